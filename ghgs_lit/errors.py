@@ -1,0 +1,17 @@
+"""Errors that a user can mend; the command line prints them as one line and exits with 1."""
+
+
+class InputError(ValueError):
+    """Bad input: names the path or key, what was expected and what was found."""
+
+
+def choice(key: str, value: object, allowed: tuple) -> None:
+    """Refuse a ``value`` of the configuration ``key`` that is not one of ``allowed``."""
+    if value not in allowed:
+        raise InputError(f"{key}: expected one of {', '.join(map(str, allowed))}; found {value!r}")
+
+
+def require(condition: bool, key: str, expected: str, found: object) -> None:
+    """Refuse the value ``found`` of ``key`` unless ``condition`` holds."""
+    if not condition:
+        raise InputError(f"{key}: expected {expected}; found {found!r}")

@@ -1,0 +1,80 @@
+"""Between pixels and the world. Conventions: see :mod:`ghgs_lit.types`.
+
+Every function takes any leading dimensions and computes in float32 or wider under any autocast.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.types import Cameras
+
+
+def wide(tensor: Tensor) -> Tensor:
+    """``tensor`` in float32 or wider: what all geometry is computed in."""
+    return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
+
+
+def pixel_centers(height: int, width: int, like: Tensor, stride: int = 1) -> Float[Tensor, "h w 2"]:
+    """Centres ``(u, v)`` in pixels of the ``stride`` x ``stride`` cells of an image.
+
+    ``stride=1`` gives pixel centres, ``stride=patch_size`` the true centres of the patches.
+    """
+    rows = (torch.arange(height // stride, device=like.device, dtype=like.dtype) + 0.5) * stride
+    columns = (torch.arange(width // stride, device=like.device, dtype=like.dtype) + 0.5) * stride
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    return torch.stack((u, v), dim=-1)
+
+
+def unproject(
+    pixels: Float[Tensor, "*batch 2"],
+    depth: Float[Tensor, "*batch"],
+    intrinsics: Float[Tensor, "*#batch 3 3"],
+    extrinsics: Float[Tensor, "*#batch 4 4"],
+) -> Float[Tensor, "*batch 3"]:
+    """World points of pixels ``(u, v)`` at z-depth ``depth``: ``R^T (z K^-1 [u v 1]^T - t)``."""
+    pixels, depth, intrinsics, extrinsics = map(wide, (pixels, depth, intrinsics, extrinsics))
+    fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
+    y = (pixels[..., 1] - intrinsics[..., 1, 2]) / fy
+    x = (pixels[..., 0] - intrinsics[..., 0, 2] - intrinsics[..., 0, 1] * y) / fx
+    camera = torch.stack((x * depth, y * depth, depth), dim=-1)
+    centered = camera - extrinsics[..., :3, 3]
+    # A product with R^T, written out because matmul would run in half precision under autocast.
+    return (extrinsics[..., :3, :3] * centered[..., :, None]).sum(-2)
+
+
+def unproject_maps(
+    depth: Float[Tensor, "*batch h w"], cameras: Cameras, stride: int = 1
+) -> Float[Tensor, "*batch h w 3"]:
+    """World points of a depth map whose cells are ``stride`` pixels wide."""
+    centers = pixel_centers(cameras.height, cameras.width, wide(depth), stride)
+    return unproject(
+        centers.expand(*depth.shape, 2),
+        depth,
+        cameras.intrinsics[..., None, None, :, :],
+        cameras.extrinsics[..., None, None, :, :],
+    )
+
+
+def world_to_camera(
+    points: Float[Tensor, "*batch 3"], extrinsics: Float[Tensor, "*#batch 4 4"]
+) -> Float[Tensor, "*batch 3"]:
+    """World points in camera axes, ``R x + t``."""
+    points, extrinsics = wide(points), wide(extrinsics)
+    return (extrinsics[..., :3, :3] * points[..., None, :]).sum(-1) + extrinsics[..., :3, 3]
+
+
+def project(
+    points: Float[Tensor, "*batch 3"],
+    intrinsics: Float[Tensor, "*#batch 3 3"],
+    extrinsics: Float[Tensor, "*#batch 4 4"],
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+    """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 mean nothing."""
+    camera = world_to_camera(points, extrinsics)
+    intrinsics = wide(intrinsics)
+    z = camera[..., 2]
+    safe = torch.where(z > 0, z, torch.ones_like(z))
+    x, y = camera[..., 0] / safe, camera[..., 1] / safe
+    u = intrinsics[..., 0, 0] * x + intrinsics[..., 0, 1] * y + intrinsics[..., 0, 2]
+    v = intrinsics[..., 1, 1] * y + intrinsics[..., 1, 2]
+    return torch.stack((u, v), dim=-1), z

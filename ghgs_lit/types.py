@@ -1,0 +1,227 @@
+"""What the stages hand to one another.
+
+Conventions, stated here once and true everywhere in the package:
+
+* camera axes are OpenCV's: x right, y down, z forward; ``extrinsics`` map world to camera;
+* ``intrinsics`` are in pixels and pixel ``(row i, column j)`` has its centre at
+  ``(u, v) = (j + 0.5, i + 0.5)``; a calibration made with OpenCV puts centres at integers, so its
+  ``cx`` and ``cy`` need ``+ 0.5`` before any resize;
+* quaternions are ``(w, x, y, z)``; lengths are metres; depth is z in the camera;
+* images are float in ``[0, 1]``, RGB, on a black background outside the mask.
+
+Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H W`` input size,
+``h w`` target size (of tokens: rows and columns), ``N`` packed Gaussians or tokens, ``L`` layers.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+_T = TypeVar("_T")
+
+
+def _map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
+    """Apply ``fn`` to every tensor inside nested dataclasses, tuples, lists and dicts."""
+    if isinstance(value, Tensor):
+        return fn(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        changes = {f.name: _map_tensors(getattr(value, f.name), fn) for f in dataclasses.fields(value)}
+        return dataclasses.replace(value, **changes)
+    if isinstance(value, (tuple, list)):
+        return type(value)(_map_tensors(item, fn) for item in value)
+    if isinstance(value, dict):
+        return {key: _map_tensors(item, fn) for key, item in value.items()}
+    return value
+
+
+class _TensorStruct:
+    """``to`` and ``detach`` for a dataclass of tensors."""
+
+    def to(self, *args, **kwargs):
+        """Move to a device (dtypes are kept: geometry stays float32 or wider, masks stay bool)."""
+        return _map_tensors(self, lambda t: t.to(*args, **kwargs))
+
+    def detach(self):
+        return _map_tensors(self, Tensor.detach)
+
+    def pin_memory(self):
+        return _map_tensors(self, Tensor.pin_memory)
+
+
+@dataclass(frozen=True)
+class Cameras(_TensorStruct):
+    """Pinhole cameras with any leading dimensions, all of one image size in pixels."""
+
+    intrinsics: Float[Tensor, "*batch 3 3"]
+    extrinsics: Float[Tensor, "*batch 4 4"]
+    height: int
+    width: int
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.intrinsics.shape[:-2]
+
+    @property
+    def centers(self) -> Float[Tensor, "*batch 3"]:
+        """Camera centres in the world, ``-R^T t``."""
+        rotation, translation = self.extrinsics[..., :3, :3], self.extrinsics[..., :3, 3]
+        return -(rotation.mT @ translation[..., None])[..., 0]
+
+    def __getitem__(self, index) -> "Cameras":
+        return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])
+
+    def resized(self, height: int, width: int) -> "Cameras":
+        """The same cameras for an image resized to ``height`` x ``width``."""
+        scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
+        return dataclasses.replace(
+            self, intrinsics=self.intrinsics * scale[:, None], height=height, width=width
+        )
+
+    def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
+        """The same cameras for the window that starts at ``(top, left)``; negative pads."""
+        shift = self.intrinsics.new_zeros(3, 3)
+        shift[0, 2], shift[1, 2] = -left, -top
+        return dataclasses.replace(self, intrinsics=self.intrinsics + shift, height=height, width=width)
+
+
+@dataclass(frozen=True)
+class Targets(_TensorStruct):
+    """Photographs to be predicted, from cameras that are not the inputs'."""
+
+    images: Float[Tensor, "B T 3 h w"]
+    masks: Bool[Tensor, "B T h w"]
+    cameras: Cameras
+    names: tuple[tuple[str, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class Batch(_TensorStruct):
+    """Input photographs of ``B`` subjects with everything known about them."""
+
+    images: Float[Tensor, "B V 3 H W"]
+    masks: Bool[Tensor, "B V H W"]
+    cameras: Cameras
+    targets: Targets | None = None
+    body_vertices: list[Float[Tensor, "n 3"]] | None = None
+    depths: Float[Tensor, "B V H W"] | None = None
+    subjects: tuple[str, ...] = ()
+    views: tuple[tuple[str, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class Tokens(_TensorStruct):
+    """Tokens of the encoder, packed over the kept ones of the batch.
+
+    Token ``n`` is the patch at ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens
+    are ordered by image, row, column. ``grid`` is ``(B, V, h, w)``. ``latent`` holds the embeddings E
+    of the encoder's read-out layers, ``semantic`` the features F (detached: they steer attention).
+    """
+
+    latent: tuple[Float[Tensor, "N C"], ...]
+    semantic: Float[Tensor, "N S"]
+    image: Int[Tensor, " N"]
+    row: Int[Tensor, " N"]
+    column: Int[Tensor, " N"]
+    grid: tuple[int, int, int, int]
+    patch_size: int
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether every patch of every image is present."""
+        b, v, h, w = self.grid
+        return self.image.shape[0] == b * v * h * w
+
+    def maps(self, layer: int) -> Float[Tensor, "BV C h w"]:
+        """One layer on the image grid; tokens that were not kept are zero."""
+        b, v, h, w = self.grid
+        values = self.latent[layer]
+        if not self.is_dense:
+            flat = (self.image * h + self.row) * w + self.column
+            values = values.new_zeros(b * v * h * w, values.shape[1]).index_copy(0, flat, values)
+        return values.reshape(b * v, h, w, -1).permute(0, 3, 1, 2)
+
+
+@dataclass(frozen=True)
+class DepthMaps(_TensorStruct):
+    """One depth for each pixel, in metres; ``near`` and ``far`` bound it where it is bounded."""
+
+    depth: Float[Tensor, "B V H W"]
+    valid: Bool[Tensor, "B V H W"]
+    confidence: Float[Tensor, "B V H W"]
+    near: Float[Tensor, "B V H W"] | None = None
+    far: Float[Tensor, "B V H W"] | None = None
+
+
+@dataclass(frozen=True)
+class Points(_TensorStruct):
+    """World points of pixels and of tokens. Invalid ones are finite but mean nothing."""
+
+    pixels: Float[Tensor, "B V H W 3"]
+    valid: Bool[Tensor, "B V H W"]
+    tokens: Float[Tensor, "N 3"]
+    tokens_valid: Bool[Tensor, " N"]
+
+
+@dataclass(frozen=True)
+class Gaussians(_TensorStruct):
+    """3D Gaussians of a batch, packed; ``splits[b]`` of them belong to element ``b``.
+
+    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres;
+    ``colors`` may have any number of channels. ``image`` (``b * V + v``) and ``pixel``
+    (row-major index) say which input pixel a Gaussian came from, where it came from one.
+    """
+
+    means: Float[Tensor, "N 3"]
+    quaternions: Float[Tensor, "N 4"]
+    scales: Float[Tensor, "N 3"]
+    opacities: Float[Tensor, " N"]
+    colors: Float[Tensor, "N C"]
+    splits: tuple[int, ...]
+    image: Int[Tensor, " N"] | None = None
+    pixel: Int[Tensor, " N"] | None = None
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
+        """The Gaussians at ``index`` (a slice, a mask or indices), divided as ``splits`` says."""
+        changes = {
+            f.name: getattr(self, f.name)[index]
+            for f in dataclasses.fields(self)
+            if isinstance(getattr(self, f.name), Tensor)
+        }
+        return dataclasses.replace(self, **changes, splits=splits)
+
+    def __getitem__(self, element: int) -> "Gaussians":
+        """The Gaussians of one batch element."""
+        if not -len(self.splits) <= element < len(self.splits):
+            raise IndexError(f"batch element {element} of Gaussians with {len(self.splits)} elements")
+        element %= len(self.splits)
+        start = sum(self.splits[:element])
+        count = self.splits[element]
+        return self.select(slice(start, start + count), (count,))
+
+
+@dataclass(frozen=True)
+class Prediction(_TensorStruct):
+    """What ``model(batch)`` returns."""
+
+    gaussians: Gaussians
+    depth: Float[Tensor, "B V H W"]
+    depth_valid: Bool[Tensor, "B V H W"]
+    points: Points
+    depth_maps: DepthMaps
+
+
+@dataclass(frozen=True)
+class Rendering(_TensorStruct):
+    """Images of Gaussians. ``depth`` is the expected z, ``sum(w z) / max(sum(w), 1e-10)``."""
+
+    image: Float[Tensor, "B T C h w"]
+    alpha: Float[Tensor, "B T 1 h w"]
+    depth: Float[Tensor, "B T 1 h w"]
