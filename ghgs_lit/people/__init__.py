@@ -1,0 +1,5 @@
+"""Built-in people: posed, clothed and textured, made at run time from a small body model."""
+
+from ghgs_lit.people.mesh import Person, TexturedMesh
+
+__all__ = ["Person", "TexturedMesh"]

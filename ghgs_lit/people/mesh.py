@@ -1,0 +1,68 @@
+"""Meshes with a texture, and people made of them: what the photographer takes pictures of.
+
+Metres, y up, feet on y = 0, facing +z up to a yaw about y. Built-in people and scans use the same two types.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ghgs_lit.errors import InputError
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """One part of a person: triangles with one texture.
+
+    Attributes:
+        vertices: [n, 3] float32, metres.
+        faces: [m, 3] int64, counter-clockwise seen from outside.
+        uv: [n, 2] float32, origin at the bottom left of the texture, v upwards (as trimesh has them).
+        texture: [h, w, 3 or 4] uint8, row 0 at the top.
+        alpha_cutoff: faces are cut away where the texture's alpha is below this value (0 to 1); None: opaque.
+
+    Raises:
+        InputError: an array has another shape, or the faces name vertices that do not exist.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    texture: np.ndarray
+    alpha_cutoff: float | None = None
+
+    def __post_init__(self) -> None:
+        _expect("vertices", self.vertices, (None, 3))
+        _expect("faces", self.faces, (None, 3))
+        _expect("uv", self.uv, (len(self.vertices), 2))
+        if self.texture.ndim != 3 or self.texture.shape[2] not in (3, 4):
+            raise InputError(f"texture: expected [h, w, 3 or 4], found {list(self.texture.shape)}")
+        if self.alpha_cutoff is not None and self.texture.shape[2] != 4:
+            raise InputError("alpha_cutoff: expected a texture with alpha [h, w, 4], found 3 channels")
+        if len(self.faces) and (self.faces.min() < 0 or self.faces.max() >= len(self.vertices)):
+            raise InputError(
+                f"faces: expected indices in [0, {len(self.vertices)}), "
+                f"found {self.faces.min()} to {self.faces.max()}"
+            )
+
+
+@dataclass(frozen=True)
+class Person:
+    """A dressed, posed person.
+
+    Attributes:
+        name: names the person in files and tables.
+        parts: body, hair, clothes: drawn together.
+        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts, or None if unknown.
+    """
+
+    name: str
+    parts: tuple[TexturedMesh, ...]
+    body_vertices: np.ndarray | None
+
+
+def _expect(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
+    """Raise unless `array` has `shape`, None standing for any length."""
+    if array.ndim != len(shape) or any(s not in (None, a) for s, a in zip(shape, array.shape, strict=True)):
+        wanted = ", ".join("n" if s is None else str(s) for s in shape)
+        raise InputError(f"{name}: expected [{wanted}], found {list(array.shape)}")
