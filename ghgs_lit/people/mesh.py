@@ -53,7 +53,7 @@ class Person:
     Attributes:
         name: names the person in files and tables.
         parts: body, hair, clothes: drawn together.
-        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts, or None if unknown.
+        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts, or None: unknown.
     """
 
     name: str
