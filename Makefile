@@ -1,0 +1,40 @@
+# `make help` lists the targets. The virtual environment is made on first use.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+# Two test processes: the suite is bound by the CPU, and small machines have two cores.
+JOBS   ?= 2
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint format bench clean
+
+help: ## List the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(BIN)/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+setup: $(BIN)/.installed ## Make the virtual environment with pinned versions
+
+demo: setup ## Make people, train the four ablations, evaluate at 3, 4, 5 views, print the table
+	PATH="$(abspath $(BIN)):$$PATH" bash scripts/demo.sh
+
+test: setup ## Run the whole test suite (CPU)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+lint: setup ## Check style
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: setup ## Mend style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: setup ## Measure the rasterizer against its peers (minutes)
+	$(BIN)/python benchmarks/rasterizer.py --quick
+
+clean: ## Remove the virtual environment and caches, keep runs
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis

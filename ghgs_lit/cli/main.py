@@ -1,0 +1,127 @@
+"""``ghgs <verb> [overrides]``: every verb is a Hydra application over ``conf/<verb>.yaml``."""
+
+import importlib
+import importlib.metadata
+import os
+import sys
+from dataclasses import dataclass
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from ghgs_lit.config.paths import conf_dir
+from ghgs_lit.errors import InputError
+
+# verb: (what it does, an example)
+VERBS = {
+    "prepare": (
+        "render scans into training data, or make the built-in people",
+        "ghgs prepare task=render data=scans data.source=~/scans data.root=~/rendered",
+    ),
+    "train": (
+        "train a model and evaluate it",
+        "ghgs train model=hull data=synthetic trainer.max_time=00:00:10:00",
+    ),
+    "evaluate": (
+        "measure a checkpoint or the baselines",
+        "ghgs evaluate checkpoint=runs/train/.../last.ckpt",
+    ),
+    "predict": (
+        "turn photographs into a splat (PLY) and a turntable",
+        "ghgs predict checkpoint=last.ckpt data=synthetic subject=0",
+    ),
+    "table": ("collect a sweep into the paper's table", "ghgs table sweep=runs/train/sweep_..."),
+}
+
+
+def usage() -> str:
+    lines = ["usage: ghgs <verb> [key=value ...] [group=option ...] [-m]", ""]
+    for verb, (summary, example) in VERBS.items():
+        lines += [f"  {verb:<10}{summary}", f"  {'':<10}  {example}"]
+    lines += [
+        "",
+        "ghgs <verb> --help lists the groups and keys of a verb; ghgs --version prints the version.",
+    ]
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Verb:
+    """The task of one verb: what Hydra calls, here or in the processes of a launcher."""
+
+    name: str
+    argv: tuple[str, ...]
+
+    def __call__(self, cfg: DictConfig) -> object:
+        # Lightning starts the other processes of a DDP job by running sys.argv again: it needs the verb.
+        sys.argv = list(self.argv)
+        return importlib.import_module(f"ghgs_lit.cli.{self.name}").run(cfg)
+
+
+def _completion_argv(argv: list[str]) -> list[str] | None:
+    """Arguments of a shell-completion call (``ghgs -sc ...``) for the verb that is being typed.
+
+    The shell's line is handed to Hydra without the verb. While the verb itself is being typed, the
+    verbs are printed and ``None`` comes back.
+    """
+    if "query" not in argv[2]:
+        return [argv[0], "train", *argv[1:]]
+    line = os.environ.get("COMP_LINE", "")
+    words = line.split()
+    if len(words) < 2 or words[1] not in VERBS:
+        print(" ".join(VERBS))
+        return None
+    os.environ["COMP_LINE"] = line.replace(f" {words[1]}", "", 1)
+    return [argv[0], words[1], *argv[1:]]
+
+
+def _one_line(error: Exception) -> str:
+    """A configuration error's own words and those of its cause, on one line."""
+    texts = [str(error)]
+    if error.__cause__ is not None:
+        texts.append(str(error.__cause__))
+    words = " ".join(" ".join(texts).split())
+    return words.replace("To append to your config use +", "it is no key of this verb; to add it: +")
+
+
+def _run(verb: str, argv: list[str]) -> int:
+    # Hydra's own handler would shorten and print errors; with this it raises them, and one place answers.
+    wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    sys.argv = [argv[0], *argv[2:]]
+    task = Verb(verb, tuple(argv))
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
+    except (InputError, HydraException, OmegaConfBaseException, FileNotFoundError) as error:
+        if wants_trace:
+            raise
+        print(f"ghgs {verb}: {_one_line(error)}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"ghgs {verb}: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def main() -> int:
+    """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 when interrupted."""
+    argv = list(sys.argv)
+    if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
+        completed = _completion_argv(argv)
+        return 0 if completed is None else _run(completed[1], completed)
+    if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if len(argv) > 1 else 2
+    if argv[1] == "--version":
+        print(importlib.metadata.version("ghgs-lit"))
+        return 0
+    if argv[1] not in VERBS:
+        print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}", file=sys.stderr)
+        return 2
+    return _run(argv[1], argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Builds objects from configuration nodes, through a whitelist.
+
+A configuration can come out of somebody else's checkpoint, and Hydra's ``instantiate`` calls whatever
+``_target_`` names. Only this package and the names below are ever called.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import hydra.utils
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf
+
+from ghgs_lit.errors import InputError
+
+_OUTSIDE = frozenset(
+    {
+        "lightning.pytorch.Trainer",
+        "lightning.pytorch.callbacks.LearningRateMonitor",
+        "lightning.pytorch.callbacks.ModelCheckpoint",
+        "lightning.pytorch.callbacks.RichProgressBar",
+        "lightning.pytorch.callbacks.TQDMProgressBar",
+        "lightning.pytorch.callbacks.Timer",
+        "lightning.pytorch.loggers.CSVLogger",
+        "lightning.pytorch.loggers.TensorBoardLogger",
+        "lightning.pytorch.loggers.WandbLogger",
+        "lightning.pytorch.strategies.DDPStrategy",
+        "lightning.pytorch.strategies.FSDPStrategy",
+        "torch.optim.AdamW",
+        "torch.optim.Adam",
+        "torch.optim.SGD",
+    }
+)
+
+
+def _targets(node: Any, key: str = "") -> Iterator[tuple[str, object]]:
+    """Every ``_target_`` below ``node`` with the key that it stands under."""
+    if isinstance(node, Mapping):
+        for name, value in node.items():
+            path = f"{key}.{name}" if key else str(name)
+            if name == "_target_":
+                yield path, value
+            else:
+                yield from _targets(value, path)
+    elif isinstance(node, Sequence) and not isinstance(node, (str, bytes)):
+        for index, value in enumerate(node):
+            yield from _targets(value, f"{key}[{index}]")
+
+
+def _reason(error: InstantiationException, key: str) -> InputError:
+    """What the constructor had to say, as one line that starts with the key."""
+    cause = error.__cause__
+    while isinstance(cause, InstantiationException) and cause.__cause__ is not None:
+        cause = cause.__cause__
+    if isinstance(cause, InputError):
+        return cause
+    text = str(cause or error).strip().splitlines()[0]
+    return InputError(f"{key or 'configuration'}: {text}")
+
+
+def build(node: Mapping | DictConfig, _key: str = "", **extra: Any) -> Any:
+    """Build the object that ``node`` describes (``_target_`` and its arguments), nested ones too.
+
+    Args:
+        node: a configuration node or a plain mapping; interpolations are resolved.
+        _key: where the node stands in the configuration, for messages.
+        extra: further arguments; they win over the node's.
+
+    Raises:
+        InputError: a ``_target_`` outside the whitelist, an argument that the target does not take or
+            refuses; an error inside the target that is not about its input keeps its own type.
+    """
+    if not isinstance(node, Mapping | DictConfig) or "_target_" not in node:
+        raise InputError(f"{_key or 'configuration'}: expected a mapping with _target_; found {node!r}")
+    plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
+    for path, target in _targets(plain, _key):
+        if not (isinstance(target, str) and (target in _OUTSIDE or target.startswith("ghgs_lit."))):
+            raise InputError(f"{path}: expected a class of ghgs_lit or a whitelisted one; found {target!r}")
+    try:
+        return hydra.utils.instantiate(plain, _convert_="all", **extra)
+    except InstantiationException as error:
+        if (
+            isinstance(error.__cause__, (InputError, TypeError, InstantiationException))
+            or not error.__cause__
+        ):
+            raise _reason(error, _key) from error
+        raise
