@@ -1,0 +1,90 @@
+"""The command line: verbs, one-line errors, exit codes, completion."""
+
+import importlib
+
+import pytest
+
+from ghgs_lit.cli import main as cli
+from ghgs_lit.config import conf_dir
+
+
+def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
+    monkeypatch.setattr("sys.argv", ["ghgs", *argv])
+    # main() asks Hydra to raise rather than to print; restored here for the other tests.
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    try:
+        code = cli.main()
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, capsys):
+    code, out, _ = call(monkeypatch, capsys, "--help")
+    assert code == 0
+    for verb, (_, example) in cli.VERBS.items():
+        assert example in out
+        assert (conf_dir() / f"{verb}.yaml").is_file()
+        assert callable(importlib.import_module(f"ghgs_lit.cli.{verb}").run)
+
+
+@pytest.mark.parametrize("argv", [(), ("paint",)])
+def test_bad_verb_is_bad_usage(monkeypatch, capsys, argv):
+    code, out, err = call(monkeypatch, capsys, *argv)
+    assert code == 2
+    assert "train" in out + err
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (("train", "colour=red"), "colour"),
+        (("train", "optimizer.speed=9"), "speed"),
+        (("train", "encoder=vggt_huge"), "vggt_huge"),
+        (("train", "seed="), "seed"),
+        (("train", "views=[4"), "views"),
+    ],
+)
+def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys, argv, expected):
+    code, _, err = call(monkeypatch, capsys, *argv)
+    lines = [line for line in err.strip().splitlines() if line]
+    assert code == 1
+    assert len(lines) == 1
+    assert expected in lines[0]
+    assert lines[0].startswith("ghgs train: ")
+
+
+def test_verb_help_and_cfg_are_hydras(monkeypatch, capsys):
+    code, out, _ = call(monkeypatch, capsys, "train", "--help")
+    assert code == 0
+    assert "ablation:" in out
+    code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", "seed=7")
+    assert code == 0
+    assert "seed: 7" in out
+
+
+def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
+    monkeypatch.setenv("COMP_LINE", "ghgs tr")
+    _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
+    assert set(out.split()) == set(cli.VERBS)
+    monkeypatch.setenv("COMP_LINE", "ghgs train abl")
+    _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
+    assert "ablation=" in out
+
+
+def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
+    """Lightning restarts sys.argv for the other processes of a DDP job."""
+    seen = {}
+
+    class Module:
+        @staticmethod
+        def run(cfg):
+            import sys
+
+            seen["argv"] = list(sys.argv)
+
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Module)
+    monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
+    cli.Verb("train", ("ghgs", "train", "seed=1"))(None)
+    assert seen["argv"] == ["ghgs", "train", "seed=1"]
