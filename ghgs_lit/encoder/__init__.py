@@ -1,0 +1,5 @@
+"""The encode stage: VGGT's aggregator over patch tokens, of any size."""
+
+from ghgs_lit.encoder.encoder import VGGTEncoder
+
+__all__ = ["VGGTEncoder"]

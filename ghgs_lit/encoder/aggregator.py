@@ -1,0 +1,97 @@
+"""Alternating attention inside each view and across all views (VGGT's aggregator)."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.encoder.block import Block, run
+from ghgs_lit.encoder.rope import rotary_tables, token_positions
+from ghgs_lit.errors import require
+
+NORM_EPS = 1e-5
+
+Pair = tuple[Float[Tensor, "n t c"], Float[Tensor, "n t c"]]
+
+
+class Aggregator(nn.Module):
+    """``depth`` pairs of a frame and a global block on the patch tokens of ``patch_embed``.
+
+    Each view's sequence is [camera, registers, patches]. The first view has camera and register tokens
+    of its own and so fixes the frame of reference: exchanging it for another changes the result, any
+    other permutation of views only permutes it.
+    """
+
+    def __init__(
+        self,
+        patch_embed: nn.Module,
+        patch_size: int,
+        width: int,
+        heads: int,
+        depth: int,
+        registers: int,
+        layers: Sequence[int],
+        layer_scale: float = 0.01,
+        checkpointing: bool = False,
+    ):
+        super().__init__()
+        require(
+            width % (4 * heads) == 0,
+            "encoder.width",
+            "a multiple of 4 * heads (rows and columns rotate)",
+            width,
+        )
+        require(
+            len(layers) > 0
+            and sorted(set(layers)) == list(layers)
+            and layers[0] >= 0
+            and layers[-1] == depth - 1,
+            "encoder.layers",
+            f"ascending indices that end at the last of {depth} pairs of blocks",
+            list(layers),
+        )
+        self.patch_size, self.layers, self.checkpointing = patch_size, tuple(layers), checkpointing
+        self.special = 1 + registers
+        self.head_width = width // heads
+        self.patch_embed = patch_embed
+        self.camera_token = nn.Parameter(torch.empty(1, 2, 1, width).normal_(std=1e-6))
+        self.register_token = nn.Parameter(torch.empty(1, 2, registers, width).normal_(std=1e-6))
+
+        def blocks() -> nn.ModuleList:
+            return nn.ModuleList(
+                Block(width, heads, qk_norm=True, norm_eps=NORM_EPS, layer_scale=layer_scale)
+                for _ in range(depth)
+            )
+
+        self.frame_blocks, self.global_blocks = blocks(), blocks()
+
+    def special_tokens(self, views: int) -> Float[Tensor, "v s c"]:
+        """Camera and register tokens: slot 0 for the first view, slot 1 for the others."""
+        tokens = torch.cat((self.camera_token, self.register_token), dim=2)[0]
+        return torch.cat((tokens[:1], tokens[1:].expand(views - 1, -1, -1)))
+
+    def forward(self, images: Float[Tensor, "b v i H W"]) -> tuple[list[Pair], Float[Tensor, "bv p c"]]:
+        """Normalised images to the tokens after the frame and the global block of each read-out layer
+        (special tokens included, ``[B*V, special + P, C]`` each) and the patch tokens that entered."""
+        b, v, _, height, width = images.shape
+        patches = self.patch_embed(images.flatten(0, 1))
+        special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)
+        x = torch.cat((special, patches), dim=1)
+
+        positions = token_positions(
+            height // self.patch_size, width // self.patch_size, self.special, images.device
+        )
+        inside = rotary_tables(positions, self.head_width, x)
+        across = inside.repeat(v)
+
+        pairs = []
+        for i, (frame_block, global_block) in enumerate(
+            zip(self.frame_blocks, self.global_blocks, strict=True)
+        ):
+            frame = run(frame_block, x, self.checkpointing, inside)
+            sequence = frame.unflatten(0, (b, v)).flatten(1, 2)
+            x = run(global_block, sequence, self.checkpointing, across).view_as(frame)
+            if i in self.layers:
+                pairs.append((frame, x))
+        return pairs, patches

@@ -1,0 +1,59 @@
+"""Pre-norm transformer block with LayerScale, shared by the ViT and the aggregator."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from ghgs_lit.encoder.attention import Attention
+from ghgs_lit.encoder.rope import Rotary
+
+
+class LayerScale(nn.Module):
+    """Adds a branch to the residual stream, each channel scaled by its own learned ``gamma``."""
+
+    def __init__(self, width: int, init: float):
+        super().__init__()
+        self.gamma = nn.Parameter(torch.full((width,), float(init)))
+
+    def forward(self, x: Float[Tensor, "*n c"], branch: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+        return torch.addcmul(x, branch, self.gamma)
+
+
+class Mlp(nn.Module):
+    """Two linear layers, four times as wide inside, with the exact GELU."""
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.fc1 = nn.Linear(width, 4 * width)
+        self.fc2 = nn.Linear(4 * width, width)
+
+    def forward(self, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
+        return self.fc2(F.gelu(self.fc1(x)))
+
+
+class Block(nn.Module):
+    """``x + gamma1 Attention(LN(x))``, then ``x + gamma2 MLP(LN(x))``."""
+
+    def __init__(self, width: int, heads: int, qk_norm: bool, norm_eps: float, layer_scale: float):
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=norm_eps)
+        self.attn = Attention(width, heads, qk_norm)
+        self.ls1 = LayerScale(width, layer_scale)
+        self.norm2 = nn.LayerNorm(width, eps=norm_eps)
+        self.mlp = Mlp(width)
+        self.ls2 = LayerScale(width, layer_scale)
+
+    def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
+        x = self.ls1(x, self.attn(self.norm1(x), rotary))
+        return self.ls2(x, self.mlp(self.norm2(x)))
+
+
+def run(
+    block: Block, x: Float[Tensor, "n t c"], checkpointing: bool, rotary: Rotary | None = None
+) -> Float[Tensor, "n t c"]:
+    """``block(x)``; with ``checkpointing`` its activations are recomputed in the backward pass."""
+    if checkpointing and torch.is_grad_enabled():
+        return checkpoint(block, x, rotary, use_reentrant=False)
+    return block(x, rotary)

@@ -1,0 +1,148 @@
+"""The encode stage: photographs and masks to tokens."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ghgs_lit.encoder.aggregator import Aggregator
+from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
+from ghgs_lit.encoder.vit import VisionTransformer
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.types import Tokens
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+VIT_OPTIONS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
+
+
+class VGGTEncoder(nn.Module):
+    """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
+
+    Args:
+        width, heads, depth: of the aggregator; ``depth`` counts pairs of a frame and a global block.
+        vit: ``{kind: conv}`` one convolution per patch; ``{kind: stem, channels}`` a small convolutional
+            stem; ``{kind: dinov2, depth, heads}`` a DINOv2 ViT with registers.
+        layers: pairs whose tokens are read out, ascending; the last must be the last of all.
+        image_size: side of the square image whose patch positions a DINOv2 ViT stores.
+        mask_input: the mask is a fourth image channel.
+        layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
+        trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
+        checkpointing: recompute activations in the backward pass instead of keeping them.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        heads: int,
+        depth: int,
+        vit: Mapping,
+        layers: Sequence[int],
+        patch_size: int = 14,
+        registers: int = 4,
+        image_size: int = 518,
+        mask_input: bool = False,
+        layer_scale: float = 0.01,
+        trainable: str = "all",
+        checkpointing: bool = False,
+    ):
+        super().__init__()
+        self.patch_size, self.mask_input = patch_size, mask_input
+        self.dim_latent, self.dim_semantic = 2 * width, width
+        channels = 4 if mask_input else 3
+        mean, std = (*IMAGENET_MEAN, 0.5)[:channels], (*IMAGENET_STD, 0.5)[:channels]
+        self.register_buffer("mean", torch.tensor(mean).view(-1, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(std).view(-1, 1, 1), persistent=False)
+        patch_embed = _patch_embedding(vit, channels, width, patch_size, image_size, registers, checkpointing)
+        self.aggregator = Aggregator(
+            patch_embed, patch_size, width, heads, depth, registers, layers, layer_scale, checkpointing
+        )
+        self._set_trainable(trainable, depth)
+
+    def _set_trainable(self, trainable: str, depth: int) -> None:
+        if trainable == "all":
+            return
+        digits = trainable.removeprefix("last_")
+        count = 0 if trainable == "none" else int(digits) if digits.isdecimal() else -1
+        require(
+            0 <= count <= depth, "encoder.trainable", f"all, none or last_<n>, n up to {depth}", trainable
+        )
+        self.requires_grad_(False)
+        for blocks in (self.aggregator.frame_blocks, self.aggregator.global_blocks):
+            blocks[depth - count :].requires_grad_(True)
+
+    def forward(self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."]) -> Tokens:
+        """All patches of all views.
+
+        Args:
+            images: ``[B, V, 3, H, W]``, RGB in [0, 1], sides divisible by the patch size.
+            masks: ``[B, V, H, W]``; read only where ``mask_input`` is set.
+        """
+        self._check(images, masks)
+        b, v, _, height, width = images.shape
+        grid = (b, v, height // self.patch_size, width // self.patch_size)
+        pairs, patches = self.aggregator(self._normalized(images, masks))
+        first = self.aggregator.special
+        axes = (torch.arange(n, device=images.device) for n in (b * v, *grid[2:]))
+        image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+        return Tokens(
+            latent=tuple(torch.cat((f[:, first:], g[:, first:]), dim=-1).flatten(0, 1) for f, g in pairs),
+            semantic=patches.detach().flatten(0, 1),
+            image=image,
+            row=row,
+            column=column,
+            grid=grid,
+            patch_size=self.patch_size,
+        )
+
+    def _check(self, images: Tensor, masks: Tensor) -> None:
+        b, v, channels, height, width = images.shape
+        require(channels == 3, "images", "3 channels", channels)
+        expected = f"height and width divisible by the patch size {self.patch_size}"
+        divisible = height % self.patch_size == width % self.patch_size == 0 < min(height, width)
+        require(divisible, "images", expected, f"{height} x {width}")
+        require(masks.shape == (b, v, height, width), "masks", str((b, v, height, width)), tuple(masks.shape))
+
+    def _normalized(self, images: Tensor, masks: Tensor) -> Tensor:
+        """Channels to zero mean and unit spread, in the precision of the weights."""
+        x = wide(images)
+        if self.mask_input:
+            x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
+        return ((x - self.mean) / self.std).to(self.aggregator.camera_token.dtype)
+
+
+def _patch_embedding(
+    vit: Mapping,
+    in_channels: int,
+    width: int,
+    patch_size: int,
+    image_size: int,
+    registers: int,
+    checkpointing: bool,
+) -> nn.Module:
+    """Build what ``encoder.vit`` describes."""
+    kind, options = vit.get("kind"), {key: value for key, value in vit.items() if key != "kind"}
+    choice("encoder.vit.kind", kind, tuple(VIT_OPTIONS))
+    expected = ", ".join(VIT_OPTIONS[kind]) or "none"
+    require(
+        set(options) == set(VIT_OPTIONS[kind]),
+        f"encoder.vit ({kind})",
+        f"options: {expected}",
+        sorted(options),
+    )
+    if kind == "conv":
+        return PatchEmbed(in_channels, width, patch_size)
+    if kind == "stem":
+        return ConvStem(in_channels, width, patch_size, **options)
+    return VisionTransformer(
+        in_channels,
+        width,
+        patch_size=patch_size,
+        image_size=image_size,
+        registers=registers,
+        checkpointing=checkpointing,
+        **options,
+    )

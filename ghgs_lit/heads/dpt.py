@@ -1,0 +1,191 @@
+"""Dense prediction head: four layers of tokens fused from coarse to fine into one map per image."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ghgs_lit.errors import require
+from ghgs_lit.heads.position import position_embedding
+from ghgs_lit.types import Tokens
+
+LEVELS = 4
+NORM_EPS = 1e-5
+
+
+def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
+    return nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias)
+
+
+def _resize(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c h2 w2"]:
+    if x.shape[-2:] == size:
+        return x
+    return F.interpolate(x, size, mode="bilinear", align_corners=True)
+
+
+class ResidualUnit(nn.Module):
+    """``r + conv2(relu(conv1(r)))`` with ``r = relu(x)``: published weights expect a rectified skip."""
+
+    def __init__(self, features: int):
+        super().__init__()
+        self.conv1 = _conv3(features, features)
+        self.conv2 = _conv3(features, features)
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+        rectified = F.relu(x)
+        return rectified + self.conv2(F.relu(self.conv1(rectified)))
+
+
+class Fusion(nn.Module):
+    """Add a finer level to the coarser result, refine, resize; the coarsest block has no level to add."""
+
+    def __init__(self, features: int, joins: bool):
+        super().__init__()
+        if joins:
+            self.resConfUnit1 = ResidualUnit(features)
+        self.resConfUnit2 = ResidualUnit(features)
+        self.out_conv = nn.Conv2d(features, features, 1)
+
+    def forward(
+        self,
+        x: Float[Tensor, "n c h w"],
+        level: Float[Tensor, "n c h w"] | None,
+        size: tuple[int, int],
+    ) -> Float[Tensor, "n c h2 w2"]:
+        if level is not None:
+            x = x + self.resConfUnit1(level)
+        # A 1x1 convolution commutes with interpolation; before it, it costs a quarter.
+        return _resize(self.out_conv(self.resConfUnit2(x)), size)
+
+
+class Scratch(nn.Module):
+    """Everything after the resize layers, under its published names."""
+
+    def __init__(self, out_channels: Sequence[int], features: int, hidden: int, output_dim: int):
+        super().__init__()
+        for i, channels in enumerate(out_channels, start=1):
+            setattr(self, f"layer{i}_rn", _conv3(channels, features, bias=False))
+            setattr(self, f"refinenet{i}", Fusion(features, joins=i < LEVELS))
+        self.output_conv1 = _conv3(features, features // 2)
+        self.output_conv2 = nn.Sequential(
+            _conv3(features // 2, hidden), nn.ReLU(), nn.Conv2d(hidden, output_dim, 1)
+        )
+
+
+class DPTHead(nn.Module):
+    """Tokens of four layers to ``output_dim`` raw channels for each pixel.
+
+    Args:
+        dim_in: width of a token of ``Tokens.latent``.
+        features: channels of the fused maps (a multiple of 8).
+        out_channels: channels of the four levels (multiples of 4), fine to coarse.
+        output_dim: channels of the result; activations are the caller's.
+        hidden: channels before the last convolution (32 as published).
+        image_skip: add one convolution of the picture and its mask at full resolution, which keeps a small
+            head sharp; published weights have none.
+        images_per_step: images that go through the head together where no gradient is kept (bounds memory).
+    """
+
+    def __init__(
+        self,
+        dim_in: int,
+        features: int,
+        out_channels: Sequence[int],
+        output_dim: int,
+        hidden: int = 32,
+        image_skip: bool = False,
+        images_per_step: int = 8,
+    ):
+        super().__init__()
+        require(features % 8 == 0, "features", "a multiple of 8", features)
+        require(
+            len(out_channels) == LEVELS and all(c % 4 == 0 for c in out_channels),
+            "out_channels",
+            "four multiples of 4",
+            list(out_channels),
+        )
+        require(images_per_step > 0, "images_per_step", "a positive number", images_per_step)
+        self.images_per_step = images_per_step
+        c0, c1, _, c3 = out_channels
+        self.norm = nn.LayerNorm(dim_in, eps=NORM_EPS)
+        self.projects = nn.ModuleList(nn.Conv2d(dim_in, c, 1) for c in out_channels)
+        self.resize_layers = nn.ModuleList(
+            (
+                nn.ConvTranspose2d(c0, c0, 4, stride=4),
+                nn.ConvTranspose2d(c1, c1, 2, stride=2),
+                nn.Identity(),
+                nn.Conv2d(c3, c3, 3, stride=2, padding=1),
+            )
+        )
+        self.scratch = Scratch(out_channels, features, hidden, output_dim)
+        self.image_skip = _conv3(4, features // 2) if image_skip else None
+
+    def forward(
+        self,
+        tokens: Tokens,
+        images: Float[Tensor, "b v 3 H W"] | None = None,
+        masks: Bool[Tensor, "b v H W"] | None = None,
+    ) -> Float[Tensor, "bv o H W"]:
+        """Raw maps of all images, float32 or wider; ``images`` and ``masks`` are read by the image skip."""
+        require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
+        levels = self._levels(tokens)
+        picture = None
+        if self.image_skip is not None:
+            require(images is not None and masks is not None, "image_skip", "images and masks", None)
+            picture = torch.cat((images, masks.to(images.dtype)[:, :, None]), dim=2).flatten(0, 1)
+        count = levels[0].shape[0]
+        step = count if torch.is_grad_enabled() else self.images_per_step
+        parts = []
+        for start in range(0, count, step):
+            part = slice(start, start + step)
+            parts.append(
+                self._decode(
+                    [level[part] for level in levels],
+                    tokens.patch_size,
+                    None if picture is None else picture[part],
+                )
+            )
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def _levels(self, tokens: Tokens) -> list[Float[Tensor, "bv c h w"]]:
+        """Normalised and projected tokens on the grid; a 1x1 convolution of a map is a linear of tokens."""
+        projected = tuple(
+            F.linear(self.norm(latent), project.weight.flatten(1), project.bias)
+            for latent, project in zip(tokens.latent, self.projects, strict=True)
+        )
+        packed = dataclasses.replace(tokens, latent=projected)
+        return [packed.maps(i) for i in range(LEVELS)]
+
+    def _decode(
+        self, levels: list[Tensor], patch_size: int, picture: Tensor | None
+    ) -> Float[Tensor, "n o H W"]:
+        height, width = levels[0].shape[-2:]
+        aspect = width / height
+        s = self.scratch
+        for i, resize in enumerate(self.resize_layers):
+            level = _add_positions(levels[i], aspect)
+            levels[i] = getattr(s, f"layer{i + 1}_rn")(resize(level))
+
+        sizes = [tuple(level.shape[-2:]) for level in levels]
+        x = s.refinenet4(levels[3], None, sizes[2])
+        x = s.refinenet3(x, levels[2], sizes[1])
+        x = s.refinenet2(x, levels[1], sizes[0])
+        x = s.refinenet1(x, levels[0], (2 * sizes[0][0], 2 * sizes[0][1]))
+
+        x = _resize(s.output_conv1(x), (patch_size * height, patch_size * width))
+        x = _add_positions(x, aspect)
+        if picture is not None:
+            x = x + F.relu(self.image_skip(picture))
+        x = s.output_conv2[:-1](x)
+        # The last projection stays wide under autocast: depths and offsets of millimetres hang on it.
+        last = s.output_conv2[-1]
+        with torch.autocast(x.device.type, enabled=False):
+            return last(x.to(last.weight.dtype))
+
+
+def _add_positions(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
+    """``x + 0.1 E``, in the precision of ``x``."""
+    return x + position_embedding(x.shape[1], *x.shape[-2:], aspect, x).to(x.dtype)

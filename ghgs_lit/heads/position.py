@@ -1,0 +1,46 @@
+"""Sinusoidal positions that the DPT head adds to its maps."""
+
+import math
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SCALE = 0.1
+BASE = 100.0
+
+
+def axis_coordinates(count: int, half_extent: float, dtype: torch.dtype, device=None) -> Float[Tensor, " n"]:
+    """Centres of ``count`` cells between ``-half_extent`` and ``+half_extent``."""
+    bound = half_extent * (count - 1) / count
+    return torch.linspace(-bound, bound, count, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=64)
+def _axis_waves(
+    channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
+) -> Float[Tensor, "c n"]:
+    """Sines, then cosines of one axis, float64 inside, float32 outside, in units of ``SCALE``."""
+    # A tensor made under inference mode could not be used in a later training step.
+    with torch.inference_mode(False), torch.no_grad():
+        quarter = channels // 2
+        exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
+        omega = 1.0 / BASE**exponents
+        angles = omega[:, None] * axis_coordinates(count, half_extent, dtype, device).double()
+        return torch.cat((angles.sin(), angles.cos())).float() * SCALE
+
+
+def position_embedding(
+    channels: int, rows: int, columns: int, aspect: float, like: Tensor
+) -> Float[Tensor, "c rows columns"]:
+    """``0.1 E``: waves of x in the first half of the channels, of y in the second.
+
+    The unit is half the diagonal of an image of ``aspect`` width / height; samples are cell centres.
+    Waves of the two axes are cached (a few kilobytes each), their outer layout is not.
+    """
+    dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
+    diagonal = math.hypot(aspect, 1.0)
+    x = _axis_waves(channels // 2, columns, aspect / diagonal, dtype, like.device)
+    y = _axis_waves(channels // 2, rows, 1.0 / diagonal, dtype, like.device)
+    return torch.cat((x[:, None, :].expand(-1, rows, -1), y[:, :, None].expand(-1, -1, columns)))
