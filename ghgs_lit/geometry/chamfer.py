@@ -1,0 +1,82 @@
+"""Chamfer distance between two point sets (the paper's geometric loss L_geom).
+
+Nearest neighbours are exact and carry no gradient; the gradient runs through the matched pairs only.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.projection import wide
+
+KINDS = ("squared", "huber", "truncated")
+
+
+def nearest(
+    queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], chunk: int = 2048
+) -> Int[Tensor, " n"]:
+    """Index of the nearest reference of each query; ``m`` must not be 0, coordinates must be finite.
+
+    On the CPU by k-d tree in float64; on an accelerator by explicit differences, ``chunk`` queries at a
+    time (the matrix-product form of the distance is off by a millimetre at two metres).
+    """
+    queries, references = wide(queries.detach()), wide(references.detach())
+    if queries.device.type == "cpu":
+        tree = cKDTree(references.double().numpy(), balanced_tree=False, compact_nodes=False)
+        index = tree.query(queries.double().numpy(), workers=torch.get_num_threads())[1]
+        return torch.from_numpy(index)
+    exact = "donot_use_mm_for_euclid_dist"
+    blocks = [torch.cdist(block, references, compute_mode=exact).argmin(-1) for block in queries.split(chunk)]
+    return torch.cat(blocks) if blocks else queries.new_zeros(0, dtype=torch.long)
+
+
+def penalty(offsets: Float[Tensor, "n 3"], kind: str, scale: float) -> Float[Tensor, " n"]:
+    """What a pair at ``offsets`` metres from each other costs; all kinds are d^2 within ``scale``.
+
+    Beyond it ``huber`` grows as 2 scale d - scale^2 and ``truncated`` stays at scale^2.
+    """
+    squared = offsets.square().sum(-1)
+    if kind == "squared":
+        return squared
+    limit = scale * scale
+    if kind == "truncated":
+        return squared.clamp(max=limit)
+    outside = squared > limit
+    distance = torch.where(outside, squared, torch.full_like(squared, limit)).sqrt()
+    return torch.where(outside, 2 * scale * distance - limit, squared)
+
+
+def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, "m 3"]:
+    """At most ``limit`` of the points, evenly spaced in memory from a random start."""
+    if limit is None or len(points) <= limit:
+        return points
+    steps = torch.arange(limit, dtype=torch.float64) + torch.rand((), dtype=torch.float64)
+    index = (steps * (len(points) / limit)).long().clamp(max=len(points) - 1)
+    return points[index.to(points.device)]
+
+
+def chamfer(
+    points: Float[Tensor, "n 3"],
+    references: Float[Tensor, "m 3"],
+    kind: str = "squared",
+    scale: float = 0.1,
+    limit: int | None = None,
+) -> Float[Tensor, ""]:
+    """Mean penalty from each point to its nearest reference plus the mean the other way round.
+
+    With ``limit`` at most so many of each set are matched (to all of the other set, so that the mean stays
+    unbiased). 0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
+    """
+    choice("chamfer.kind", kind, KINDS)
+    require(scale > 0, "chamfer.scale", "a positive number of metres", scale)
+    points, references = wide(points), wide(references)
+    if not (torch.isfinite(points).all() and torch.isfinite(references).all()):
+        return (points.sum() + references.sum()) * torch.nan
+    if len(points) == 0 or len(references) == 0:
+        return points.sum() * 0 + references.sum() * 0
+    some, few = subsample(points, limit), subsample(references, limit)
+    there = penalty(some - references[nearest(some, references)], kind, scale)
+    back = penalty(points[nearest(few, points)] - few, kind, scale)
+    return there.mean() + back.mean()

@@ -1,0 +1,64 @@
+"""The terms of the training loss: one signature, one value each.
+
+Every term takes ``(prediction, rendering, batch)`` and returns a scalar in float32 or wider.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.chamfer import chamfer as chamfer_distance
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.types import Batch, Prediction, Rendering
+
+Scalar = Float[Tensor, ""]
+
+
+def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
+    """Mean |render - photograph| over the whole image (first term of the paper's L_render)."""
+    return (wide(rendering.image) - wide(batch.targets.images)).abs().mean()
+
+
+def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
+    """1 - SSIM over the whole image, without padding, as the authors train (second term of L_render)."""
+    values = ssim(rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1), padding="valid")
+    return 1 - values.mean()
+
+
+def chamfer(
+    prediction: Prediction,
+    rendering: Rendering,
+    batch: Batch,
+    kind: str = "squared",
+    scale: float = 0.1,
+    points: int | None = None,
+) -> Scalar:
+    """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean.
+
+    The points are those before the Gaussian head's offset. ``points`` bounds how many of each set are
+    matched. Raises ``InputError`` when the data has no body vertices.
+    """
+    if batch.body_vertices is None:
+        raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
+    used = prediction.points.valid & batch.masks
+    values = [
+        chamfer_distance(prediction.points.pixels[b][used[b]], vertices, kind, scale, points)
+        for b, vertices in enumerate(batch.body_vertices)
+    ]
+    return torch.stack(values).mean()
+
+
+def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: bool = False) -> Scalar:
+    """Mean |z - true z| in metres (or divided by the true z) over the subject's pixels; 0 without any.
+
+    Raises ``InputError`` when the data does not know depth.
+    """
+    if batch.depths is None:
+        raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
+    used = batch.masks & prediction.depth_valid & (batch.depths > 0)
+    truth = batch.depths[used]
+    error = (wide(prediction.depth)[used] - truth).abs()
+    error = error / truth if relative else error
+    return error.sum() / max(error.numel(), 1)

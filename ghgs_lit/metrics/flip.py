@@ -1,0 +1,149 @@
+"""FLIP: a perceptual difference that needs no weights.
+
+P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A Difference
+Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's. Images are sRGB in
+[0, 1]; the result lies in [0, 1], 0 for equal images.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.geometry.projection import wide
+
+PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
+"""The paper's viewer: 0.7 m away from a 0.7 m wide screen of 3840 pixels."""
+
+# Contrast sensitivity as sums of Gaussians (table 1): amplitude and width for each opponent channel.
+_SENSITIVITY = {"Y": ((1.0, 0.0047),), "Cx": ((1.0, 0.0053),), "Cz": ((34.1, 0.04), (13.5, 0.025))}
+_COLOR_EXPONENT, _FEATURE_EXPONENT = 0.7, 0.5
+_KNEE, _KNEE_VALUE = 0.4, 0.95  # p_c and p_t of section 4.1.4
+_FEATURE_WIDTH = 0.082  # degrees, section 4.2
+# Linear RGB to CIE XYZ under D65, exact fractions of the sRGB primaries.
+_RGB_TO_XYZ = (
+    (10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
+    (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
+    (1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382),
+)
+
+
+def _mix(image: Tensor, matrix: Tensor) -> Tensor:
+    return torch.einsum("ij,njhw->nihw", matrix, image)
+
+
+def _constants(like: Tensor) -> tuple[Tensor, Tensor]:
+    """The matrix to XYZ divided by the white point, and its inverse."""
+    matrix = torch.tensor(_RGB_TO_XYZ, dtype=torch.float64)
+    relative = matrix / matrix.sum(1, keepdim=True)
+    return relative.to(like), torch.linalg.inv(relative).to(like)
+
+
+def _linear(image: Tensor) -> Tensor:
+    """sRGB to linear RGB."""
+    steep = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(image > 0.04045, steep, image / 12.92)
+
+
+def _opponent(xyz: Tensor) -> Tensor:
+    """XYZ relative to white, to YCxCz (a linear CIELab)."""
+    x, y, z = xyz.split(1, dim=1)
+    return torch.cat((116 * y - 16, 500 * (x - y), 200 * (y - z)), dim=1)
+
+
+def _from_opponent(ycc: Tensor) -> Tensor:
+    y = (ycc[:, :1] + 16) / 116
+    return torch.cat((y + ycc[:, 1:2] / 500, y, y - ycc[:, 2:] / 200), dim=1)
+
+
+def _hunt_lab(xyz: Tensor) -> Tensor:
+    """XYZ relative to white, to CIELab with chroma scaled by lightness (Hunt effect, section 4.1.3)."""
+    delta = 6 / 29
+    root = torch.where(xyz > delta**3, xyz.clamp(min=delta**3) ** (1 / 3), xyz / (3 * delta**2) + 4 / 29)
+    x, y, z = root.split(1, dim=1)
+    lightness = 116 * y - 16
+    chroma = 0.01 * lightness
+    return torch.cat((lightness, chroma * 500 * (x - y), chroma * 200 * (y - z)), dim=1)
+
+
+def _hyab(a: Tensor, b: Tensor) -> Float[Tensor, "n h w"]:
+    """City-block in lightness, Euclidean in chroma."""
+    difference = a - b
+    return difference[:, 0].abs() + difference[:, 1:].square().sum(1).sqrt()
+
+
+def _convolve(channel: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
+    """Separable filter (correlation) with the edge pixels repeated outside; channel is [n, 1, h, w]."""
+    ry, rx = len(along_y) // 2, len(along_x) // 2
+    padded = F.pad(channel, (rx, rx, ry, ry), mode="replicate")
+    return F.conv2d(F.conv2d(padded, along_y[None, None, :, None]), along_x[None, None, None, :])
+
+
+def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
+    """Blur each opponent channel as the eye does at ``ppd`` pixels per degree (section 4.1.1)."""
+    widest = max(b for terms in _SENSITIVITY.values() for _, b in terms)
+    radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * ppd)
+    x = torch.arange(-radius, radius + 1, dtype=ycc.dtype, device=ycc.device) / ppd
+    filtered = []
+    for channel, terms in zip(ycc.split(1, dim=1), _SENSITIVITY.values(), strict=True):
+        kernels = [torch.exp(-(math.pi**2) * x.square() / b) for _, b in terms]
+        masses = [a * math.sqrt(math.pi / b) * k.sum() ** 2 for (a, b), k in zip(terms, kernels, strict=True)]
+        parts = [
+            _convolve(channel, k / k.sum(), k / k.sum()) * mass
+            for k, mass in zip(kernels, masses, strict=True)
+        ]
+        filtered.append(sum(parts) / sum(masses))
+    return torch.cat(filtered, dim=1)
+
+
+def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor, "n h w"]:
+    """Colour pipeline of section 4.1 on YCxCz images, redistributed to [0, 1]."""
+    to_xyz, to_rgb = _constants(first)
+
+    def perceived(ycc: Tensor) -> Tensor:
+        rgb = _mix(_from_opponent(_filter_sensitivity(ycc, ppd)), to_rgb).clamp(0, 1)
+        return _hunt_lab(_mix(rgb, to_xyz))
+
+    error = _hyab(perceived(first), perceived(second)) ** _COLOR_EXPONENT
+    green, blue = (_hunt_lab(to_xyz[None, :, i, None, None]) for i in (1, 2))
+    largest = _hyab(green, blue) ** _COLOR_EXPONENT
+    knee = _KNEE * largest
+    above = _KNEE_VALUE + (error - knee) / (largest - knee) * (1 - _KNEE_VALUE)
+    return torch.where(error < knee, _KNEE_VALUE / knee * error, above)
+
+
+def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
+    """Strength of edges and of points in a [n, 1, h, w] channel (section 4.2)."""
+    sigma = 0.5 * _FEATURE_WIDTH * ppd
+    radius = math.ceil(3 * sigma)
+    x = torch.arange(-radius, radius + 1, dtype=lightness.dtype, device=lightness.device)
+    bell = torch.exp(-x.square() / (2 * sigma**2))
+    strengths = []
+    for kernel in (-x * bell, (x.square() / sigma**2 - 1) * bell):
+        positive, negative = kernel.clamp(min=0), kernel.clamp(max=0)
+        kernel = positive / positive.sum() - negative / negative.sum()
+        gx = _convolve(lightness, bell / bell.sum(), kernel)
+        gy = _convolve(lightness, kernel, bell / bell.sum())
+        strengths.append((gx.square() + gy.square()).sqrt()[:, 0])
+    return strengths[0], strengths[1]
+
+
+def flip_map(
+    image: Float[Tensor, "n 3 h w"],
+    target: Float[Tensor, "n 3 h w"],
+    pixels_per_degree: float = PIXELS_PER_DEGREE,
+) -> Float[Tensor, "n h w"]:
+    """FLIP of each pixel; values outside [0, 1] are clamped first."""
+    with torch.autocast(image.device.type, enabled=False):
+        image, target = wide(image).clamp(0, 1), wide(target).clamp(0, 1)
+        to_xyz, _ = _constants(image)
+        first, second = (_opponent(_mix(_linear(i), to_xyz)) for i in (image, target))
+        color = _color_difference(first, second, pixels_per_degree)
+        edges, points = zip(
+            *(_features((i[:, :1] + 16) / 116, pixels_per_degree) for i in (first, second)), strict=True
+        )
+        difference = torch.maximum((edges[0] - edges[1]).abs(), (points[0] - points[1]).abs())
+        feature = (difference / math.sqrt(2)).clamp(0, 1) ** _FEATURE_EXPONENT
+        return color.clamp(0, 1) ** (1 - feature)

@@ -1,0 +1,123 @@
+"""Image metrics as pure functions. Images are RGB in [0, 1] (data range 1); one value an image.
+
+A ``region`` selects the pixels that count. Where it is empty the value is nan, meaning "undefined", and
+averages leave it out.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.geometry.projection import wide
+
+REGIONS = ("image", "box", "subject")
+PADDINGS = ("valid", "reflect", "zeros")
+PSNR_CAP = 100.0
+"""PSNR in dB of equal images, and the most that is reported: float32 cannot tell more apart."""
+
+
+def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | None) -> Float[Tensor, " n"]:
+    """Mean of each map over its region (None: everywhere); nan where the region is empty."""
+    if region is None:
+        return values.mean((-2, -1))
+    count = region.sum((-2, -1))
+    total = torch.where(region, values, torch.zeros_like(values)).sum((-2, -1))
+    return torch.where(count > 0, total / count.clamp(min=1), torch.full_like(total, torch.nan))
+
+
+def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
+    """The smallest upright box around each mask, as a mask; empty where the mask is."""
+
+    def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
+        return (hit.long().cumsum(-1) > 0) & (hit.flip(-1).long().cumsum(-1).flip(-1) > 0)
+
+    return span(mask.any(-1))[:, :, None] & span(mask.any(-2))[:, None, :]
+
+
+def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
+    """Region ``image`` (None: all pixels), ``box`` or ``subject`` of a subject's mask."""
+    choice("region", name, REGIONS)
+    return {"image": lambda: None, "box": lambda: box_of(mask), "subject": lambda: mask}[name]()
+
+
+def psnr(
+    image: Float[Tensor, "n c h w"],
+    target: Float[Tensor, "n c h w"],
+    region: Bool[Tensor, "n h w"] | None = None,
+) -> Float[Tensor, " n"]:
+    """Peak signal-to-noise ratio in dB, ``-10 log10(MSE)``, at most ``PSNR_CAP``."""
+    mse = mean_over((wide(image) - wide(target)).square().mean(1), region)
+    return -10 * mse.clamp(min=10 ** (-PSNR_CAP / 10)).log10()
+
+
+def gaussian_window(size: int, sigma: float, like: Tensor) -> Float[Tensor, " size"]:
+    """Normalised samples of a Gaussian, centred."""
+    x = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
+    weights = torch.exp(-x.square() / (2 * sigma**2))
+    return weights / weights.sum()
+
+
+def _blur(maps: Float[Tensor, "n c h w"], window: Float[Tensor, " k"]) -> Tensor:
+    """Separable convolution of every channel with ``window``, where it lies inside."""
+    n, c, h, w = maps.shape
+    maps = F.conv2d(maps.reshape(n * c, 1, h, w), window[None, None, :, None])
+    maps = F.conv2d(maps, window[None, None, None, :])
+    return maps.reshape(n, c, *maps.shape[-2:])
+
+
+def ssim_map(
+    image: Float[Tensor, "n c h w"],
+    target: Float[Tensor, "n c h w"],
+    padding: str = "valid",
+    window: int = 11,
+    sigma: float = 1.5,
+) -> Float[Tensor, "n c hh ww"]:
+    """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider.
+
+    ``valid`` gives the pixels whose window lies inside the image (what scikit-image averages); the others
+    keep the image's size: ``reflect`` mirrors it outside (torchmetrics), ``zeros`` continues it black (the
+    authors' evaluation).
+    """
+    choice("ssim.padding", padding, PADDINGS)
+    if min(image.shape[-2:]) < window:
+        raise InputError(
+            f"ssim: expected images of at least {window}x{window} pixels; found {tuple(image.shape[-2:])}"
+        )
+    with torch.autocast(image.device.type, enabled=False):
+        x, y = wide(image), wide(target)
+        if padding != "valid":
+            border, mode = [window // 2] * 4, "reflect" if padding == "reflect" else "constant"
+            x, y = F.pad(x, border, mode), F.pad(y, border, mode)
+        moments = torch.cat((x, y, x * x, y * y, x * y), dim=1)
+        blurred = _blur(moments, gaussian_window(window, sigma, moments))
+        mx, my, xx, yy, xy = blurred.chunk(5, dim=1)
+        c1, c2 = 0.01**2, 0.03**2
+        luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
+        return luminance * (2 * (xy - mx * my) + c2) / (xx - mx * mx + yy - my * my + c2)
+
+
+def ssim(
+    image: Float[Tensor, "n c h w"],
+    target: Float[Tensor, "n c h w"],
+    padding: str = "valid",
+    region: Bool[Tensor, "n h w"] | None = None,
+    window: int = 11,
+    sigma: float = 1.5,
+) -> Float[Tensor, " n"]:
+    """Mean of :func:`ssim_map` over the channels and over the pixels of ``region`` that it covers."""
+    values = ssim_map(image, target, padding, window, sigma).mean(1)
+    if region is not None and padding == "valid":
+        border = window // 2
+        region = region[:, border : region.shape[1] - border, border : region.shape[2] - border]
+    return mean_over(values, region)
+
+
+def depth_error_mm(
+    depth: Float[Tensor, "n h w"], truth: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"]
+) -> Float[Tensor, ""]:
+    """Mean |z - true z| in millimetres over all pixels of ``region`` with a true depth; nan without any."""
+    region = region & (truth > 0)
+    require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
+    return 1000 * (wide(depth)[region] - wide(truth)[region]).abs().mean()

@@ -1,0 +1,121 @@
+"""The pure functions as ``torchmetrics.Metric``: the mean over all images seen."""
+
+import warnings
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torchmetrics import Metric
+
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.metrics import functional
+from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
+
+Images = Float[Tensor, "n 3 h w"]
+Masks = Bool[Tensor, "n h w"]
+
+
+class PerImageMetric(Metric):
+    """Mean of one value an image; undefined values (nan) are left out, nan when all are."""
+
+    full_state_update = False
+    is_differentiable = False
+
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
+
+    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+        """The value of each image; ``mask`` is the subject's in the target."""
+        raise NotImplementedError
+
+    def update(self, image: Images, target: Images, mask: Masks) -> None:
+        values = self.per_image(image, target, mask)
+        defined = ~values.isnan()
+        self.total += values[defined].double().sum()
+        self.count += defined.sum()
+
+    def compute(self) -> Tensor:
+        return self.total / self.count
+
+    def set_dtype(self, dst_type):
+        """States keep their dtype: a mean over many images is accumulated in float64."""
+        return self
+
+
+class PSNR(PerImageMetric):
+    """PSNR in dB over a region; equal images count as ``functional.PSNR_CAP``."""
+
+    higher_is_better = True
+
+    def __init__(self, region: str = "image", **kwargs):
+        super().__init__(**kwargs)
+        choice("region", region, functional.REGIONS)
+        self.region = region
+
+    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+        return functional.psnr(image, target, functional.region_of(mask, self.region))
+
+
+class SSIM(PerImageMetric):
+    """SSIM over a region; ``padding`` as in :func:`~ghgs_lit.metrics.functional.ssim_map`."""
+
+    higher_is_better = True
+
+    def __init__(self, padding: str = "reflect", region: str = "image", **kwargs):
+        super().__init__(**kwargs)
+        choice("ssim.padding", padding, functional.PADDINGS)
+        choice("region", region, functional.REGIONS)
+        self.padding, self.region = padding, region
+
+    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+        return functional.ssim(image, target, self.padding, functional.region_of(mask, self.region))
+
+
+class FLIP(PerImageMetric):
+    """Mean FLIP over a region, seen at ``pixels_per_degree``."""
+
+    higher_is_better = False
+
+    def __init__(self, region: str = "image", pixels_per_degree: float = PIXELS_PER_DEGREE, **kwargs):
+        super().__init__(**kwargs)
+        choice("region", region, functional.REGIONS)
+        require(pixels_per_degree > 0, "pixels_per_degree", "a positive number", pixels_per_degree)
+        self.region, self.pixels_per_degree = region, pixels_per_degree
+
+    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+        values = flip_map(image, target, self.pixels_per_degree)
+        return functional.mean_over(values, functional.region_of(mask, self.region))
+
+
+class LPIPS(PerImageMetric):
+    """LPIPS of the whole image through torchmetrics, which needs torchvision and its weights.
+
+    ``signed`` maps [0, 1] to the [-1, 1] that the network was calibrated on; the authors' evaluation
+    does not. Raises ``InputError`` where the package or the weights cannot be had.
+    """
+
+    higher_is_better = False
+
+    def __init__(self, net: str = "vgg", signed: bool = True, **kwargs):
+        super().__init__(**kwargs)
+        choice("lpips.net", net, ("vgg", "alex", "squeeze"))
+        try:
+            import torchvision  # noqa: F401
+        except ImportError as error:
+            raise InputError("LPIPS needs torchvision: pip install 'ghgs-lit[lpips]'") from error
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                self.network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=signed)
+        except Exception as error:  # the download fails in as many ways as networks do
+            raise InputError(f"LPIPS: the weights of {net!r} could not be had: {error}") from error
+        self.signed = signed
+
+    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+        # The network's range check has no use for a render that overshoots by a rounding error.
+        singles = (images.float().clamp(0, 1).split(1) for images in (image, target))
+        return torch.stack([self.network(a, b) for a, b in zip(*singles, strict=True)])

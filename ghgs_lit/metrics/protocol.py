@@ -1,0 +1,81 @@
+"""A measuring protocol: which metrics, how each is computed, under which names."""
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.errors import InputError, choice
+from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE
+from ghgs_lit.metrics.functional import REGIONS
+from ghgs_lit.metrics.metric import FLIP, LPIPS, PSNR, SSIM, PerImageMetric
+
+LPIPS_POLICIES = ("auto", "require", "off")
+
+
+class ImageMetrics:
+    """All metrics of a protocol at once: ``metrics(image, target, mask)`` gives a value an image by name.
+
+    Names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
+    ``_subject`` for the other ``regions`` (FLIP: not the subject's pixels alone, since it is a blur).
+
+    Args:
+        protocol: the name that every reported figure carries.
+        regions: where PSNR and SSIM are taken: ``image``, ``box``, ``subject``.
+        ssim_padding: ``reflect`` (torchmetrics), ``valid`` (scikit-image) or ``zeros`` (the authors).
+        clamp: whether renders are clamped to [0, 1] first.
+        lpips: ``auto`` leaves LPIPS out, with one line, where it cannot be had; ``require`` fails; ``off``.
+        lpips_net: ``vgg``, ``alex`` or ``squeeze``.
+        lpips_signed: whether LPIPS sees [-1, 1] (as it was calibrated) or [0, 1].
+        flip_pixels_per_degree: FLIP's viewing distance.
+    """
+
+    def __init__(
+        self,
+        protocol: str = "correct",
+        regions: Sequence[str] = REGIONS,
+        ssim_padding: str = "reflect",
+        clamp: bool = True,
+        lpips: str = "auto",
+        lpips_net: str = "vgg",
+        lpips_signed: bool = True,
+        flip_pixels_per_degree: float = PIXELS_PER_DEGREE,
+    ):
+        choice("metrics.lpips", lpips, LPIPS_POLICIES)
+        for region in regions:
+            choice("metrics.regions", region, REGIONS)
+        self.protocol, self.clamp = protocol, clamp
+        self.metrics: dict[str, PerImageMetric] = {}
+        for region in regions:
+            suffix = "" if region == "image" else f"_{region}"
+            self.metrics[f"psnr{suffix}"] = PSNR(region)
+            self.metrics[f"ssim{suffix}"] = SSIM(ssim_padding, region)
+            if region != "subject":
+                self.metrics[f"flip{suffix}"] = FLIP(region, flip_pixels_per_degree)
+        if lpips != "off":
+            try:
+                self.metrics["lpips"] = LPIPS(lpips_net, lpips_signed)
+            except InputError as error:
+                if lpips == "require":
+                    raise
+                warnings.warn(f"left out: {error}", stacklevel=2)
+
+    def to(self, device: torch.device | str) -> "ImageMetrics":
+        self.metrics = {name: metric.to(device) for name, metric in self.metrics.items()}
+        return self
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        image: Float[Tensor, "n 3 h w"],
+        target: Float[Tensor, "n 3 h w"],
+        mask: Bool[Tensor, "n h w"],
+    ) -> dict[str, Tensor]:
+        """One value an image for each metric; nan where a region is empty."""
+        image = image.clamp(0, 1) if self.clamp else image
+        return {name: metric.per_image(image, target, mask) for name, metric in self.metrics.items()}
+
+    def higher_is_better(self, name: str) -> bool:
+        return bool(self.metrics[name].higher_is_better)

@@ -1,0 +1,197 @@
+"""Losses against SciPy, kornia, the authors' numbers and finite differences."""
+
+import dataclasses
+
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.chamfer import chamfer, nearest, penalty
+from ghgs_lit.losses import Losses
+from ghgs_lit.types import (
+    Batch,
+    Cameras,
+    DepthMaps,
+    Gaussians,
+    Points,
+    Prediction,
+    Rendering,
+    Targets,
+)
+
+
+def _cameras(*shape: int, height: int, width: int) -> Cameras:
+    return Cameras(
+        torch.eye(3).expand(*shape, 3, 3).clone(), torch.eye(4).expand(*shape, 4, 4).clone(), height, width
+    )
+
+
+def _example(seed: int = 0, body: bool = True, depths: bool = True):
+    """A batch of two people in two views with one target, a prediction and its rendering."""
+    g = torch.Generator().manual_seed(seed)
+    b, v, h, w = 2, 2, 16, 18
+    cameras = _cameras(b, v, height=h, width=w)
+    masks = torch.rand(b, v, h, w, generator=g) > 0.5
+    points = torch.rand(b, v, h, w, 3, generator=g)
+    depth = torch.rand(b, v, h, w, generator=g) + 1
+    valid = torch.rand(b, v, h, w, generator=g) > 0.2
+    n = 4
+    gaussians = Gaussians(
+        torch.rand(n, 3), torch.rand(n, 4), torch.rand(n, 3), torch.rand(n), torch.rand(n, 3), (2, 2)
+    )
+    prediction = Prediction(
+        gaussians=gaussians,
+        depth=depth,
+        depth_valid=valid,
+        points=Points(points, valid, torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)),
+        depth_maps=DepthMaps(depth, valid, torch.ones_like(depth)),
+    )
+    targets = Targets(
+        torch.rand(b, 1, 3, h, w, generator=g),
+        torch.ones(b, 1, h, w, dtype=torch.bool),
+        _cameras(b, 1, height=h, width=w),
+    )
+    batch = Batch(
+        images=torch.rand(b, v, 3, h, w, generator=g),
+        masks=masks,
+        cameras=cameras,
+        targets=targets,
+        body_vertices=[torch.rand(30, 3, generator=g) for _ in range(b)] if body else None,
+        depths=torch.rand(b, v, h, w, generator=g) + 1 if depths else None,
+    )
+    rendering = Rendering(
+        torch.rand(b, 1, 3, h, w, generator=g), torch.ones(b, 1, 1, h, w), torch.ones(b, 1, 1, h, w)
+    )
+    return prediction, rendering, batch
+
+
+def _reference_chamfer(a: torch.Tensor, b: torch.Tensor) -> float:
+    squared = cdist(a.double().numpy(), b.double().numpy(), "sqeuclidean")
+    return squared.min(1).mean() + squared.min(0).mean()
+
+
+def test_nearest_neighbours_are_exact():
+    g = torch.Generator().manual_seed(0)
+    a, b = torch.rand(300, 3, generator=g), torch.rand(200, 3, generator=g)
+    expected = torch.from_numpy(cdist(a.double(), b.double()).argmin(1))
+    assert torch.equal(nearest(a, b), expected)
+
+
+def test_chamfer_is_scipys():
+    g = torch.Generator().manual_seed(1)
+    a, b = torch.rand(120, 3, generator=g), torch.rand(90, 3, generator=g)
+    assert chamfer(a, b).item() == pytest.approx(_reference_chamfer(a, b), rel=1e-6)
+    assert chamfer(a.bfloat16(), b).dtype == torch.float32
+
+
+@pytest.mark.parametrize("kind", ["squared", "huber", "truncated"])
+def test_chamfer_gradient_is_that_of_finite_differences(kind):
+    g = torch.Generator().manual_seed(2)
+    a = torch.rand(12, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    b = torch.rand(9, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x, y: chamfer(x, y, kind, scale=0.3), (a, b))
+
+
+def test_one_outlier_owns_the_squared_gradient_only():
+    g = torch.Generator().manual_seed(3)
+    body = torch.rand(500, 3, generator=g)
+    points = body + 0.01 * torch.randn(500, 3, generator=g)
+    points[0] = 1000.0
+    share = {}
+    for kind in ("squared", "huber", "truncated"):
+        leaf = points.clone().requires_grad_()
+        chamfer(leaf, body, kind, scale=0.1).backward()
+        norms = leaf.grad.norm(dim=-1)
+        assert torch.isfinite(norms).all()
+        share[kind] = (norms[0] / norms.sum()).item()
+    assert share["squared"] > 0.99
+    assert share["huber"] < 0.05
+    assert share["truncated"] == 0
+
+
+def test_penalties_agree_within_the_scale_and_meet_at_it():
+    offsets = torch.tensor([[0.05, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])
+    assert torch.allclose(penalty(offsets, "huber", 0.1), torch.tensor([0.0025, 0.01, 0.05]))
+    assert torch.allclose(penalty(offsets, "truncated", 0.1), torch.tensor([0.0025, 0.01, 0.01]))
+
+
+def test_chamfer_of_empty_and_of_broken_sets():
+    points = torch.zeros(0, 3, requires_grad=True)
+    value = chamfer(points, torch.rand(5, 3))
+    value.backward()
+    assert value.item() == 0
+    assert chamfer(torch.rand(5, 3), torch.zeros(0, 3)).item() == 0
+    coincident = torch.rand(4, 3, requires_grad=True)
+    chamfer(coincident, coincident.detach(), "huber").backward()
+    assert torch.equal(coincident.grad, torch.zeros(4, 3))
+    assert chamfer(torch.full((3, 3), torch.inf), torch.rand(5, 3)).isnan()
+
+
+def test_the_total_is_the_weighted_sum_of_reference_terms():
+    kornia = pytest.importorskip("kornia")
+    prediction, rendering, batch = _example()
+    weights = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.5, "depth": 0.5}
+    total, values = Losses(weights)(prediction, rendering, batch)
+    image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
+    ssim = kornia.metrics.ssim(image, target, 11, padding="valid").mean()
+    used = prediction.points.valid & batch.masks
+    clouds = [
+        _reference_chamfer(prediction.points.pixels[b][used[b]], batch.body_vertices[b]) for b in range(2)
+    ]
+    expected = {
+        "render_l1": (image - target).abs().mean().item(),
+        "render_ssim": 1 - ssim.item(),
+        "chamfer": sum(clouds) / 2,
+        "depth": (prediction.depth - batch.depths).abs()[used].mean().item(),
+    }
+    assert {k: v.item() for k, v in values.items()} == pytest.approx(expected, rel=1e-4)
+    assert total.item() == pytest.approx(sum(weights[k] * expected[k] for k in weights), rel=1e-4)
+
+
+def test_terms_of_weight_zero_are_not_computed():
+    prediction, rendering, batch = _example(body=False, depths=False)
+    total, values = Losses({"render_l1": 1.0, "chamfer": 0.0, "depth": 0.0})(prediction, rendering, batch)
+    assert list(values) == ["render_l1"]
+    assert total == values["render_l1"]
+
+
+@pytest.mark.parametrize("term", ["chamfer", "depth"])
+def test_a_term_that_the_data_cannot_feed_is_an_error(term):
+    prediction, rendering, batch = _example(body=False, depths=False)
+    with pytest.raises(InputError, match=rf"loss\.weights\.{term}"):
+        Losses({term: 1.0})(prediction, rendering, batch)
+
+
+def test_losses_without_any_subject_pixel_are_zero():
+    prediction, rendering, batch = _example()
+    batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks))
+    _, values = Losses({"chamfer": 1.0, "depth": 1.0})(prediction, rendering, batch)
+    assert values["chamfer"].item() == 0
+    assert values["depth"].item() == 0
+
+
+def test_subsampled_chamfer_is_unbiased():
+    prediction, rendering, batch = _example()
+    _, full = Losses({"chamfer": 1.0})(prediction, rendering, batch)
+    torch.manual_seed(0)
+    few = Losses({"chamfer": 1.0}, chamfer_points=25)
+    values = torch.stack([few(prediction, rendering, batch)[1]["chamfer"] for _ in range(200)])
+    assert values.std() > 0
+    assert values.mean().item() == pytest.approx(full["chamfer"].item(), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key"),
+    [
+        ({"weights": {"render_l2": 1.0}}, "loss.weights"),
+        ({"weights": {"render_l1": -1.0}}, r"loss\.weights\.render_l1"),
+        ({"weights": {"render_l1": 0.0}}, r"loss\.weights"),
+        ({"weights": {"chamfer": 1.0}, "chamfer": "cubed"}, r"loss\.chamfer"),
+        ({"weights": {"chamfer": 1.0}, "chamfer_scale": 0.0}, r"loss\.chamfer_scale"),
+        ({"weights": {"depth": 1.0}, "depth": "inches"}, r"loss\.depth"),
+    ],
+)
+def test_impossible_values_name_their_key(arguments, key):
+    with pytest.raises(InputError, match=key):
+        Losses(**arguments)

@@ -1,0 +1,177 @@
+"""Metrics against torchmetrics, the authors' numbers, the reference FLIP and exact cases."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torchmetrics.functional.image import (
+    peak_signal_noise_ratio,
+    structural_similarity_index_measure,
+)
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.metrics import PSNR, PSNR_CAP, SSIM, ImageMetrics, depth_error_mm, flip_map, psnr, ssim
+from ghgs_lit.metrics.functional import box_of, ssim_map
+
+FIXTURES = Path(__file__).parent / "fixtures"
+
+
+def _images(n=3, h=30, w=41, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    target = torch.rand(n, 3, h, w, generator=g)
+    image = (target + 0.1 * torch.randn(target.shape, generator=g)).clamp(0, 1)
+    return image, target
+
+
+def test_authors_evaluation_numbers():
+    data = load_file(FIXTURES / "losses.safetensors")
+    first, second = data["in/img1"], data["in/img2"]
+    assert torch.allclose(psnr(first, second)[:, None], data["out/psnr"], atol=1e-5)
+    assert torch.allclose(ssim(first, second, "zeros"), data["out/ssim_per_image"], atol=2e-6)
+    assert torch.allclose(
+        ssim(first.double(), second.double(), "zeros"), data["out64/ssim_per_image"], atol=2e-7
+    )
+    # Without padding it is another number: the fixture tells them apart.
+    assert (ssim(first, second, "valid") - data["out/ssim_per_image"]).abs().min() > 1e-3
+
+
+def test_psnr_and_ssim_are_torchmetrics():
+    image, target = _images()
+    for i in range(len(image)):
+        a, b = image[i : i + 1], target[i : i + 1]
+        assert psnr(a, b).item() == pytest.approx(
+            peak_signal_noise_ratio(a, b, data_range=1.0).item(), abs=1e-4
+        )
+        expected = structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5)
+        assert ssim(a, b, "reflect").item() == pytest.approx(expected.item(), abs=1e-5)
+
+
+def test_ssim_without_padding_is_the_interior():
+    """``valid`` is scikit-image's average (``use_sample_covariance=False``): the map without its border."""
+    image, target = _images(1)
+    inside = ssim_map(image, target, "reflect")[..., 5:-5, 5:-5].mean()
+    assert ssim(image, target, "valid").item() == pytest.approx(inside.item(), abs=1e-6)
+    metrics = pytest.importorskip("skimage.metrics")
+    expected = metrics.structural_similarity(
+        image[0].numpy(), target[0].numpy(), channel_axis=0, data_range=1.0,
+        gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+    )  # fmt: skip
+    assert ssim(image, target, "valid").item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_ssim_gradient_is_that_of_finite_differences():
+    image, target = (i.double() for i in _images(1, 12, 13))
+    image.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: ssim(x, target, "valid"), (image,))
+
+
+def test_ssim_is_wide_under_autocast():
+    image, target = _images()
+    with torch.autocast("cpu", torch.bfloat16):
+        low = ssim(image, target)
+    assert torch.equal(low, ssim(image, target))
+
+
+def test_psnr_of_known_errors_by_region():
+    target = torch.zeros(1, 3, 10, 12)
+    mask = torch.zeros(1, 10, 12, dtype=torch.bool)
+    mask[0, 2, 3] = mask[0, 5, 8] = True
+    image = target.clone()
+    image[0, :, 2, 3] = 0.1  # one subject pixel is off by 0.1, the rest is exact
+    box = box_of(mask)
+    assert box.sum() == 4 * 6
+    assert box[0, 2:6, 3:9].all()
+    assert psnr(image, target).item() == pytest.approx(20 + 10 * np.log10(120), abs=1e-4)
+    assert psnr(image, target, box).item() == pytest.approx(20 + 10 * np.log10(24), abs=1e-4)
+    assert psnr(image, target, mask).item() == pytest.approx(20 + 10 * np.log10(2), abs=1e-4)
+
+
+def test_equal_images_and_empty_regions_are_defined():
+    image, _ = _images()
+    nobody = torch.zeros(3, 30, 41, dtype=torch.bool)
+    assert torch.equal(psnr(image, image), torch.full((3,), PSNR_CAP))
+    assert torch.allclose(ssim(image, image), torch.ones(3))
+    assert flip_map(image, image).abs().max() == 0
+    assert psnr(image, image, nobody).isnan().all()
+    assert not box_of(nobody).any()
+    metric = PSNR("box")
+    metric.update(image, image, nobody)
+    metric.update(image, image, ~nobody)
+    assert metric.compute().item() == pytest.approx(PSNR_CAP)
+    assert depth_error_mm(torch.ones(3, 30, 41), torch.ones(3, 30, 41), nobody).isnan()
+
+
+def test_ssim_of_a_region_is_the_mean_of_its_windows():
+    image, target = _images(1)
+    region = torch.zeros(1, 30, 41, dtype=torch.bool)
+    region[0, 12, 20] = True
+    window = ssim(image[..., 7:18, 15:26], target[..., 7:18, 15:26])  # the one window centred there
+    assert ssim(image, target, "valid", region).item() == pytest.approx(window.item(), abs=1e-6)
+    with pytest.raises(InputError, match="at least 11x11"):
+        ssim(image[..., :10], target[..., :10])
+
+
+def test_flip_is_the_reference_implementation():
+    """``flip.npz``: maps made with the authors' flip-evaluator 1.7 at its default viewing distance."""
+    data = np.load(FIXTURES / "flip.npz")
+    reference, test = (
+        torch.from_numpy(data[k].astype(np.float32) / 255).permute(0, 3, 1, 2) for k in ("reference", "test")
+    )
+    assert torch.allclose(flip_map(test, reference), torch.from_numpy(data["flip"]), atol=2e-5)
+
+
+def test_flip_of_black_and_white_is_nearly_one():
+    black, white = torch.zeros(1, 3, 20, 20), torch.ones(1, 3, 20, 20)
+    value = flip_map(white, black)
+    assert value.max() <= 1
+    assert value.min() > 0.9
+    assert torch.allclose(flip_map(black, white), value, atol=1e-6)
+
+
+def test_metric_classes_average_the_pure_functions():
+    image, target = _images(4)
+    mask = torch.rand(4, 30, 41, generator=torch.Generator().manual_seed(5)) > 0.9
+    for metric, values in (
+        (PSNR("box"), psnr(image, target, box_of(mask))),
+        (SSIM("zeros"), ssim(image, target, "zeros")),
+    ):
+        metric.update(image[:1], target[:1], mask[:1])
+        metric.update(image[1:], target[1:], mask[1:])
+        assert metric.compute().item() == pytest.approx(values.mean().item(), rel=1e-6)
+        assert not metric.state_dict()
+
+
+def test_a_protocol_reports_its_metrics_by_name():
+    image, target = _images(2)
+    mask = torch.zeros(2, 30, 41, dtype=torch.bool)
+    mask[:, 8:20, 10:30] = True
+    values = ImageMetrics(lpips="off")(image * 1.5, target, mask)
+    assert set(values) == {
+        "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
+    }  # fmt: skip
+    assert torch.equal(values["psnr"], psnr((image * 1.5).clamp(0, 1), target))
+    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")(image * 1.5, target, mask)
+    assert set(release) == {"psnr", "ssim", "flip"}
+    assert torch.equal(release["psnr"], psnr(image * 1.5, target))
+
+
+def test_lpips_is_left_out_with_a_line_or_refused():
+    try:
+        import torchvision  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip("torchvision is installed")
+    with pytest.warns(UserWarning, match="LPIPS needs torchvision"):
+        assert "lpips" not in ImageMetrics(lpips="auto").metrics
+    with pytest.raises(InputError, match="torchvision"):
+        ImageMetrics(lpips="require")
+
+
+def test_depth_error_is_in_millimetres_on_known_subject_pixels():
+    depth = torch.full((1, 2, 3), 2.0)
+    truth = torch.tensor([[[2.01, 2.03, 0.0], [2.0, 5.0, 2.0]]])
+    region = torch.tensor([[[True, True, True], [False, False, True]]])
+    assert depth_error_mm(depth, truth, region).item() == pytest.approx((10 + 30 + 0) / 3, abs=1e-3)
