@@ -1,0 +1,28 @@
+"""Human Gaussian splatting from a few calibrated photographs: train, ablate, sweep, compare."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ghgs_lit.model import GHGS
+    from ghgs_lit.rendering import render
+    from ghgs_lit.types import Batch, Gaussians
+
+_HOMES = {
+    "GHGS": "ghgs_lit.model",
+    "Batch": "ghgs_lit.types",
+    "Gaussians": "ghgs_lit.types",
+    "render": "ghgs_lit.rendering",
+}
+__all__ = ["GHGS", "Batch", "Gaussians", "render"]
+
+
+def __getattr__(name: str):
+    """Public names, imported on first use: ``ghgs --help`` must not wait for PyTorch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

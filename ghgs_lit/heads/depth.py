@@ -1,0 +1,94 @@
+"""The depth stage: one z-depth and one confidence for each pixel (paper, section 3.2)."""
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.visual_hull import SubjectBounds
+from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.proportions import proportioned_dpt
+from ghgs_lit.types import Batch, DepthMaps, Tokens
+
+
+def _bounded_inverse(x: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """``1 / z`` between ``1 / far`` and ``1 / near``: steps of equal size on the image of another view."""
+    share = x.sigmoid()
+    return near * far / (far * share + near * (1 - share))
+
+
+def _log(x: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    return near * torch.exp(x.sigmoid() * torch.log(far / near))
+
+
+def _linear(x: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    return near + (far - near) * x.sigmoid()
+
+
+#: From a raw value to a depth within ``[near, far]``; 0 gives a depth in the middle.
+BOUNDED = {"bounded_inverse": _bounded_inverse, "log": _log, "linear": _linear}
+
+
+def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound."""
+    return 1 / (x + 1e-8)
+
+
+class DepthHead(nn.Module):
+    """Depth from the four layers of tokens by a dense head.
+
+    Args:
+        dim_latent: width of the tokens (from the encoder).
+        dpt: options of the dense head; widths that are not given follow the encoder's.
+        parameterization: ``bounded_inverse``, ``log`` or ``linear`` between the near and far of each pixel,
+            starting in their middle; ``inverse_linear`` for the authors' checkpoints only.
+        bounds: where near and far come from: ``box`` or ``hull``; ``none`` with ``inverse_linear``.
+        search: options of :class:`SubjectBounds`.
+    """
+
+    def __init__(
+        self,
+        dim_latent: int,
+        dpt: Mapping | None = None,
+        parameterization: str = "bounded_inverse",
+        bounds: str = "box",
+        search: Mapping | None = None,
+    ):
+        super().__init__()
+        choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
+        choice("depth_head.bounds", bounds, ("box", "hull", "none"))
+        require(
+            (bounds == "none") == (parameterization == "inverse_linear"),
+            "depth_head.bounds",
+            "none with inverse_linear, box or hull with all others",
+            f"{bounds} with {parameterization}",
+        )
+        self.parameterization = parameterization
+        self.bounds = None if bounds == "none" else SubjectBounds(kind=bounds, **(search or {}))
+        self.dpt = proportioned_dpt(dim_latent, 2, **(dpt or {}))
+        if self.bounds is not None:
+            last = self.dpt.scratch.output_conv2[-1]
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(self, tokens: Tokens, batch: Batch) -> DepthMaps:
+        """Depths of all pixels; those of the subject are valid. What is not finite becomes 1 m, invalid."""
+        raw = wide(self.dpt(tokens, batch.images, batch.masks))
+        value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
+        near = far = None
+        if self.bounds is None:
+            depth = inverse_linear(value)
+        else:
+            near, far = self.bounds(batch.masks, batch.cameras)
+            depth = BOUNDED[self.parameterization](value, near, far)
+        finite = depth.isfinite()
+        return DepthMaps(
+            depth=torch.where(finite, depth, 1.0),
+            valid=batch.masks & finite,
+            confidence=CONFIDENCES["expp1"](confidence),
+            near=near,
+            far=far,
+        )

@@ -1,0 +1,175 @@
+"""The Gaussian stage: one Gaussian for each pixel of the subject (paper, section 3.3)."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from math import log
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.heads.activations import unit
+from ghgs_lit.heads.proportions import proportioned_dpt
+from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Tokens
+
+Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _logit(share: float) -> float:
+    return log(share / (1 - share))
+
+
+def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), activation()]
+    return nn.Sequential(*layers[:-1])
+
+
+class FootprintAttributes:
+    """Raw values to attributes in units of what one pixel sees; raw zeros give a splat on the surface.
+
+    A pixel's footprint is ``z / f`` metres. Scales lie between ``scale_floor`` and ``scale_cap`` footprints
+    (log scale), starting at ``scale_start``; the floor leaves no holes when the splat is rendered at a higher
+    resolution. Opacities lie above ``opacity_floor``, starting at ``opacity_start``: below 1/255 a splat
+    has no gradient left. Offsets lie within ``offset_limit`` metres along each axis.
+    """
+
+    def __init__(
+        self,
+        offset_limit: float = 0.05,
+        scale_floor: float = 0.15,
+        scale_cap: float = 4.0,
+        scale_start: float = 0.3,
+        opacity_floor: float = 0.1,
+        opacity_start: float = 0.9,
+    ):
+        key = "gaussian_head.attributes"
+        require(offset_limit >= 0, f"{key}.offset_limit", "0 or more metres", offset_limit)
+        rising = 0 < scale_floor < scale_start < scale_cap
+        require(
+            rising,
+            f"{key}.scale_start",
+            "0 < scale_floor < scale_start < scale_cap",
+            (scale_floor, scale_start, scale_cap),
+        )
+        require(
+            0 <= opacity_floor < opacity_start < 1,
+            f"{key}.opacity_start",
+            "0 <= opacity_floor < opacity_start < 1",
+            (opacity_floor, opacity_start),
+        )
+        self.offset_limit, self.scale_floor, self.opacity_floor = offset_limit, scale_floor, opacity_floor
+        self.scale_range = log(scale_cap / scale_floor)
+        self.scale_bias = _logit(log(scale_start / scale_floor) / self.scale_range)
+        self.opacity_bias = _logit((opacity_start - opacity_floor) / (1 - opacity_floor))
+
+    def __call__(
+        self,
+        offset: Float[Tensor, "N 3"],
+        scale: Float[Tensor, "N 3"],
+        rotation: Float[Tensor, "N 4"],
+        opacity: Float[Tensor, " N"],
+        footprint: Float[Tensor, " N"],
+    ) -> Attributes:
+        identity = rotation.new_tensor([1.0, 0.0, 0.0, 0.0])
+        scale = self.scale_floor * torch.exp(self.scale_range * (scale + self.scale_bias).sigmoid())
+        opacity = self.opacity_floor + (1 - self.opacity_floor) * (opacity + self.opacity_bias).sigmoid()
+        return (
+            self.offset_limit * offset.tanh(),
+            footprint[:, None] * scale,
+            unit(identity + rotation),
+            opacity,
+        )
+
+
+def release_attributes(
+    offset: Float[Tensor, "N 3"],
+    scale: Float[Tensor, "N 3"],
+    rotation: Float[Tensor, "N 4"],
+    opacity: Float[Tensor, " N"],
+    footprint: Float[Tensor, " N"],
+) -> Attributes:
+    """As in the authors' release: offsets and scales in metres, without bound."""
+    return offset, F.softplus(scale, beta=100), unit(rotation), opacity.sigmoid()
+
+
+class GaussianHead(nn.Module):
+    """A dense head over the recalibrated tokens, then four small networks for each pixel of the subject.
+
+    Colours are the input pixels'. Published names: ``offset_header``, ``scale_header``, ``rot_header``,
+    ``opacity_header``, linears at 0, 2 and 4.
+
+    Args:
+        dim_latent: width of the tokens (from the encoder).
+        dpt: options of the dense head; widths that are not given follow the encoder's.
+        channels: of the dense head's result, a descriptor for each pixel.
+        hidden: widths inside the four networks.
+        parameterization: ``footprint`` (:class:`FootprintAttributes`, raw values start at 0) or
+            ``release`` (:func:`release_attributes`, PyTorch's initialisation).
+        attributes: options of :class:`FootprintAttributes`.
+        pixels: ``subject`` runs the four networks on the subject's pixels, ``all`` on every pixel and
+            selects after; the Gaussians are the same.
+    """
+
+    def __init__(
+        self,
+        dim_latent: int,
+        dpt: Mapping | None = None,
+        channels: int = 32,
+        hidden: Sequence[int] = (128, 32),
+        parameterization: str = "footprint",
+        attributes: Mapping | None = None,
+        pixels: str = "subject",
+    ):
+        super().__init__()
+        choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
+        choice("gaussian_head.pixels", pixels, ("subject", "all"))
+        require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
+        self.pixels = pixels
+        self.decoder = proportioned_dpt(dim_latent, channels, **(dpt or {}))
+        self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
+        self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
+        self.rot_header = _mlp((channels, *hidden, 4), nn.ReLU)
+        self.opacity_header = _mlp((channels, *hidden, 1), nn.ReLU)
+        self.activate = release_attributes
+        if parameterization == "footprint":
+            self.activate = FootprintAttributes(**(attributes or {}))
+            for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header):
+                nn.init.zeros_(header[-1].weight)
+                nn.init.zeros_(header[-1].bias)
+
+    def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
+        """Gaussians of the valid pixels in the order of element, view, row, column."""
+        maps = self.decoder(tokens, batch.images, batch.masks)
+        image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+        descriptors = maps.flatten(2).transpose(1, 2)
+        if self.pixels == "subject":
+            raw = self._raw(descriptors[image, pixel])
+        else:
+            raw = tuple(value[image, pixel] for value in self._raw(descriptors))
+        focal = wide(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
+        depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
+        # Without a gradient: a splat that is too large must not come nearer to become smaller.
+        footprint = depth.detach() / focal
+        offset, scales, quaternions, opacities = self.activate(*raw, footprint)
+        return Gaussians(
+            means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
+            quaternions=quaternions,
+            scales=scales,
+            opacities=opacities,
+            colors=wide(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel],
+            splits=tuple(points.valid.flatten(1).sum(1).tolist()),
+            image=image,
+            pixel=pixel,
+        )
+
+    def _raw(self, descriptors: Float[Tensor, "*n c"]) -> Attributes:
+        offset, scale, rotation, opacity = (
+            wide(header(descriptors))
+            for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header)
+        )
+        return offset, scale, rotation, opacity[..., 0]

@@ -1,0 +1,84 @@
+"""Exact nearest neighbours among the tokens of one batch element (paper, section 3.3)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.projection import wide
+
+MODES = ("all", "other_views", "mixed")
+
+#: Distances that are held at once: bounds memory, and keeps a block in a CPU's cache.
+_BLOCK = 1 << 18
+
+
+@dataclass(frozen=True)
+class Neighbors:
+    """Of each of ``n`` tokens, the indices of ``k`` others (or itself); where not ``valid``, none."""
+
+    index: Int[Tensor, "n k"]
+    valid: Bool[Tensor, "n k"]
+
+
+@torch.no_grad()
+def nearest_neighbors(
+    points: Float[Tensor, "n d"], view: Int[Tensor, " n"], k: int, mode: str = "all"
+) -> Neighbors:
+    """The ``k`` nearest points of each point, or as many as there are, nearest first, ties by index.
+
+    Distances come from differences in float32 or wider (no expansion into products, which loses digits
+    far from the origin). ``mode``: ``all`` takes any view, the point itself included;
+    ``other_views`` no point of the query's own view, unless there is no other (then the query itself);
+    ``mixed`` up to ``k // 2`` of the own view, itself included, and the rest from others.
+    """
+    choice("recalibration.neighbors", mode, MODES)
+    require(k >= 1, "recalibration.k", "1 or more", k)
+    points = wide(points)
+    n = points.shape[0]
+    parts = [
+        _nearest_to_block(points, view, slice(start, start + step), min(k, n), mode)
+        for step in [max(1, _BLOCK // max(n, 1))]
+        for start in range(0, max(n, 1), step)
+    ]
+    return Neighbors(torch.cat([p.index for p in parts]), torch.cat([p.valid for p in parts]))
+
+
+def _nearest_to_block(points: Tensor, view: Tensor, block: slice, k: int, mode: str) -> Neighbors:
+    distance = torch.cdist(points[block], points, compute_mode="donot_use_mm_for_euclid_dist")
+    if mode == "all":
+        index = _smallest(distance, k)
+        return Neighbors(index, torch.ones_like(index, dtype=torch.bool))
+    same = view[block, None] == view
+    other = _allowed(distance, ~same, k if mode == "other_views" else k - k // 2)
+    if mode == "mixed":
+        own = _allowed(distance, same, k // 2)
+        return Neighbors(
+            torch.cat((own.index, other.index), dim=1), torch.cat((own.valid, other.valid), dim=1)
+        )
+    alone = ~other.valid.any(1)
+    query = torch.arange(len(points), device=points.device)[block]
+    index = torch.where(alone[:, None], query[:, None], other.index)
+    first = torch.arange(index.shape[1], device=points.device) == 0
+    return Neighbors(index, other.valid | (alone[:, None] & first))
+
+
+def _allowed(distance: Tensor, mask: Tensor, k: int) -> Neighbors:
+    """The nearest among those in ``mask``; distances that are not allowed sort behind all others."""
+    index = _smallest(torch.where(mask, distance, float("nan")), k)
+    return Neighbors(index, mask.gather(1, index))
+
+
+def _smallest(distance: Float[Tensor, "m n"], k: int) -> Int[Tensor, "m k"]:
+    """Columns of the ``k`` smallest of each row, ascending, ties by column; NaN is largest.
+
+    ``topk`` promises no order among equals, so the column is part of the key: the bits of a
+    non-negative float32 sort like its value, and the column fills the lower half.
+    """
+    if distance.dtype == torch.float64:
+        return distance.sort(dim=1, stable=True).indices[:, :k]
+    column = torch.arange(distance.shape[1], device=distance.device)
+    key = (distance.view(torch.int32).long() << 32) | column
+    return key.topk(k, dim=1, largest=False).values & 0xFFFFFFFF

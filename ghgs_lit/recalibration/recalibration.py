@@ -1,0 +1,98 @@
+"""Recalibration of latent embeddings by multi-view semantic consistency (paper, section 3.3)."""
+
+import dataclasses
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.recalibration.attention import SemanticAttention
+from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
+from ghgs_lit.types import Batch, Points, Tokens
+
+NEIGHBORHOODS = ("xyz", "image_plane", "feature")
+
+
+class Recalibration(nn.Module):
+    """One :class:`SemanticAttention` for all layers; neighbours and cosines are found once a forward.
+
+    Args:
+        dim_latent: width of the tokens (from the encoder).
+        k: neighbours of a token, or as many as there are.
+        num_heads, similarity, s_min: see :class:`SemanticAttention`.
+        neighborhood: near in what: ``xyz``, the token points; ``image_plane``, token centres in units of the
+            image's longer side, shared by all views (the paper without unprojection); ``feature``, directions
+            of the semantic features.
+        neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
+        tokens: ``subject``, tokens with a valid point; others pass unchanged. ``all``, the release's.
+    """
+
+    def __init__(
+        self,
+        dim_latent: int,
+        k: int = 64,
+        num_heads: int = 8,
+        similarity: str = "product",
+        s_min: float = 0.01,
+        neighborhood: str = "xyz",
+        neighbors: str = "all",
+        tokens: str = "subject",
+    ):
+        super().__init__()
+        require(isinstance(k, int) and k >= 1, "recalibration.k", "1 or more", k)
+        choice("recalibration.neighborhood", neighborhood, NEIGHBORHOODS)
+        choice("recalibration.neighbors", neighbors, MODES)
+        choice("recalibration.tokens", tokens, ("subject", "all"))
+        self.k, self.neighborhood, self.neighbors, self.tokens = k, neighborhood, neighbors, tokens
+        self.block = SemanticAttention(dim_latent, num_heads, similarity, s_min)
+
+    def forward(self, tokens: Tokens, points: Points, batch: Batch) -> Tokens:
+        """Tokens with recalibrated layers; the semantic features and the order stay."""
+        batch_size, views = batch.masks.shape[:2]
+        takes_part = points.tokens_valid | (self.tokens == "all")
+        chosen = takes_part.nonzero()[:, 0]
+        element = tokens.image[chosen] // views
+        counts = torch.bincount(element, minlength=batch_size).tolist()
+        neighbors = [
+            nearest_neighbors(positions, image, self.k, self.neighbors)
+            for positions, image in zip(
+                self._positions(tokens, points)[chosen].split(counts),
+                tokens.image[chosen].split(counts),
+                strict=True,
+            )
+        ]
+        cosines = None
+        if self.block.similarity != "none":
+            semantic = tokens.semantic[chosen].split(counts)
+            cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
+        layers = tuple(
+            layer.index_copy(0, chosen, self.block(layer[chosen], neighbors, cosines).to(layer.dtype))
+            for layer in tokens.latent
+        )
+        return dataclasses.replace(tokens, latent=layers)
+
+    def _positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
+        if self.neighborhood == "xyz":
+            return points.tokens.detach()
+        if self.neighborhood == "feature":
+            return F.normalize(wide(tokens.semantic), dim=-1)
+        return (torch.stack((tokens.column, tokens.row), dim=-1) + 0.5) / max(tokens.grid[2:])
+
+
+@torch.no_grad()
+def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Float[Tensor, "n k"]:
+    """Cosines of the semantic features of tokens and their neighbours (Eq. 4), float32 or wider.
+
+    Features are normalised once, before they are picked; a feature of length 0 has cosine 0 to all.
+    """
+    with torch.autocast(semantic.device.type, enabled=False):
+        unit = F.normalize(wide(semantic), dim=-1, eps=1e-12)
+        step = 1024
+        parts = [
+            (unit[start : start + step] @ unit.T).gather(1, neighbors.index[start : start + step])
+            for start in range(0, max(len(unit), 1), step)
+        ]
+    return torch.cat(parts)
