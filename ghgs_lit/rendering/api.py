@@ -1,0 +1,168 @@
+"""Gaussians to images: one function, one definition of the image, three backends."""
+
+import importlib
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.rendering import gsplat_backend
+from ghgs_lit.rendering.settings import RasterSettings
+from ghgs_lit.types import Cameras, Gaussians, Rendering
+
+BACKENDS = ("auto", "gsplat", "cpu", "reference")
+_MODULES = {"gsplat": "gsplat_backend", "cpu": "cpu", "reference": "reference"}
+
+Background = Tensor | float | Sequence[float]
+
+
+def render(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    backend: str = "auto",
+    background: Background = 0.0,
+    near: float = 0.01,
+    far: float = 1e10,
+    settings: RasterSettings | None = None,
+) -> Rendering:
+    """Images [B, T, C, h, w], alphas and depths of ``B`` sets of Gaussians from cameras [B, T].
+
+    Differentiable in means, quaternions, scales, opacities, colours and background; any number ``C`` of
+    colour channels, any image size, any number of Gaussians per element, none included.
+
+    ``backend``: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
+    means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
+    ``background``: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
+    ``near`` and ``far`` in metres: only Gaussians whose centre has ``near <= z <= far`` are seen.
+    ``depth`` is the expectation ``sum(w z) / max(sum(w), 1e-10)``, 0 where nothing is seen.
+
+    Zero quaternions are identity; a Gaussian with a NaN in its geometry or opacity is not seen.
+    Raises ``InputError`` for inputs that do not fit, ``BackendUnavailable`` where gsplat cannot run.
+    """
+    settings = settings or RasterSettings()
+    _check_range(near, far)
+    _check_inputs(gaussians, cameras)
+    backend = resolve(backend, gaussians.means.device)
+    module = importlib.import_module(f"ghgs_lit.rendering.{_MODULES[backend]}")
+    gaussians = _wide_gaussians(gaussians)
+    cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
+    with torch.autocast(gaussians.means.device.type, enabled=False):
+        sums = module.render_sums(gaussians, cameras, settings, float(near), float(far))
+        channels = gaussians.colors.shape[1]
+        color, depth, alpha = sums.split((channels, 1, 1), dim=2)
+        image = color + (1 - alpha) * _background(background, color)
+        return Rendering(image=image, alpha=alpha, depth=depth / alpha.clamp_min(1e-10))
+
+
+def resolve(backend: str, device: torch.device) -> str:
+    """The backend that ``auto`` means on ``device``; refuses one that cannot run there."""
+    choice("renderer.backend", backend, BACKENDS)
+    is_cuda = device.type == "cuda"
+    if backend == "auto":
+        if is_cuda:
+            gsplat_backend.load()
+        elif device.type != "cpu":
+            raise InputError(
+                f"renderer.backend=auto: no backend for tensors on {device}; move them to cuda or cpu"
+            )
+        return "gsplat" if is_cuda else "cpu"
+    if backend == "gsplat" and not is_cuda:
+        gsplat_backend.load()
+    wanted = {"gsplat": "cuda", "cpu": "cpu"}.get(backend, device.type)
+    if device.type != wanted:
+        raise InputError(f"renderer.backend={backend}: expected tensors on {wanted}; found {device}")
+    return backend
+
+
+class Renderer:
+    """``render`` with its options bound, as ``conf/renderer`` describes it."""
+
+    def __init__(
+        self,
+        backend: str = "auto",
+        background: float | Sequence[float] = 0.0,
+        near: float = 0.01,
+        far: float = 1e10,
+        **settings,
+    ):
+        choice("renderer.backend", backend, BACKENDS)
+        for name in settings:
+            choice("renderer", name, tuple(RasterSettings.__dataclass_fields__))
+        _check_range(near, far)
+        numbers = background if isinstance(background, Sequence) else (background,)
+        require(
+            not isinstance(background, str) and all(_is_finite(number) for number in numbers),
+            "renderer.background", "a number or one for each channel", background,
+        )
+        self.backend = backend
+        self.background = tuple(numbers) if isinstance(background, Sequence) else background
+        self.near, self.far = float(near), float(far)
+        self.settings = RasterSettings(**settings)
+
+    def __call__(
+        self, gaussians: Gaussians, cameras: Cameras, background: Background | None = None
+    ) -> Rendering:
+        """Render; ``background`` replaces the configured one. See :func:`render`."""
+        background = self.background if background is None else background
+        return render(gaussians, cameras, self.backend, background, self.near, self.far, self.settings)
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _check_range(near: float, far: float) -> None:
+    require(_is_finite(near) and near > 0, "renderer.near", "a number of metres > 0", near)
+    require(_is_finite(far) and far > near, "renderer.far", f"more than near = {near}", far)
+
+
+def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
+    count = len(gaussians)
+    shapes = {"means": (count, 3), "quaternions": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    for name, shape in shapes.items():
+        found = tuple(getattr(gaussians, name).shape)
+        require(found == shape, f"gaussians.{name}", f"shape {shape}", found)
+    found = tuple(gaussians.colors.shape)
+    require(len(found) == 2 and found[0] == count, "gaussians.colors", f"shape ({count}, channels)", found)
+    require(
+        sum(gaussians.splits) == count and min(gaussians.splits, default=0) >= 0,
+        "gaussians.splits", f"counts that add up to {count}", gaussians.splits,
+    )
+    require(
+        len(cameras.shape) == 2 and cameras.shape[0] == len(gaussians.splits),
+        "cameras", f"shape [{len(gaussians.splits)}, T], one row per batch element", tuple(cameras.shape),
+    )
+    require(
+        cameras.height > 0 and cameras.width > 0,
+        "cameras", "a positive image size", (cameras.height, cameras.width),
+    )
+    require(
+        not bool((cameras.intrinsics[..., 0, 1] != 0).any()),
+        "cameras.intrinsics", "no skew: K[0, 1] = 0", "another value",
+    )
+
+
+def _wide_gaussians(gaussians: Gaussians) -> Gaussians:
+    """Gaussians in float32, or all in float64 if any of their fields are."""
+    fields = ("means", "quaternions", "scales", "opacities", "colors")
+    tensors = {name: wide(getattr(gaussians, name)) for name in fields}
+    is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
+    dtype = torch.float64 if is_double else torch.float32
+    return Gaussians(**{name: t.to(dtype) for name, t in tensors.items()}, splits=gaussians.splits)
+
+
+def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor | float:
+    if isinstance(background, (int, float)):
+        return background
+    tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
+    if tensor.ndim == 1:
+        require(
+            tensor.shape[0] in (1, color.shape[2]),
+            "renderer.background", f"{color.shape[2]} channels", tensor.shape[0],
+        )
+        return tensor[:, None, None]
+    return tensor

@@ -1,0 +1,37 @@
+"""Compile a kernel with Numba and keep its machine code on disk for as long as it is right."""
+
+import hashlib
+from pathlib import Path
+
+import numba
+
+
+def _sources_digest() -> str:
+    """Digest of every source file that the machine code of a kernel depends on."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+_DIGEST = _sources_digest()
+
+
+def kernel(function):
+    """Compile ``function`` on first use; it runs without the interpreter lock.
+
+    Numba's cache notices a changed file, but neither changed globals nor other modules whose code was
+    inlined, and installers may keep a file's time stamp. So cached code here is stamped with the digest
+    of all sources of this package. Without a writable place for a cache, kernels compile in each process.
+    """
+    try:
+        compiled = numba.njit(nogil=True, cache=True)(function)
+        compiled._cache._cache_file._source_stamp = _DIGEST
+    except (RuntimeError, AttributeError):
+        compiled = numba.njit(nogil=True)(function)
+    return compiled
+
+
+def helper(function):
+    """A function that kernels call; it is compiled into them."""
+    return numba.njit(nogil=True, inline="never")(function)

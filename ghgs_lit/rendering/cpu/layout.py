@@ -1,0 +1,34 @@
+"""Where things lie in the arrays that the kernels share.
+
+A *splat* is one Gaussian seen by one camera: splat ``m`` of view ``v`` is Gaussian ``m + shift[v]``. Its
+record is 16 floats. With ``Sigma = L L^T`` its 2D covariance (low-pass included) and ``d`` the vector
+from its centre to a pixel's, the exponent of the Gaussian is ``-(p^2 + q^2) ln 2`` where
+``p = K_XX dx`` and ``q = K_YX dx + K_YY dy``: a sum of squares, which cannot cancel or turn negative.
+"""
+
+RECORD = 16
+# Centre: the whole pixel, and 0.5 minus the rest, so that distances near it keep all their digits.
+COLUMN, ROW, REST_X, REST_Y = 0, 1, 2, 3
+K_XX, K_YX, K_YY = 4, 5, 6
+OPACITY, CUTOFF, DEPTH = 7, 8, 9
+# Half sides in pixels of the box around the ellipse outside which the splat adds nothing.
+HALF_WIDTH, HALF_HEIGHT = 10, 11
+
+TILE = 16
+BLOCK = 4
+PIXELS = TILE * TILE
+
+# An entry is one splat in one tile. Its gradients, with ``h = dL / d ln(alpha)`` summed over pixels:
+# the moments of h in whitened coordinates, the depth's gradient, then from COLOR on the colours'.
+H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH = 0, 1, 2, 3, 4, 5, 6
+COLOR = 8
+
+# A view: focal lengths, principal point, rotation, translation, then the limits of x/z and y/z.
+FX, FY, CX, CY, ROTATION, TRANSLATION = 0, 1, 2, 3, 4, 13
+X_LOW, X_HIGH, Y_LOW, Y_HIGH = 16, 17, 18, 19
+VIEW = 20
+
+
+def gradient_width(channels: int) -> int:
+    """Floats of an entry's gradient: COLOR and the channels, in whole vectors."""
+    return -(-(COLOR + channels) // 16) * 16

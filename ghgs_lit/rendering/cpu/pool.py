@@ -1,0 +1,53 @@
+"""A few threads for each process, to run kernels that hold no interpreter lock."""
+
+import os
+import threading
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+
+_lock = threading.Lock()
+_pool: ThreadPoolExecutor | None = None
+_owner: tuple[int, int] | None = None
+
+
+def _reset_lock() -> None:
+    """A forked child may inherit a lock that is held by a thread that it does not have."""
+    global _lock
+    _lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_reset_lock)
+
+
+def _workers(count: int) -> ThreadPoolExecutor:
+    """The pool of this process; a fork or a changed number of threads makes a new one."""
+    global _pool, _owner
+    with _lock:
+        if _owner != (os.getpid(), count):
+            _pool = ThreadPoolExecutor(count, thread_name_prefix="ghgs-render")
+            _owner = (os.getpid(), count)
+        return _pool
+
+
+def run(tasks: list) -> None:
+    """Call every task, on at most ``torch.get_num_threads()`` threads, the caller's among them."""
+    helpers = min(torch.get_num_threads(), len(tasks)) - 1
+    queue = deque(tasks)
+
+    def drain() -> None:
+        while True:
+            try:
+                task = queue.popleft()
+            except IndexError:
+                return
+            task()
+
+    futures = [_workers(torch.get_num_threads() - 1).submit(drain) for _ in range(helpers)]
+    drain()
+    for future in futures:
+        # A helper that never got a turn has nothing left to do, and waiting for it could block.
+        if not future.cancel():
+            future.result()

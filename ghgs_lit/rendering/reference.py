@@ -1,0 +1,122 @@
+"""The definition of the image in plain PyTorch, in the dtype of its input: the truth for tests.
+
+Every Gaussian meets every pixel, so it is slow and takes memory; gradients come from autograd. What is
+computed is told in :class:`ghgs_lit.rendering.settings.RasterSettings`.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.projection import pixel_centers
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.rendering.settings import RasterSettings
+from ghgs_lit.types import Cameras, Gaussians
+
+# Gaussians times pixels held at once.
+_CHUNK = 1 << 19
+
+
+def render_sums(
+    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
+) -> Float[Tensor, "B T channels h w"]:
+    """Sums over the Gaussians of a pixel: ``w colour`` (C channels), ``w z`` and ``w``."""
+    images = []
+    for element in range(len(gaussians.splits)):
+        images += [
+            _view(gaussians[element], cameras[element, view], settings, near, far)
+            for view in range(cameras.shape[1])
+        ]
+    if not images:
+        shape = (gaussians.colors.shape[1] + 2, cameras.height, cameras.width)
+        return gaussians.means.new_zeros(*cameras.shape, *shape)
+    return torch.stack(images).unflatten(0, cameras.shape)
+
+
+def _view(
+    gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
+) -> Float[Tensor, "channels h w"]:
+    index = visible(gaussians, camera, settings, near, far)
+    splats = project(gaussians.select(index, (len(index),)), camera, settings)
+    centers = pixel_centers(camera.height, camera.width, splats["centers"]).flatten(0, 1)
+    step = max(1, _CHUNK // max(1, len(splats["depths"])))
+    image = torch.cat([_blend(splats, chunk, settings) for chunk in centers.split(step)])
+    return image.mT.unflatten(1, (camera.height, camera.width))
+
+
+@torch.no_grad()
+def visible(
+    gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
+) -> Int[Tensor, " n"]:
+    """Gaussians between near and far with a positive, finite determinant and an opacity that counts, by
+    float32 depth, ties by index. What is not a number is none of these."""
+    splats = project(gaussians, camera, settings)
+    depths, determinants = splats["depths"], splats["determinants"]
+    keep = (depths >= near) & (depths <= far) & (determinants > 0) & determinants.isfinite()
+    keep &= (splats["opacities"] >= settings.alpha_min) & splats["centers"].isfinite().all(-1)
+    index = keep.nonzero()[:, 0]
+    return index[depths[index].float().argsort(stable=True)]
+
+
+def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> dict[str, Tensor]:
+    """Splats: centres [n, 2] px, covariances (xx, xy, yy) and determinants px^2, depths, opacities, colours."""
+    rotation, translation = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
+    points = gaussians.means @ rotation.mT + translation
+    x, y, z = points.unbind(-1)
+    focal, center = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
+    size = focal.new_tensor([camera.width, camera.height])
+    margin = settings.frustum_margin * 0.5 * size / focal
+    held = torch.stack((x / z, y / z), dim=-1)
+    held = torch.minimum(torch.maximum(held, -center / focal - margin), (size - center) / focal + margin)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        (
+            torch.stack((focal[0] / z, zero, -focal[0] / z * held[:, 0]), dim=-1),
+            torch.stack((zero, focal[1] / z, -focal[1] / z * held[:, 1]), dim=-1),
+        ),
+        dim=-2,
+    )
+    root = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
+    row_x, row_y = (jacobian @ rotation @ root).unbind(-2)
+    xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
+    # |row_x x row_y|^2 = xx yy - xy^2 without the cancellation.
+    bare = torch.linalg.cross(row_x, row_y).square().sum(-1)
+    determinant = bare + settings.low_pass * (xx + yy) + settings.low_pass**2
+    opacities = gaussians.opacities
+    if settings.antialiased:
+        ratio = bare / determinant
+        is_flat = ~(ratio > 0)
+        opacities = opacities * torch.where(is_flat, zero, torch.where(is_flat, 1, ratio).sqrt())
+    centers = focal * points[:, :2] / z[:, None] + center
+    return {
+        "centers": centers,
+        "covariances": torch.stack((xx + settings.low_pass, xy, yy + settings.low_pass), dim=-1),
+        "determinants": determinant,
+        "depths": z,
+        "opacities": opacities,
+        "colors": gaussians.colors,
+    }
+
+
+def _blend(splats: dict[str, Tensor], pixels: Tensor, settings: RasterSettings) -> Tensor:
+    """Composite all splats over pixels [P, 2]; returns [P, C + 2]."""
+    dx, dy = (pixels[None] - splats["centers"][:, None]).unbind(-1)
+    xx, xy, _ = splats["covariances"][:, None].unbind(-1)
+    sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats["determinants"][:, None])
+    near_enough = sigma <= 0.5 * settings.extent**2
+    raw = splats["opacities"][:, None] * torch.exp(-torch.where(near_enough, sigma, 0))
+    # The gradient of a clamped alpha is zero, also at equality.
+    alpha = torch.where(raw < settings.alpha_max, raw, settings.alpha_max)
+    hit = near_enough & (alpha >= settings.alpha_min)
+    behind = torch.log1p(-torch.where(hit, alpha, 0)).cumsum(0)
+    # T only falls, so all that follow a splat that was left out are left out too.
+    seen = hit & (behind > (math.log(settings.stop) if settings.stop > 0 else -math.inf))
+    alpha = torch.where(seen, alpha, 0)
+    step = torch.log1p(-alpha)
+    weights = alpha * torch.exp(step.cumsum(0) - step)
+    ones = torch.ones_like(splats["depths"])
+    values = torch.cat((splats["colors"], splats["depths"][:, None], ones[:, None]), dim=-1)
+    # Not a matrix product: a colour that is not finite must not reach pixels that do not see it.
+    return (weights[..., None] * torch.where(seen[..., None], values[:, None], 0)).sum(0)
