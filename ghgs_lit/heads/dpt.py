@@ -20,6 +20,11 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, 3, padding=1, bias=bias)
 
 
+def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
+    """A 1x1 convolution as a linear of pixels: no copy where channels are innermost, as they are here."""
+    return F.linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
+
+
 def _resize(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c h2 w2"]:
     if x.shape[-2:] == size:
         return x
@@ -58,7 +63,7 @@ class Fusion(nn.Module):
         if level is not None:
             x = x + self.resConfUnit1(level)
         # A 1x1 convolution commutes with interpolation; before it, it costs a quarter.
-        return _resize(self.out_conv(self.resConfUnit2(x)), size)
+        return _resize(_pointwise(self.out_conv, self.resConfUnit2(x)), size)
 
 
 class Scratch(nn.Module):
@@ -136,6 +141,7 @@ class DPTHead(nn.Module):
         if self.image_skip is not None:
             require(images is not None and masks is not None, "image_skip", "images and masks", None)
             picture = torch.cat((images, masks.to(images.dtype)[:, :, None]), dim=2).flatten(0, 1)
+            picture = picture.contiguous(memory_format=torch.channels_last)
         count = levels[0].shape[0]
         step = count if torch.is_grad_enabled() else self.images_per_step
         parts = []
@@ -152,12 +158,11 @@ class DPTHead(nn.Module):
 
     def _levels(self, tokens: Tokens) -> list[Float[Tensor, "bv c h w"]]:
         """Normalised and projected tokens on the grid; a 1x1 convolution of a map is a linear of tokens."""
-        projected = tuple(
-            F.linear(self.norm(latent), project.weight.flatten(1), project.bias)
-            for latent, project in zip(tokens.latent, self.projects, strict=True)
-        )
-        packed = dataclasses.replace(tokens, latent=projected)
-        return [packed.maps(i) for i in range(LEVELS)]
+        levels = []
+        for latent, project in zip(tokens.latent, self.projects, strict=True):
+            projected = F.linear(self.norm(latent), project.weight.flatten(1), project.bias)
+            levels.append(dataclasses.replace(tokens, latent=(projected,)).maps(0))
+        return levels
 
     def _decode(
         self, levels: list[Tensor], patch_size: int, picture: Tensor | None
@@ -183,7 +188,7 @@ class DPTHead(nn.Module):
         # The last projection stays wide under autocast: depths and offsets of millimetres hang on it.
         last = s.output_conv2[-1]
         with torch.autocast(x.device.type, enabled=False):
-            return last(x.to(last.weight.dtype))
+            return _pointwise(last, x.to(last.weight.dtype))
 
 
 def _add_positions(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:

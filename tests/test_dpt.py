@@ -1,0 +1,192 @@
+"""Properties of the dense head."""
+
+import dataclasses
+
+import pytest
+import torch
+from torch import nn
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.heads.activations import split_activated, unit
+from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
+from ghgs_lit.heads.position import position_embedding
+from ghgs_lit.types import Tokens
+
+
+def _tokens(b=1, v=2, h=3, w=2, patch_size=14, width=16, dtype=torch.float32, seed=0) -> Tokens:
+    g = torch.Generator().manual_seed(seed)
+    image, row, column = (
+        axis.flatten() for axis in torch.meshgrid(*map(torch.arange, (b * v, h, w)), indexing="ij")
+    )
+    latent = tuple(torch.randn(len(image), width, generator=g, dtype=dtype) for _ in range(4))
+    return Tokens(latent, latent[0], image, row, column, (b, v, h, w), patch_size)
+
+
+def _select(tokens: Tokens, kept: torch.Tensor) -> Tokens:
+    packed = {name: getattr(tokens, name)[kept] for name in ("semantic", "image", "row", "column")}
+    return dataclasses.replace(tokens, latent=tuple(x[kept] for x in tokens.latent), **packed)
+
+
+def _head(seed=0, **options) -> DPTHead:
+    torch.manual_seed(seed)
+    return DPTHead(**{"dim_in": 16, "features": 8, "out_channels": (4, 8, 8, 12), "output_dim": 3, **options})
+
+
+@pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
+@pytest.mark.parametrize("grid", [(1, 1), (3, 2), (2, 5)])
+def test_any_patch_size_and_grid(patch_size, grid):
+    tokens = _tokens(2, 2, *grid, patch_size=patch_size)
+    raw = _head()(tokens)
+    assert raw.shape == (4, 3, patch_size * grid[0], patch_size * grid[1])
+    assert raw.isfinite().all()
+
+
+def test_images_are_independent_and_steps_change_nothing():
+    head = _head(images_per_step=2).double()
+    tokens = _tokens(v=5, dtype=torch.float64)
+    together = head(tokens)
+    with torch.no_grad():
+        in_steps = head(tokens)
+    torch.testing.assert_close(in_steps, together, rtol=1e-12, atol=1e-12)
+    kept = tokens.image == 3
+    one = _select(tokens, kept)
+    one = dataclasses.replace(one, image=torch.zeros_like(one.image), grid=(1, 1, 3, 2))
+    torch.testing.assert_close(head(one), together[3:4], rtol=1e-12, atol=1e-12)
+
+
+def test_tokens_that_were_not_kept_are_blank():
+    head = _head()
+    tokens = _tokens(h=4, w=4)
+    kept = torch.ones(32, dtype=torch.bool)
+    kept[[3, 17]] = False
+    fewer = _select(tokens, kept)
+    levels = head._levels(fewer)
+    for level, full in zip(levels, head._levels(tokens), strict=True):
+        blank = (level == 0).all(dim=1).flatten()
+        assert torch.equal(blank, ~kept)
+        torch.testing.assert_close(
+            level.permute(0, 2, 3, 1).reshape(32, -1)[kept], full.permute(0, 2, 3, 1).reshape(32, -1)[kept]
+        )
+    assert head(fewer).isfinite().all()
+
+
+def test_residual_unit_rectifies_its_skip():
+    block = ResidualUnit(8)
+    nn.init.zeros_(block.conv2.weight)
+    nn.init.zeros_(block.conv2.bias)
+    x = torch.randn(1, 8, 3, 3)
+    kept = x.clone()
+    torch.testing.assert_close(block(x), x.clamp(min=0))
+    assert torch.equal(x, kept)
+
+
+def test_pointwise_is_the_convolution():
+    conv = nn.Conv2d(6, 4, 1)
+    for layout in (torch.contiguous_format, torch.channels_last):
+        x = torch.randn(2, 6, 5, 3).contiguous(memory_format=layout)
+        torch.testing.assert_close(_pointwise(conv, x), conv(x))
+
+
+def test_image_skip_reads_picture_and_mask():
+    head = _head(image_skip=True)
+    tokens = _tokens(b=1, v=2, h=2, w=3)
+    images, masks = torch.rand(1, 2, 3, 28, 42), torch.rand(1, 2, 28, 42) > 0.5
+    raw = head(tokens, images, masks)
+    for other in (head(tokens, 1 - images, masks), head(tokens, images, ~masks)):
+        assert (other - raw).abs().max() > 1e-4
+    moved = images.clone()
+    moved[0, 1, :, 20, 30] += 1
+    changed = (head(tokens, moved, masks) - raw).abs().amax(1) > 0
+    assert not changed[0].any()
+    assert changed[1, 18:23, 28:33].any()
+    changed[1, 18:23, 28:33] = False
+    assert not changed.any()
+    raw.sum().backward()
+    assert all(p.grad is not None for p in head.parameters())
+    with pytest.raises(InputError, match="image_skip"):
+        head(tokens)
+    assert not any("image_skip" in key for key in _head().state_dict())
+
+
+def test_last_projection_is_wide_under_autocast():
+    head = _head(features=32, hidden=32)
+    tokens = _tokens(v=2, h=5, w=5)
+    with torch.no_grad():
+        exact = head(tokens)
+        with torch.autocast("cpu", torch.bfloat16):
+            low = head(tokens)
+    assert low.dtype == torch.float32
+    assert (low - exact).abs().max() < 0.03 * exact.abs().max()
+
+
+def test_gradients_reach_every_layer_and_agree_with_finite_differences():
+    head = _head().double()
+    tokens = _tokens(v=1, h=2, w=2, patch_size=8, dtype=torch.float64)
+
+    def forward(*latent):
+        return head(dataclasses.replace(tokens, latent=latent))
+
+    latent = tuple(x.requires_grad_() for x in tokens.latent)
+    assert torch.autograd.gradcheck(forward, latent, fast_mode=True)
+    forward(*latent).square().sum().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in head.parameters())
+
+
+def test_positions_made_for_inference_serve_training():
+    head = _head()
+    tokens = _tokens(h=5, w=7)
+    with torch.inference_mode():
+        head(tokens)
+    head(tokens).sum().backward()
+
+
+def test_positions_are_centred():
+    e = position_embedding(8, 4, 6, 1.5, torch.zeros(1, dtype=torch.float64))
+    sine = [0, 1, 4, 5]
+    cosine = [2, 3, 6, 7]
+    flipped = e.flip(1, 2)
+    torch.testing.assert_close(flipped[sine], -e[sine])
+    torch.testing.assert_close(flipped[cosine], e[cosine])
+    assert torch.equal(e[0], e[0, :1].expand(4, -1))
+    assert torch.equal(e[4], e[4, :, :1].expand(-1, 6))
+
+
+def test_unit_of_zero_is_zero_with_a_finite_gradient():
+    x = torch.tensor([[0.0, 0, 0], [3, 0, 4]], requires_grad=True)
+    y = unit(x)
+    torch.testing.assert_close(y.detach(), torch.tensor([[0.0, 0, 0], [0.6, 0, 0.8]]))
+    y.sum().backward()
+    assert x.grad.isfinite().all()
+
+
+def test_activations_are_wide():
+    raw = torch.full((1, 2, 1, 1), 30.0, dtype=torch.float16)
+    value, confidence = split_activated(raw, "exp")
+    assert value.dtype == torch.float32
+    assert value.isfinite().all()
+    assert confidence.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"features": 12}, "features: expected a multiple of 8; found 12"),
+        ({"out_channels": (4, 8, 8)}, "out_channels: expected four multiples of 4"),
+        ({"out_channels": (4, 8, 8, 10)}, "out_channels: expected four multiples of 4"),
+        ({"images_per_step": 0}, "images_per_step"),
+    ],
+)
+def test_impossible_options_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        _head(**options)
+
+
+def test_wrong_number_of_layers_is_refused():
+    tokens = _tokens()
+    with pytest.raises(InputError, match=r"tokens.latent: expected four layers; found 3"):
+        _head()(dataclasses.replace(tokens, latent=tokens.latent[:3]))
+
+
+def test_unknown_activation_is_refused():
+    with pytest.raises(InputError, match="value activation"):
+        split_activated(torch.zeros(1, 2, 1, 1), "tan")
