@@ -22,13 +22,11 @@ def _axis_waves(
     channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "c n"]:
     """Sines, then cosines of one axis, float64 inside, float32 outside, in units of ``SCALE``."""
-    # A tensor made under inference mode could not be used in a later training step.
-    with torch.inference_mode(False), torch.no_grad():
-        quarter = channels // 2
-        exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
-        omega = 1.0 / BASE**exponents
-        angles = omega[:, None] * axis_coordinates(count, half_extent, dtype, device).double()
-        return torch.cat((angles.sin(), angles.cos())).float() * SCALE
+    quarter = channels // 2
+    exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
+    omega = 1.0 / BASE**exponents
+    angles = omega[:, None] * axis_coordinates(count, half_extent, dtype, device).double()
+    return torch.cat((angles.sin(), angles.cos())).float() * SCALE
 
 
 def position_embedding(
