@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.projection import pixel_centers, project, wide
+from ghgs_lit.geometry.projection import pixel_centers, project, wide, world_to_camera
 from ghgs_lit.types import Cameras
 
 Interval = tuple[Tensor, Tensor]
@@ -99,17 +99,19 @@ def subject_box(
     Carved twice: the second grid fills the box that the first has found. Where nothing is left (masks
     that contradict one another) the box of the pass before stays.
     """
-    center, reach = _center_and_reach(masks, cameras)
-    lower, upper = center - reach[:, None], center + reach[:, None]
+    center = _center(masks, cameras)
+    reach = _reach(masks, cameras, center)[:, None]
+    lower, upper = center - reach, center + reach
     votes = masks.flatten(2).any(-1)
     focal = wide(cameras.intrinsics)[..., [0, 1], [0, 1]].amax(-1)
     for _ in range(2):
         cell = (upper - lower) / cells
+        depth = _project_one((lower + upper) / 2, cameras)[1]
         # Half a cell's diagonal in pixels, for subjects that come up to 0.6 of the distance of their middle.
-        depth = project(center[:, None], cameras.intrinsics, cameras.extrinsics)[1]
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=_BEHIND)
-        grow = min(ceil(pixels.max().item()), max(masks.shape[-2:])) + radius
-        kept = _carve(_outside(dilate(masks, grow), votes), cameras, lower, cell, cells, tolerance)
+        grow = pixels.amax(1).clamp(max=max(masks.shape[-2:])).ceil().int().tolist()
+        grown = torch.stack([dilate(mask, radius + more) for mask, more in zip(masks, grow, strict=True)])
+        kept = _carve(_outside(grown, votes), cameras, lower, cell, cells, tolerance)
         found = kept.flatten(1).any(-1)[:, None]
         for axis in range(3):
             others = [d for d in (1, 2, 3) if d != axis + 1]
@@ -121,7 +123,6 @@ def subject_box(
             high = lower[:, axis] + (last + 1) * cell[:, axis]
             lower = torch.where(found & _axis(axis, lower), low[:, None], lower)
             upper = torch.where(found & _axis(axis, upper), high[:, None], upper)
-        center = (lower + upper) / 2
     return lower, upper
 
 
@@ -138,9 +139,8 @@ def box_interval(
     far = torch.maximum(*faces).amin(-1)
     corners = torch.stack(torch.meshgrid(*[torch.arange(2, device=lower.device)] * 3, indexing="ij"), -1)
     corners = torch.where(corners.reshape(1, 8, 3) == 0, lower[:, None], upper[:, None])
-    depth = project(
-        corners[:, None], cameras.intrinsics[:, :, None, :, :], cameras.extrinsics[:, :, None, :, :]
-    )[1]
+    corners = corners[:, None].expand(-1, cameras.shape[1], -1, -1)
+    depth = world_to_camera(corners, cameras.extrinsics[:, :, None])[..., 2]
     misses = near >= far
     near = torch.where(misses, depth.amin(-1)[..., None, None], near)
     return near, torch.where(misses, depth.amax(-1)[..., None, None], far)
@@ -271,41 +271,51 @@ def _carve(
     return torch.stack(kept)
 
 
-def _center_and_reach(masks: Tensor, cameras: Cameras) -> tuple[Float[Tensor, "B 3"], Float[Tensor, " B"]]:
-    """The point nearest to the rays through the masks' centroids, and a generous radius about it.
+def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Pixel [B, V, 2] and depth [B, V] of one point of each element in all of its cameras."""
+    points = points[:, None].expand(*cameras.shape, 3)
+    return project(points, cameras.intrinsics, cameras.extrinsics)
+
+
+def _center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
+    """The point nearest to the rays through the masks' centroids, by least squares.
 
     The optical axes take part with a small weight, so that one mask, or none, is enough; a still smaller
     pull to the cameras keeps parallel rays solvable.
     """
+    intrinsics, extrinsics = wide(cameras.intrinsics), wide(cameras.extrinsics)
+    u, v = _axes(cameras)
     counts = masks.sum((-2, -1))
-    pixels = pixel_centers(cameras.height, cameras.width, wide(cameras.intrinsics))
-    sums = torch.stack(
-        ((masks.sum(-2) * pixels[0, :, 0]).sum(-1), (masks.sum(-1) * pixels[:, 0, 1]).sum(-1)), -1
-    )
-    centroid = sums / counts.clamp(min=1)[..., None]
-    axis = wide(cameras.intrinsics)[..., :2, 2]
-    rays = torch.stack((torch.where(counts[..., None] > 0, centroid, axis), axis), dim=-2)
-    weights = torch.stack(
-        (counts > 0, torch.full_like(counts, True, dtype=torch.bool)), -1
-    ) * rays.new_tensor([1, 1e-3])
+    sums = torch.stack(((masks.sum(-2) * u).sum(-1), (masks.sum(-1) * v).sum(-1)), -1)
+    axis = intrinsics[..., :2, 2]
+    centroid = torch.where(counts[..., None] > 0, sums / counts.clamp(min=1)[..., None], axis)
+    rays = torch.stack((centroid, axis), dim=-2)
     rays = torch.cat((rays, torch.ones_like(rays[..., :1])), -1)
-    to_world = wide(cameras.extrinsics)[..., :3, :3].mT @ torch.linalg.inv(wide(cameras.intrinsics))
+    to_world = extrinsics[..., :3, :3].mT @ torch.linalg.inv(intrinsics)
     directions = F.normalize(torch.einsum("bvij,bvrj->bvri", to_world, rays), dim=-1)
+    weights = torch.stack((counts > 0, torch.full_like(counts, 1e-3, dtype=rays.dtype)), -1)
     identity = torch.eye(3, device=rays.device, dtype=rays.dtype)
-    across = weights[..., None, None] * (identity - directions[..., :, None] * directions[..., None, :])
+    across = identity - directions[..., :, None] * directions[..., None, :]
+    across = (weights[..., None, None] * across).sum(2)
     origin = cameras.centers.mean(1)
-    offsets = (cameras.centers - origin[:, None])[:, :, None, :, None]
-    matrix = across.sum((1, 2)) + 1e-4 * identity
-    center = torch.linalg.solve(matrix, (across @ offsets).sum((1, 2)))[..., 0] + origin
+    offsets = (cameras.centers - origin[:, None])[..., None]
+    matrix = across.sum(1) + 1e-4 * identity
+    return torch.linalg.solve(matrix, (across @ offsets).sum(1))[..., 0] + origin
 
-    pixel, depth = project(center[:, None], cameras.intrinsics, cameras.extrinsics)
-    extent = torch.zeros_like(pixel)
-    for dim, across_dim in ((0, -2), (1, -1)):
-        line = masks.any(across_dim)
-        position = pixels[0, :, 0] if dim == 0 else pixels[:, 0, 1]
-        distance = (position - pixel[..., dim, None]).abs() + 0.5
-        extent[..., dim] = torch.where(line, distance, 0).amax(-1)
-    focal = wide(cameras.intrinsics)[..., [0, 1], [0, 1]]
-    reach = (extent / focal).norm(dim=-1) * depth.clamp(min=_BEHIND)
+
+def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
+    """A generous radius of the subject about ``center``, in metres."""
+    pixel, depth = _project_one(center, cameras)
+    extents = [
+        torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
+        for dim, line in enumerate(_axes(cameras))
+    ]
+    extent = torch.stack(extents, -1) / wide(cameras.intrinsics)[..., [0, 1], [0, 1]]
     # More than what is seen: what reaches away from a camera looks smaller than it is.
-    return center, 1.4 * reach.amax(1).clamp(min=0.05)
+    return 1.4 * (extent.norm(dim=-1) * depth.clamp(min=_BEHIND)).amax(1).clamp(min=0.05)
+
+
+def _axes(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Pixel centres along a row and along a column."""
+    centers = pixel_centers(cameras.height, cameras.width, wide(cameras.intrinsics))
+    return centers[0, :, 0], centers[:, 0, 1]
