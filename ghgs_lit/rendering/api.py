@@ -96,7 +96,9 @@ class Renderer:
         numbers = background if isinstance(background, Sequence) else (background,)
         require(
             not isinstance(background, str) and all(_is_finite(number) for number in numbers),
-            "renderer.background", "a number or one for each channel", background,
+            "renderer.background",
+            "a number or one for each channel",
+            background,
         )
         self.backend = backend
         self.background = tuple(numbers) if isinstance(background, Sequence) else background
@@ -130,19 +132,27 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     require(len(found) == 2 and found[0] == count, "gaussians.colors", f"shape ({count}, channels)", found)
     require(
         sum(gaussians.splits) == count and min(gaussians.splits, default=0) >= 0,
-        "gaussians.splits", f"counts that add up to {count}", gaussians.splits,
+        "gaussians.splits",
+        f"counts that add up to {count}",
+        gaussians.splits,
     )
     require(
         len(cameras.shape) == 2 and cameras.shape[0] == len(gaussians.splits),
-        "cameras", f"shape [{len(gaussians.splits)}, T], one row per batch element", tuple(cameras.shape),
+        "cameras",
+        f"shape [{len(gaussians.splits)}, T], one row per batch element",
+        tuple(cameras.shape),
     )
     require(
         cameras.height > 0 and cameras.width > 0,
-        "cameras", "a positive image size", (cameras.height, cameras.width),
+        "cameras",
+        "a positive image size",
+        (cameras.height, cameras.width),
     )
     require(
         not bool((cameras.intrinsics[..., 0, 1] != 0).any()),
-        "cameras.intrinsics", "no skew: K[0, 1] = 0", "another value",
+        "cameras.intrinsics",
+        "no skew: K[0, 1] = 0",
+        "another value",
     )
 
 
@@ -162,7 +172,9 @@ def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Te
     if tensor.ndim == 1:
         require(
             tensor.shape[0] in (1, color.shape[2]),
-            "renderer.background", f"{color.shape[2]} channels", tensor.shape[0],
+            "renderer.background",
+            f"{color.shape[2]} channels",
+            tensor.shape[0],
         )
         return tensor[:, None, None]
     return tensor

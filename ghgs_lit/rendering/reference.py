@@ -61,7 +61,7 @@ def visible(
 
 
 def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> dict[str, Tensor]:
-    """Splats: centres [n, 2] px, covariances (xx, xy, yy) and determinants px^2, depths, opacities, colours."""
+    """Splats: centres [n, 2] px, covariances (xx, xy, yy), determinants, depths, opacities, colours."""
     rotation, translation = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
     points = gaussians.means @ rotation.mT + translation
     x, y, z = points.unbind(-1)

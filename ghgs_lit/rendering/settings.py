@@ -35,17 +35,28 @@ class RasterSettings:
         for name in ("alpha_min", "alpha_max"):
             value = getattr(self, name)
             require(
-                _is_number(value) and 0 < value < 1, f"renderer.settings.{name}", "a number between 0 and 1", value
+                _is_number(value) and 0 < value < 1,
+                f"renderer.settings.{name}",
+                "a number between 0 and 1",
+                value,
             )
         require(
             self.alpha_min < self.alpha_max,
-            "renderer.settings.alpha_min", f"less than alpha_max = {self.alpha_max}", self.alpha_min,
+            "renderer.settings.alpha_min",
+            f"less than alpha_max = {self.alpha_max}",
+            self.alpha_min,
         )
         require(
-            _is_number(self.extent) and self.extent > 0, "renderer.settings.extent", "a number > 0", self.extent
+            _is_number(self.extent) and self.extent > 0,
+            "renderer.settings.extent",
+            "a number > 0",
+            self.extent,
         )
         require(
-            isinstance(self.antialiased, bool), "renderer.settings.antialiased", "true or false", self.antialiased
+            isinstance(self.antialiased, bool),
+            "renderer.settings.antialiased",
+            "true or false",
+            self.antialiased,
         )
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -45,7 +46,7 @@ class _Plan:
 
     @classmethod
     def of(cls, gaussians, cameras, settings, near, far) -> "_Plan":
-        elements, views_each = cameras.shape
+        views_each = cameras.shape[1]
         splits = np.array(gaussians.splits, dtype=np.int64)
         return cls(
             views=_view_rows(cameras, settings),
@@ -113,9 +114,25 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
 
     def project(v: int) -> None:
         seen[v] = projection.project(
-            means, roots, opacities, plan.views[v], starts[v], plan.counts[v], shifts[v], plan.near, plan.far,
-            settings.low_pass, settings.alpha_min, settings.extent, settings.antialiased, plan.height, plan.width,
-            records, depths, rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
+            means,
+            roots,
+            opacities,
+            plan.views[v],
+            starts[v],
+            plan.counts[v],
+            shifts[v],
+            plan.near,
+            plan.far,
+            settings.low_pass,
+            settings.alpha_min,
+            settings.extent,
+            settings.antialiased,
+            plan.height,
+            plan.width,
+            records,
+            depths,
+            rects,
+            tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
         )
 
     pool.run([partial(project, v) for v in range(views)])
@@ -126,8 +143,17 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
 
     def scatter(v: int) -> None:
         binning.scatter(
-            depths, rects, starts[v], plan.counts[v], seen[v], tiles_x, tile_starts, v * tiles, entry_starts,
-            splats, slots,
+            depths,
+            rects,
+            starts[v],
+            plan.counts[v],
+            seen[v],
+            tiles_x,
+            tile_starts,
+            v * tiles,
+            entry_starts,
+            splats,
+            slots,
         )
 
     pool.run([partial(scatter, v) for v in range(views)])
@@ -138,7 +164,7 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
 def _parts(count: int) -> list[tuple[int, int]]:
     """``count`` things in one run for each thread."""
     edges = np.linspace(0, count, min(torch.get_num_threads(), max(1, count)) + 1).astype(np.int64)
-    return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(int(a), int(b)) for a, b in pairwise(edges)]
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
@@ -160,13 +186,25 @@ class _Rasterize(torch.autograd.Function):
         found = _prepare(plan, *arrays[:4])
         image = torch.zeros(len(plan.views), colors.shape[1] + 2, plan.height, plan.width)
         settings = plan.settings
-        pool.run([
-            partial(
-                raster.forward, run, *plan.tiles, found.tile_starts, found.splats, found.shifts, found.records,
-                arrays[4], np.float32(settings.alpha_max), np.float32(settings.stop), found.hits, image.numpy(),
-            )
-            for run in _tile_runs(found.tile_starts)
-        ])
+        pool.run(
+            [
+                partial(
+                    raster.forward,
+                    run,
+                    *plan.tiles,
+                    found.tile_starts,
+                    found.splats,
+                    found.shifts,
+                    found.records,
+                    arrays[4],
+                    np.float32(settings.alpha_max),
+                    np.float32(settings.stop),
+                    found.hits,
+                    image.numpy(),
+                )
+                for run in _tile_runs(found.tile_starts)
+            ]
+        )
         ctx.save_for_backward(means, quaternions, scales, opacities, colors, image)
         ctx.plan, ctx.found = plan, found
         return image
@@ -180,24 +218,55 @@ class _Rasterize(torch.autograd.Function):
         width = layout.gradient_width(colors.shape[1])
         gradients = np.empty((len(found.splats), width), np.float32)
         upstream = image_gradient.float().contiguous().numpy()
-        pool.run([
-            partial(
-                raster.backward, run, *plan.tiles, found.tile_starts, found.splats, found.slots, found.shifts,
-                found.records, colors, np.float32(settings.alpha_max), np.float32(settings.stop), found.hits,
-                image.numpy(), upstream, gradients,
-            )
-            for run in _tile_runs(found.tile_starts)
-        ])
+        pool.run(
+            [
+                partial(
+                    raster.backward,
+                    run,
+                    *plan.tiles,
+                    found.tile_starts,
+                    found.splats,
+                    found.slots,
+                    found.shifts,
+                    found.records,
+                    colors,
+                    np.float32(settings.alpha_max),
+                    np.float32(settings.stop),
+                    found.hits,
+                    image.numpy(),
+                    upstream,
+                    gradients,
+                )
+                for run in _tile_runs(found.tile_starts)
+            ]
+        )
         results = [torch.zeros_like(t) for t in inputs]
         arrays = [t.numpy() for t in results]
         tasks = []
         for first_view in range(0, len(plan.views), max(1, plan.views_each)):
             start = int(plan.first_gaussians[first_view])
             for a, b in _parts(int(plan.counts[first_view])):
-                tasks.append(partial(
-                    projection.unproject, means, quaternions, scales, found.roots, plan.views, first_view,
-                    first_view + plan.views_each, start + a, start + b, found.shifts, settings.low_pass,
-                    settings.antialiased, found.records, found.rects, found.entry_starts, gradients, *arrays,
-                ))
+                tasks.append(
+                    partial(
+                        projection.unproject,
+                        means,
+                        quaternions,
+                        scales,
+                        found.roots,
+                        plan.views,
+                        first_view,
+                        first_view + plan.views_each,
+                        start + a,
+                        start + b,
+                        found.shifts,
+                        settings.low_pass,
+                        settings.antialiased,
+                        found.records,
+                        found.rects,
+                        found.entry_starts,
+                        gradients,
+                        *arrays,
+                    )
+                )
         pool.run(tasks)
         return *results, None

@@ -66,8 +66,25 @@ def roots(quaternions, scales, first, last, out):
 
 @kernel
 def project(
-    means, root, opacities, view, start, count, shift, near, far, low_pass, alpha_min, extent, antialiased,
-    height, width, records, depths, rects, tile_counts,
+    means,
+    root,
+    opacities,
+    view,
+    start,
+    count,
+    shift,
+    near,
+    far,
+    low_pass,
+    alpha_min,
+    extent,
+    antialiased,
+    height,
+    width,
+    records,
+    depths,
+    rects,
+    tile_counts,
 ):
     """Splats ``start`` to ``start + count`` of one view; returns how many are seen.
 
@@ -90,7 +107,8 @@ def project(
         for i in range(2):
             for j in range(3):
                 m[3 * i + j] = (
-                    affine[3 * i] * root[n, j] + affine[3 * i + 1] * root[n, 3 + j]
+                    affine[3 * i] * root[n, j]
+                    + affine[3 * i + 1] * root[n, 3 + j]
                     + affine[3 * i + 2] * root[n, 6 + j]
                 )
         a = m[0] * m[0] + m[1] * m[1] + m[2] * m[2]
@@ -152,7 +170,11 @@ def _entry_sum(gradients, first, last, out):
 @helper
 def _covariance_gradient(record, total, out):
     """``dL/dSigma`` (xx, xy, yy) from the whitened second moments: ``L^-T M L^-1 / 2``."""
-    k_xx, k_yx, k_yy = np.float64(record[layout.K_XX]), np.float64(record[layout.K_YX]), np.float64(record[layout.K_YY])
+    k_xx, k_yx, k_yy = (
+        np.float64(record[layout.K_XX]),
+        np.float64(record[layout.K_YX]),
+        np.float64(record[layout.K_YY]),
+    )
     half = 0.5 / _ROOT**4
     pp, pq, qq = half * total[layout.H_PP], half * total[layout.H_PQ], half * total[layout.H_QQ]
     out[0] = k_xx * k_xx * pp + 2 * k_xx * k_yx * pq + k_yx * k_yx * qq
@@ -204,7 +226,9 @@ def _point_gradient(view, point, d_u, d_v, d_z, d_affine, out):
     out[0] = fx * d_u + inverse * d_held_x
     out[1] = fy * d_v + inverse * d_held_y
     out[2] = (
-        d_z - x * fx * d_u - y * fy * d_v
+        d_z
+        - x * fx * d_u
+        - y * fy * d_v
         - inverse * (fx * (d_xx - held_x * d_xz) + fy * (d_yy - held_y * d_yz) + x * d_held_x + y * d_held_y)
     )
 
@@ -262,8 +286,27 @@ def _splat_gradient(view, mean, root, record, total, low_pass, antialiased, work
 
 @kernel
 def unproject(
-    means, quaternions, scales, root, views, first_view, last_view, first, last, shifts, low_pass, antialiased,
-    records, rects, entry_starts, gradients, d_means, d_quaternions, d_scales, d_opacities, d_colors,
+    means,
+    quaternions,
+    scales,
+    root,
+    views,
+    first_view,
+    last_view,
+    first,
+    last,
+    shifts,
+    low_pass,
+    antialiased,
+    records,
+    rects,
+    entry_starts,
+    gradients,
+    d_means,
+    d_quaternions,
+    d_scales,
+    d_opacities,
+    d_colors,
 ):
     """Gradients of Gaussians ``first`` to ``last``, summed over the views that show them."""
     channels = d_colors.shape[1]

@@ -43,7 +43,10 @@ def _touched(record, x0, y0):
     """The blocks of a tile that a splat's bounding box meets, as bits; a hair more than those it hits."""
     x = (record[layout.COLUMN] - x0) - record[layout.REST_X]
     y = (record[layout.ROW] - y0) - record[layout.REST_Y]
-    reach_x, reach_y = record[layout.HALF_WIDTH] + np.float32(0.01), record[layout.HALF_HEIGHT] + np.float32(0.01)
+    reach_x, reach_y = (
+        record[layout.HALF_WIDTH] + np.float32(0.01),
+        record[layout.HALF_HEIGHT] + np.float32(0.01),
+    )
     left = int(max(np.float32(0), np.ceil(x - reach_x))) // 4
     right = int(min(np.float32(layout.TILE - 1), np.floor(x + reach_x))) // 4
     top = int(max(np.float32(0), np.ceil(y - reach_y))) // 4
@@ -97,7 +100,9 @@ def _blend(record, squared, transmittance, alpha_max, stop):
     """
     cutoff = simd.full(record[layout.CUTOFF])
     reached = (squared <= cutoff) & (transmittance > simd.full(np.float32(0)))
-    raw = simd.full(record[layout.OPACITY]) * simd.exp2(simd.full(np.float32(0)) - simd.minimum(squared, cutoff))
+    raw = simd.full(record[layout.OPACITY]) * simd.exp2(
+        simd.full(np.float32(0)) - simd.minimum(squared, cutoff)
+    )
     alpha = simd.minimum(raw, simd.full(alpha_max))
     behind = transmittance - transmittance * alpha
     seen = reached & (behind > simd.full(stop))
@@ -140,13 +145,18 @@ def _forward_splat(record, color, x0, y0, live, planes, transmittance, alpha_max
 
 
 @kernel
-def forward(tiles, tiles_x, tiles_y, tile_starts, splats, shifts, records, colors, alpha_max, stop, hits, image):
+def forward(
+    tiles, tiles_x, tiles_y, tile_starts, splats, shifts, records, colors, alpha_max, stop, hits, image
+):
     """Blend the given ``tiles`` into ``image`` [V, C + 2, h, w]: colours, sum of w z, sum of w.
 
     ``hits`` [entries] receives the blocks that each entry reached, for the backward pass.
     """
     planes_count, height, width = image.shape[1:]
-    transmittance, planes = _scratch(layout.PIXELS // _LANES), _scratch(planes_count * layout.PIXELS // _LANES)
+    transmittance, planes = (
+        _scratch(layout.PIXELS // _LANES),
+        _scratch(planes_count * layout.PIXELS // _LANES),
+    )
     for tile in tiles:
         view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
         y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
@@ -196,7 +206,9 @@ def _backward_splat(record, color, x0, y0, hit, transmittance, upstream, suffix,
         simd.store(transmittance, at, left)
         weight = simd.select(seen, before * alpha, zero)
         d_z = simd.load(upstream, channels * layout.PIXELS + at)
-        value = simd.fma(d_z, simd.full(record[layout.DEPTH]), simd.load(upstream, (channels + 1) * layout.PIXELS + at))
+        value = simd.fma(
+            d_z, simd.full(record[layout.DEPTH]), simd.load(upstream, (channels + 1) * layout.PIXELS + at)
+        )
         d_depth = simd.fma(weight, d_z, d_depth)
         for c in range(channels):
             d_c = simd.load(upstream, c * layout.PIXELS + at)
@@ -223,8 +235,21 @@ def _backward_splat(record, color, x0, y0, hit, transmittance, upstream, suffix,
 
 @kernel
 def backward(
-    tiles, tiles_x, tiles_y, tile_starts, splats, slots, shifts, records, colors, alpha_max, stop, hits, image,
-    image_gradient, gradients,
+    tiles,
+    tiles_x,
+    tiles_y,
+    tile_starts,
+    splats,
+    slots,
+    shifts,
+    records,
+    colors,
+    alpha_max,
+    stop,
+    hits,
+    image,
+    image_gradient,
+    gradients,
 ):
     """Gradients of every entry of the given ``tiles``, from the gradient of ``image``, into ``gradients``."""
     planes_count, height, width = image.shape[1:]
@@ -249,8 +274,17 @@ def backward(
                 continue
             s = splats[entry]
             _backward_splat(
-                records[s], colors[s + shifts[view]], x0, y0, np.int64(hits[entry]), transmittance, upstream, suffix,
-                sums, alpha_max, stop,
+                records[s],
+                colors[s + shifts[view]],
+                x0,
+                y0,
+                np.int64(hits[entry]),
+                transmittance,
+                upstream,
+                suffix,
+                sums,
+                alpha_max,
+                stop,
             )
             for first in range(0, rows, _LANES):
                 simd.store(line, 0, simd.row_sums(sums, first * _LANES))

@@ -139,7 +139,9 @@ def store(typing_context, array, index, value):
 @intrinsic
 def fma(typing_context, a, b, c):
     """``a * b + c``, fused where the machine can."""
-    return vector(vector, vector, vector), lambda context, builder, sig, args: _call(builder, "fmuladd", *args)
+    return vector(vector, vector, vector), lambda context, builder, sig, args: _call(
+        builder, "fmuladd", *args
+    )
 
 
 @intrinsic

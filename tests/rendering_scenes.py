@@ -1,0 +1,155 @@
+"""Scenes and comparisons that the tests of the renderer share."""
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from ghgs_lit.rendering import RasterSettings, render
+from ghgs_lit.types import Cameras, Gaussians, Rendering
+
+FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
+
+
+def cameras(
+    views: int, height: int, width: int, batch: int = 1, distance: float = 3.0, focal: float = 1.3
+) -> Cameras:
+    """Cameras around the y axis that look at the origin; unequal focal lengths, off-centre axis."""
+    intrinsics = torch.tensor(
+        [
+            [focal * width, 0.0, 0.5 * width + 0.3],
+            [0.0, 1.1 * focal * width, 0.5 * height - 0.2],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
+    for view in range(views):
+        angle = 2 * math.pi * view / views + 0.2 if views > 1 else 0.0
+        extrinsics[:, view, 0, 0] = extrinsics[:, view, 2, 2] = math.cos(angle)
+        extrinsics[:, view, 0, 2], extrinsics[:, view, 2, 0] = math.sin(angle), -math.sin(angle)
+        extrinsics[:, view, 2, 3] = distance
+    return Cameras(intrinsics.expand(batch, views, 3, 3), extrinsics, height, width)
+
+
+def cloud(
+    count: int, seed: int = 0, size: float = 0.05, channels: int = 3, splits: tuple | None = None
+) -> Gaussians:
+    """Random Gaussians around the origin, of all shapes, turned every way."""
+    generator = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=0.5 * torch.randn(count, 3, generator=generator),
+        quaternions=torch.randn(count, 4, generator=generator),
+        scales=size * torch.rand(count, 3, generator=generator) + 0.1 * size,
+        opacities=torch.rand(count, generator=generator),
+        colors=torch.rand(count, channels, generator=generator),
+        splits=(count,) if splits is None else splits,
+    )
+
+
+def body(count: int, size: int, seed: int = 0) -> Gaussians:
+    """Splats of about a pixel on a closed surface that covers a fifth of a ``size`` x ``size`` frame."""
+    generator = torch.Generator().manual_seed(seed)
+    direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    pixel = 3.0 / (1.3 * size)
+    axes = torch.tensor([0.165, 0.36, 0.165]) * size * pixel
+    return Gaussians(
+        means=direction * axes + 0.002 * torch.randn(count, 3, generator=generator),
+        quaternions=torch.randn(count, 4, generator=generator),
+        scales=pixel * (0.2 + 0.4 * torch.rand(count, 3, generator=generator)),
+        opacities=0.7 + 0.29 * torch.rand(count, generator=generator),
+        colors=torch.rand(count, 3, generator=generator),
+        splits=(count,),
+    )
+
+
+def one(**changes) -> Gaussians:
+    """One round Gaussian at the origin, changed as asked; a value with a leading dimension makes several."""
+    values = {
+        "means": torch.zeros(1, 3),
+        "quaternions": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "scales": torch.full((1, 3), 0.1),
+        "opacities": torch.full((1,), 0.8),
+        "colors": torch.tensor([[0.9, 0.5, 0.2]]),
+    }
+    values.update({name: torch.as_tensor(value, dtype=torch.float32) for name, value in changes.items()})
+    count = max(len(value) for value in values.values())
+    values = {name: value.expand(count, *value.shape[1:]).clone() for name, value in values.items()}
+    return Gaussians(**values, splits=(count,))
+
+
+def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """The same Gaussians as leaves that require gradients."""
+    fields = {name: getattr(gaussians, name).detach().to(dtype).requires_grad_() for name in FIELDS}
+    return dataclasses.replace(gaussians, **fields)
+
+
+def ambiguous(gaussians: Gaussians, views: Cameras, settings: RasterSettings, **options) -> Tensor:
+    """Pixels [B, T, 1, h, w] of which float32 may decide a threshold otherwise than float64 does."""
+    images = []
+    for sign in (-1, 1):
+        moved = dataclasses.replace(
+            settings,
+            alpha_min=settings.alpha_min * (1 + sign * 1e-5),
+            stop=settings.stop * (1 + sign * 1e-3),
+            extent=settings.extent * (1 + sign * 1e-6),
+        )
+        double = gaussians.to(torch.float64) if gaussians.means.dtype != torch.float64 else gaussians
+        images.append(render(double.detach(), views, "reference", settings=moved, **options))
+    difference = (images[0].alpha - images[1].alpha).abs() + (images[0].image - images[1].image).abs().sum(
+        2, True
+    )
+    return difference != 0
+
+
+def error(value: Tensor, truth: Tensor) -> float:
+    """Relative L2 error; absolute where the truth is zero."""
+    value, truth = value.detach().double(), truth.detach().double()
+    return float((value - truth).norm() / (truth.norm() if truth.norm() > 0 else 1.0))
+
+
+def differentiate(
+    gaussians: Gaussians, views: Cameras, backend: str, dtype, weights: list[Tensor], **options
+):
+    """A rendering and the gradients of its product with ``weights`` (image, alpha, depth)."""
+    gaussians = leaves(gaussians, dtype)
+    rendering = render(gaussians, views, backend, **options)
+    outputs = (rendering.image, rendering.alpha, rendering.depth)
+    torch.autograd.backward([(o.double() * w).sum() for o, w in zip(outputs, weights, strict=True)])
+    return rendering, {name: getattr(gaussians, name).grad for name in FIELDS}
+
+
+def compare(
+    gaussians: Gaussians,
+    views: Cameras,
+    settings: RasterSettings | None = None,
+    image_budget: float = 2e-5,
+    gradient_budget: float = 5e-5,
+    ambiguous_budget: float = 0.01,
+    **options,
+) -> Rendering:
+    """Assert that the CPU backend in float32 is the reference in float64, forward and backward."""
+    settings = settings or RasterSettings()
+    unsure = ambiguous(gaussians, views, settings, **options)
+    assert unsure.double().mean() <= ambiguous_budget
+    generator = torch.Generator().manual_seed(7)
+    shape = (*views.shape, 1, views.height, views.width)
+    channels = gaussians.colors.shape[1]
+    weights = [
+        torch.randn((*shape[:2], c, *shape[3:]), generator=generator, dtype=torch.float64) * ~unsure
+        for c in (channels, 1, 1)
+    ]
+    truth, true_gradients = differentiate(
+        gaussians, views, "reference", torch.float64, weights, settings=settings, **options
+    )
+    found, gradients = differentiate(
+        gaussians, views, "cpu", torch.float32, weights, settings=settings, **options
+    )
+    for name in ("image", "alpha", "depth"):
+        value, wanted = getattr(found, name), getattr(truth, name)
+        assert torch.isfinite(value).all(), name
+        assert error(value * ~unsure, wanted * ~unsure) < image_budget, name
+    for name in FIELDS:
+        assert torch.isfinite(gradients[name]).all(), name
+        assert error(gradients[name], true_gradients[name]) < gradient_budget, name
+    return found
