@@ -52,15 +52,15 @@ class SubjectBounds:
     min_thickness: float = 0.02
 
     def __post_init__(self) -> None:
-        choice("depth_head.bounds.kind", self.kind, ("box", "hull"))
-        require(0 <= self.dilation < 0.5, "depth_head.bounds.dilation", "a part of the image", self.dilation)
+        choice("depth_head.search.kind", self.kind, ("box", "hull"))
+        require(0 <= self.dilation < 0.5, "depth_head.search.dilation", "a part of the image", self.dilation)
         for name in ("tolerance", "margin"):
-            require(getattr(self, name) >= 0, f"depth_head.bounds.{name}", "0 or more", getattr(self, name))
+            require(getattr(self, name) >= 0, f"depth_head.search.{name}", "0 or more", getattr(self, name))
         for name, least in (("samples", 2), ("resolution", 8), ("cells", 8)):
             value = getattr(self, name)
-            require(value >= least, f"depth_head.bounds.{name}", f"{least} or more", value)
+            require(value >= least, f"depth_head.search.{name}", f"{least} or more", value)
         for name in ("min_depth", "min_thickness"):
-            require(getattr(self, name) > 0, f"depth_head.bounds.{name}", "above 0", getattr(self, name))
+            require(getattr(self, name) > 0, f"depth_head.search.{name}", "above 0", getattr(self, name))
 
     @torch.no_grad()
     def __call__(
