@@ -1,0 +1,49 @@
+"""``ghgs evaluate``: measure a checkpoint, baselines, or both on the same targets."""
+
+from typing import Any
+
+import lightning.pytorch as L
+from omegaconf import DictConfig
+
+from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.config import build
+from ghgs_lit.errors import InputError
+from ghgs_lit.experiments.baselines import BASELINES, baseline
+from ghgs_lit.experiments.evaluation import Method, ModelMethod
+from ghgs_lit.experiments.session import build_data, measure_and_write, pick_device
+from ghgs_lit.model import GHGS, read_checkpoint
+
+
+def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
+    """What is measured, by name, and what is known about it."""
+    names = config["baselines"]
+    names = list(BASELINES) if names == "all" else [names] if isinstance(names, str) else names
+    path, renderer = config["checkpoint"], build(config["renderer"], "renderer")
+    if path is None and not names:
+        raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
+    methods: dict[str, Method] = {}
+    facts: dict[str, Any] = {"checkpoint": path}
+    trained = config
+    if path is not None:
+        model = GHGS.from_checkpoint(path)
+        trained = read_checkpoint(path)["config"]
+        facts["checkpoint_config"] = trained
+        facts["parameters"] = {"total": sum(p.numel() for p in model.parameters())}
+        methods["model"] = ModelMethod(model.to(device).eval(), renderer)
+    splats = config["splats"]
+    for name in names:
+        methods[name] = baseline(
+            name, renderer, lambda: GHGS.from_config(trained).to(device), splats["sigma"], splats["opacity"]
+        )
+    return methods, facts
+
+
+def run(cfg: DictConfig) -> None:
+    directory = output_dir()
+    config = save_config(cfg, directory)
+    L.seed_everything(config["seed"], workers=True, verbose=False)
+    device = pick_device(config["device"])
+    methods, facts = _methods(config, device)
+    data = build_data(config)
+    data.prepare_data()
+    announce(measure_and_write(methods, data, config, directory, device, verb="evaluate", **facts))

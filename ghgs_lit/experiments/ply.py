@@ -1,0 +1,76 @@
+"""Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
+
+World frame; opacity as logit, standard deviations as logarithm, unit quaternions ``(w, x, y, z)``, colour
+as the constant term of spherical harmonics.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.types import Gaussians
+
+SH_CONSTANT = 0.5 / np.sqrt(np.pi)
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_CONSTANT * f_dc."""
+_OPACITY_LIMIT = 1e-6  # a logit of exactly 0 or 1 is infinite
+_SMALLEST_SCALE = 1e-9  # metres
+_GROUPS = {
+    "means": ("x", "y", "z"),
+    "normals": ("nx", "ny", "nz"),
+    "colors": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacities": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "quaternions": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+
+
+def write_ply(gaussians: Gaussians, path: Path) -> None:
+    """Write the Gaussians of one subject (RGB colours), aside and renamed."""
+    require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
+    channels = gaussians.colors.shape[1]
+    require(channels == 3, "write_ply", "colours of 3 channels", channels)
+    fields = ("means", "quaternions", "scales", "opacities", "colors")
+    means, quaternions, scales, opacities, colors = (
+        getattr(gaussians, name).detach().to("cpu", torch.float64) for name in fields
+    )
+    values = {
+        "means": means,
+        "normals": torch.zeros_like(means),
+        "colors": (colors - 0.5) / SH_CONSTANT,
+        "opacities": torch.logit(opacities.clamp(_OPACITY_LIMIT, 1 - _OPACITY_LIMIT))[:, None],
+        "scales": scales.clamp(min=_SMALLEST_SCALE).log(),
+        "quaternions": torch.nn.functional.normalize(quaternions, dim=-1),
+    }
+    vertices = np.empty(len(gaussians), dtype=[(name, "<f4") for names in _GROUPS.values() for name in names])
+    for group, names in _GROUPS.items():
+        for column, name in enumerate(names):
+            vertices[name] = values[group][:, column].numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(aside)
+    aside.replace(path)
+
+
+def read_ply(path: Path) -> Gaussians:
+    """Read such a file (its constant colour only) as the Gaussians of one subject."""
+    try:
+        vertices = PlyData.read(path)["vertex"]
+        columns = {
+            group: torch.from_numpy(np.stack([np.asarray(vertices[n], np.float32) for n in names], -1))
+            for group, names in _GROUPS.items()
+            if group != "normals"
+        }
+    except (PlyParseError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: expected a 3D Gaussian Splatting PLY; found {error}") from error
+    return Gaussians(
+        means=columns["means"],
+        quaternions=columns["quaternions"],
+        scales=columns["scales"].exp(),
+        opacities=columns["opacities"][:, 0].sigmoid(),
+        colors=columns["colors"] * SH_CONSTANT + 0.5,
+        splits=(len(columns["means"]),),
+    )

@@ -1,0 +1,101 @@
+"""``metrics.json`` and ``metrics.csv``: one row a subject, target and method, with provenance."""
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ghgs_lit.errors import InputError
+
+FORMAT_VERSION = 1
+KEYS = ("method", "subject", "views", "targets", "target", "inputs")
+"""What a row is about; everything else in it is a number."""
+
+Row = dict[str, Any]
+
+
+def mean(values: Iterable[float | None]) -> float | None:
+    """Mean of the defined values (neither None nor nan); None without any."""
+    known = [v for v in values if v is not None and not math.isnan(v)]
+    return sum(known) / len(known) if known else None
+
+
+def metric_names(rows: Sequence[Row]) -> list[str]:
+    """Names of the numbers in the rows, in order of appearance."""
+    return list(dict.fromkeys(name for row in rows for name in row if name not in KEYS))
+
+
+def summarize(rows: Sequence[Row]) -> list[Row]:
+    """Means over subjects for each method, number of views and kind of target.
+
+    A subject's targets are averaged first, so that each subject counts once.
+    """
+    groups: dict[tuple, dict[str, list[Row]]] = {}
+    for row in rows:
+        key = (row["method"], row["views"], row["targets"])
+        groups.setdefault(key, {}).setdefault(row["subject"], []).append(row)
+    names = metric_names(rows)
+    return [
+        {
+            **dict(zip(("method", "views", "targets"), key, strict=True)),
+            "subjects": len(subjects),
+            **{name: mean(mean(row.get(name) for row in own) for own in subjects.values()) for name in names},
+        }
+        for key, subjects in groups.items()
+    ]
+
+
+def _write(path: Path, text: str) -> None:
+    """Write aside and rename: a reader never sees half a file."""
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    aside.write_text(text)
+    aside.replace(path)
+
+
+def _plain(value: Any) -> Any:
+    """Numbers that JSON does not know become null."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value
+
+
+def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str, Any]) -> Path:
+    """Write ``metrics.csv`` and then ``metrics.json``, whose presence says that the run is complete."""
+    if not rows:
+        raise InputError("evaluation: expected at least one subject and target; found none")
+    directory.mkdir(parents=True, exist_ok=True)
+    columns = [*KEYS, *metric_names(rows)]
+    table = io.StringIO()
+    writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**row, "inputs": " ".join(row["inputs"])} for row in _plain(rows))
+    _write(directory / "metrics.csv", table.getvalue())
+    content = {
+        "format_version": FORMAT_VERSION,
+        "provenance": provenance,
+        "summary": summarize(rows),
+        "rows": rows,
+    }
+    path = directory / "metrics.json"
+    _write(path, json.dumps(_plain(content), indent=1, allow_nan=False))
+    return path
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """Read a ``metrics.json``; an ``InputError`` names a file that is none."""
+    try:
+        content = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected a metrics.json; found {error}") from error
+    if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
+        found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
+        raise InputError(f"{path}: expected format_version {FORMAT_VERSION}; found {found}")
+    return content

@@ -1,0 +1,89 @@
+"""What the verbs that measure have in common: data, methods, results in the run's directory."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rich
+import torch
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch import LightningDataModule
+from rich.table import Table
+
+from ghgs_lit.config import build
+from ghgs_lit.errors import choice, require
+from ghgs_lit.experiments.evaluation import Method, measure_all
+from ghgs_lit.experiments.provenance import provenance
+from ghgs_lit.experiments.results import Row, metric_names, summarize, write_results
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def build_data(config: Mapping[str, Any]) -> LightningDataModule:
+    """The configured data with its view and target protocols."""
+    return build(
+        config["data"], "data", views=config["views"], targets=config["targets"], seed=config["seed"]
+    )
+
+
+def pick_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is one."""
+    choice("device", name, DEVICES)
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def choices() -> dict[str, str]:
+    """Which member of each config group this run was made of; empty outside of Hydra."""
+    return dict(HydraConfig.get().runtime.choices) if HydraConfig.initialized() else {}
+
+
+def measure_and_write(
+    methods: Mapping[str, Method],
+    data: LightningDataModule,
+    config: Mapping[str, Any],
+    directory: Path,
+    device: torch.device,
+    **facts: Any,
+) -> Path:
+    """Measure ``methods`` as ``config`` (``evaluation``, ``metrics``) says; print and write the results."""
+    protocol = config["evaluation"]
+    for key in ("views", "targets"):
+        found = protocol[key]
+        require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
+    metrics = build(config["metrics"], "metrics").to(device)
+    rows = measure_all(
+        dict(methods),
+        data,
+        views=protocol["views"],
+        targets=protocol["targets"],
+        split=protocol["split"],
+        metrics=metrics,
+        device=device,
+        pictures=directory / "pictures",
+        picture_count=protocol["pictures"],
+    )
+    source = provenance(
+        config,
+        seed=config["seed"],
+        data={"name": config["data"].get("name"), "split": protocol["split"]},
+        protocol={
+            "metrics": metrics.protocol,
+            "views": list(protocol["views"]),
+            "targets": list(protocol["targets"]),
+            "reported": list(metrics.metrics),
+        },
+        choices=choices(),
+        **facts,
+    )
+    print_summary(rows)
+    return write_results(directory, rows, source)
+
+
+def print_summary(rows: list[Row]) -> None:
+    """Means over subjects as a table on the terminal."""
+    names = [name for name in metric_names(rows) if name != "gaussians"]
+    table = Table("method", "views", "targets", *names)
+    for mean in summarize(rows):
+        numbers = ("-" if mean[n] is None else f"{mean[n]:.{2 if abs(mean[n]) >= 5 else 4}f}" for n in names)
+        table.add_row(mean["method"], str(mean["views"]), mean["targets"], *numbers)
+    rich.print(table)

@@ -1,0 +1,42 @@
+"""Cameras on a circle around what the given cameras look at."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from ghgs_lit.types import Cameras
+
+
+def look_at_point(cameras: Cameras) -> Tensor:
+    """The world point nearest to all optical axes (least squares); cameras are [V]."""
+    forward = cameras.extrinsics[:, 2, :3].double()
+    away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
+    right = (away @ cameras.centers.double()[:, :, None]).sum(0)
+    return (torch.linalg.pinv(away.sum(0)) @ right)[:, 0]
+
+
+def turntable(cameras: Cameras, frames: int) -> Cameras:
+    """[frames] cameras: once around the subject at the mean distance and height of ``cameras`` [V].
+
+    Starts at the first camera's side; its intrinsics are used throughout. Up is the cameras' mean up.
+    """
+    center = look_at_point(cameras)
+    up = torch.nn.functional.normalize(-cameras.extrinsics[:, 1, :3].double().mean(0), dim=0)
+    offsets = cameras.centers.double() - center
+    heights = offsets @ up
+    flat = offsets - heights[:, None] * up
+    radius = flat.norm(dim=-1).mean()
+    start = torch.nn.functional.normalize(flat[0], dim=0)
+    side = torch.linalg.cross(up, start)
+    angles = torch.arange(frames, dtype=torch.float64, device=center.device) * (2 * math.pi / frames)
+    around = angles.cos()[:, None] * start + angles.sin()[:, None] * side
+    positions = center + radius * around + heights.mean() * up
+    forward = torch.nn.functional.normalize(center - positions, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
+    rotation = torch.stack((right, torch.linalg.cross(forward, right), forward), dim=-2)
+    extrinsics = torch.eye(4, dtype=torch.float64, device=center.device).repeat(frames, 1, 1)
+    extrinsics[:, :3, :3] = rotation
+    extrinsics[:, :3, 3] = -(rotation @ positions[..., None])[..., 0]
+    intrinsics = cameras.intrinsics[:1].expand(frames, 3, 3)
+    return Cameras(intrinsics, extrinsics.to(cameras.extrinsics.dtype), cameras.height, cameras.width)

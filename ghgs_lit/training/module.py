@@ -1,0 +1,113 @@
+"""The LightningModule: steps, optimizer and logging calls around the model."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from lightning.pytorch.callbacks import Timer
+from torch import Tensor, nn
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import Losses
+from ghgs_lit.metrics import PSNR
+from ghgs_lit.model import FORMAT_VERSION
+from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
+
+
+class DivergedError(InputError):
+    """A loss or a gradient stopped being a number."""
+
+
+class GHGSModule(L.LightningModule):
+    """Trains ``model`` (``Batch -> Prediction``) through ``renderer`` (``Gaussians, Cameras -> Rendering``).
+
+    ``config`` is the run's full configuration as plain data; every checkpoint carries it.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        renderer: Callable[[Gaussians, Cameras], Rendering],
+        losses: Losses,
+        optimization: Optimization,
+        config: Mapping[str, Any],
+    ):
+        super().__init__()
+        self.model = model
+        self.renderer = renderer
+        self.losses = losses
+        self.optimization = optimization
+        self.config = config
+        self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
+
+    def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
+        prediction = self.model(batch)
+        return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        prediction, rendering = self(batch)
+        total, values = self.losses(prediction, rendering, batch)
+        if not torch.isfinite(total):
+            broken = ", ".join(f"{name} = {v.item()}" for name, v in values.items() if not torch.isfinite(v))
+            subjects = ", ".join(batch.subjects)
+            raise DivergedError(
+                f"step {self.global_step}: expected finite losses; found {broken} (subjects {subjects})"
+            )
+        size = len(batch.images)
+        self.log("train/loss", total.detach(), prog_bar=True, batch_size=size)
+        self.log_dict({f"train/{name}": v.detach() for name, v in values.items()}, batch_size=size)
+        self.log("train/gaussians", float(len(prediction.gaussians)) / size, batch_size=size)
+        return total
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        prediction, rendering = self(batch)
+        image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
+        size, mask = len(batch.images), batch.targets.masks.flatten(0, 1)
+        for name, metric in (("val/psnr", self.val_psnr), ("val/psnr_box", self.val_psnr_box)):
+            metric.update(image.clamp(0, 1), target, mask)
+            self.log(name, metric, prog_bar=name == "val/psnr", on_epoch=True, batch_size=size)
+        return {"prediction": prediction, "rendering": rendering}
+
+    def progress(self) -> float:
+        """Share of the budget that is used up: of the steps or of the time, whichever is further."""
+        trainer = self.trainer
+        shares = [self.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
+        for timer in (c for c in trainer.callbacks if isinstance(c, Timer)):
+            used, left = timer.time_elapsed(), timer.time_remaining()
+            if left is not None:
+                share = torch.tensor(used / max(used + left, 1e-9), device=self.device)
+                # The processes' clocks differ, their learning rates must not.
+                together = trainer.world_size > 1 and used > 0
+                shares.append(float(trainer.strategy.reduce(share, reduce_op="max") if together else share))
+        if not shares:
+            raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
+        return min(max(shares), 1.0)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        optimizer = self.optimization.build(self.model.parameters())
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda _: self.optimization.factor(self.progress())
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
+        """Clip to ``optimizer.clip``, log the norm before it, refuse one that is not a number."""
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip)
+        if not torch.isfinite(norm):
+            broken = [
+                name
+                for name, p in self.model.named_parameters()
+                if p.grad is not None and not torch.isfinite(p.grad).all()
+            ]
+            raise DivergedError(
+                f"step {self.global_step}: expected a finite gradient; found {norm.item()} in"
+                f" {len(broken)} parameters, first {broken[0] if broken else 'none'}"
+            )
+        self.log("train/gradient_norm", norm)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Plain data only: such a file loads with ``torch.load(weights_only=True)``."""
+        checkpoint["format_version"] = FORMAT_VERSION
+        checkpoint["config"] = dict(self.config)

@@ -1,0 +1,57 @@
+"""How the weights move: AdamW, a linear schedule over the run's budget, a bound on the gradient."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from ghgs_lit.errors import require
+
+
+@dataclass(frozen=True)
+class Optimization:
+    """AdamW whose learning rate rises linearly to ``lr`` and then falls linearly.
+
+    ``warmup`` is the rise's share of the run; ``start_factor`` and ``end_factor`` are the first and the
+    last learning rate as parts of ``lr``; ``clip`` bounds the norm of the gradient. The schedule runs on
+    the share of the budget that is used up, in steps or in time, whichever is further.
+    """
+
+    lr: float
+    betas: Sequence[float] = (0.9, 0.999)
+    eps: float = 1e-8
+    weight_decay: float = 1e-5
+    warmup: float = 0.01
+    start_factor: float = 0.04
+    end_factor: float = 0.0
+    clip: float = 1.0
+
+    def __post_init__(self):
+        require(self.lr > 0, "optimizer.lr", "a positive number", self.lr)
+        betas_fit = len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)
+        require(betas_fit, "optimizer.betas", "two numbers in [0, 1)", list(self.betas))
+        require(self.eps > 0, "optimizer.eps", "a positive number", self.eps)
+        require(self.weight_decay >= 0, "optimizer.weight_decay", "a number of at least 0", self.weight_decay)
+        require(0 <= self.warmup < 1, "optimizer.warmup", "a share in [0, 1)", self.warmup)
+        for name in ("start_factor", "end_factor"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, f"optimizer.{name}", "a share in [0, 1]", value)
+        require(self.clip > 0, "optimizer.clip", "a positive gradient norm", self.clip)
+
+    def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.AdamW:
+        """The optimizer of those parameters that are trained."""
+        return torch.optim.AdamW(
+            [p for p in parameters if p.requires_grad],
+            lr=self.lr,
+            betas=tuple(self.betas),
+            eps=self.eps,
+            weight_decay=self.weight_decay,
+        )
+
+    def factor(self, progress: float) -> float:
+        """Learning rate as a part of ``lr`` when the share ``progress`` in [0, 1] of the budget is used."""
+        if progress < self.warmup:
+            return self.start_factor + (1 - self.start_factor) * progress / self.warmup
+        fall = (progress - self.warmup) / (1 - self.warmup)
+        return 1 + (self.end_factor - 1) * min(fall, 1.0)
