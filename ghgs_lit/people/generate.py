@@ -1,0 +1,152 @@
+"""Make a person: shape, pose, clothes, colours, all from two numbers."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from ghgs_lit.errors import require
+from ghgs_lit.people import garments
+from ghgs_lit.people.body import BODY_VERTICES, BodyModel, load_body, skin
+from ghgs_lit.people.cloth import bottom_texture, shoe_texture, top_texture
+from ghgs_lit.people.complexion import Complexion, eye_texture, head_texture, sample_complexion, skin_texture
+from ghgs_lit.people.garments import Figure
+from ghgs_lit.people.hair import make_hair, sample_haircut
+from ghgs_lit.people.mesh import Person, TexturedMesh
+from ghgs_lit.people.meshing import triangles, vertex_normals
+from ghgs_lit.people.noise import Noise
+from ghgs_lit.people.outfit import Outfit, sample_outfit
+from ghgs_lit.people.pose import sample_pose
+from ghgs_lit.people.surface import Place, chart
+
+HIDDEN = 0.03  # skin and inner layers this far inside an outer garment are left out, metres
+YAW = 30.0  # degrees to either side
+TRIES = 6  # poses drawn before the arms are simply spread
+
+
+def generate(seed: int, index: int) -> Person:
+    """Make person `index` of the family `seed`: the same person on every machine, up to rounding.
+
+    Stands on y = 0 with the feet's centre near the origin, facing +z up to 30 degrees of yaw; metres.
+
+    Raises:
+        InputError: a number is negative.
+    """
+    require(seed >= 0, "seed", "a number of at least 0", seed)
+    require(index >= 0, "index", "a number of at least 0", index)
+    streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(4)]
+    shape_rng, pose_rng, cloth_rng, look_rng = streams
+    body = load_body()
+    coefficients, female, age = body.sample_shape(shape_rng)
+    figure = pose_figure(body, coefficients, pose_rng)
+    outfit = sample_outfit(cloth_rng, female)
+    look = sample_complexion(look_rng, female, age)
+    cut = sample_haircut(look_rng, female)
+    parts = dress(figure, outfit, cloth_rng)
+    parts += undressed_parts(figure, outfit, look, scalp=0.25 if cut.style == "bald" else 1.0)
+    parts += make_hair(figure, cut, look, look_rng)
+    turn = Rotation.from_euler("y", pose_rng.uniform(-YAW, YAW), degrees=True).as_matrix()
+    return _on_the_ground(f"person_{seed}_{index:04d}", parts, figure.posed, turn)
+
+
+def pose_figure(body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator) -> Figure:
+    """The naked person in a pose whose arms do not run into the trunk."""
+    rest, joints = body.rest(coefficients)
+    faces = triangles(body.surfaces["body"].quads)
+    for attempt in range(TRIES):
+        pose = sample_pose(body, joints, rng, widen=attempt / (TRIES - 1))
+        posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], pose.transforms)
+        if arm_depth(body, posed, faces) < 0.012:
+            break
+    return Figure(rest, joints, faces, pose.transforms, posed)
+
+
+def arm_depth(body: BodyModel, posed: np.ndarray, faces: np.ndarray) -> float:
+    """How deep, in metres, forearms and hands are inside trunk and thighs."""
+    bones = np.array(body.bone_names)[body.weights[:BODY_VERTICES].argmax(1)]
+    limb = np.flatnonzero([b.startswith(("lowerarm", "wrist", "finger")) for b in bones])[::4]
+    solid = np.flatnonzero([b.startswith(("spine", "root", "upperleg", "clavicle", "head")) for b in bones])[
+        ::3
+    ]
+    normals = vertex_normals(posed, faces)
+    distance, nearest = cKDTree(posed[solid]).query(posed[limb], distance_upper_bound=0.08)
+    near = np.isfinite(distance)
+    nearest, limb = solid[nearest[near]], limb[near]
+    height = np.einsum("ki,ki->k", posed[limb] - posed[nearest], normals[nearest])
+    return float(np.clip(-height, 0, None).max(initial=0.0))
+
+
+def dress(figure: Figure, outfit: Outfit, rng: np.random.Generator) -> list[TexturedMesh]:
+    """Shoes, trousers or skirt, top and jacket, each without what the next one hides."""
+    noise = Noise(rng, 1.1, 3.0, 128)
+    top, jacket, bottom, shoes = outfit.top, outfit.jacket, outfit.bottom, outfit.shoes
+    upper, lower = chart("upper"), chart("skirt" if bottom.kind == "skirt" else "lower")
+    field = garments.top_field(upper.place, top)
+    if top.tucked:
+        field = np.minimum(field, HIDDEN - garments.bottom_field(upper.place, bottom))
+    if jacket:
+        field = np.minimum(field, HIDDEN - garments.top_field(upper.place, jacket))
+    parts = [upper.mesh(garments.drape_top(figure, top, noise), field, top_texture(top, noise, rng))]
+    if jacket:
+        points = garments.drape_top(figure, jacket, noise)
+        parts.append(
+            upper.mesh(points, garments.top_field(upper.place, jacket), top_texture(jacket, noise, rng))
+        )
+    field = garments.bottom_field(lower.place, bottom)
+    for outer in (jacket, None if top.tucked else top):
+        if outer:
+            field = np.minimum(field, HIDDEN - garments.top_field(lower.place, outer))
+    if bottom.kind == "skirt":
+        points = garments.drape_skirt(figure, bottom, noise, rng)
+    else:
+        points = garments.drape_trousers(figure, bottom, noise)
+    parts.append(lower.mesh(points, field, bottom_texture(bottom, noise)))
+    feet = chart("shoes")
+    parts.append(
+        feet.mesh(
+            garments.shape_shoes(figure, shoes), garments.shoe_field(feet.place, shoes), shoe_texture(shoes)
+        )
+    )
+    return parts
+
+
+def undressed_parts(figure: Figure, outfit: Outfit, look: Complexion, scalp: float) -> list[TexturedMesh]:
+    """Head, eyes and the skin that the clothes leave bare."""
+    parts = []
+    textures = {
+        "head": lambda: head_texture(look, scalp),
+        "skin": lambda: skin_texture(look, outfit.shoes),
+        "eyes": lambda: eye_texture(look),
+    }
+    for name, texture in textures.items():
+        piece = chart(name)
+        points = skin(piece.operator @ figure.rest, piece.weights, figure.transforms)
+        field = bare_field(piece.place, outfit) if name == "skin" else np.ones(len(points))
+        inner = np.clip(HIDDEN - field, 0.0, HIDDEN)  # what clothes cover keeps clear of them
+        if name == "skin":
+            points = points - 0.12 * inner[:, None] * vertex_normals(points, piece.vertex_faces)
+        parts.append(piece.mesh(points, field, texture()))
+    return parts
+
+
+def bare_field(place: Place, outfit: Outfit) -> np.ndarray:
+    """Positive where skin shows, and a little way under the clothes."""
+    covered = np.maximum(garments.top_field(place, outfit.top), garments.shoe_field(place, outfit.shoes))
+    if outfit.bottom.kind != "skirt":
+        covered = np.maximum(covered, garments.bottom_field(place, outfit.bottom))
+    return HIDDEN - covered
+
+
+def _on_the_ground(name: str, parts: list[TexturedMesh], naked: np.ndarray, turn: np.ndarray) -> Person:
+    """Turn about y, centre in x and z, put the lowest point on y = 0."""
+    low = min(float(part.vertices[:, 1].min()) for part in parts)
+    middle = 0.5 * (naked.min(0) + naked.max(0))
+    shift = np.array([-middle[0], -low, -middle[2]])
+
+    def place(points: np.ndarray) -> np.ndarray:
+        return ((points.astype(np.float64) + shift) @ turn.T).astype(np.float32)
+
+    moved = tuple(
+        TexturedMesh(place(part.vertices), part.faces, part.uv, part.texture, part.alpha_cutoff)
+        for part in parts
+    )
+    return Person(name, moved, place(naked))

@@ -1,0 +1,37 @@
+"""Smooth random textures that repeat without a seam."""
+
+import numpy as np
+
+
+class Noise:
+    """A periodic field [size, size] with zero mean, unit variance and a power spectrum of 1 / f^(2 slope).
+
+    `fineness` is the lowest number of waves per period.
+    """
+
+    def __init__(self, rng: np.random.Generator, slope: float = 1.2, fineness: float = 2.0, size: int = 256):
+        frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]) * size
+        spectrum = np.fft.rfft2(rng.standard_normal((size, size)))
+        gain = np.where(frequency >= fineness, 1.0 / np.maximum(frequency, 1.0) ** slope, 0.0)
+        field = np.fft.irfft2(spectrum * gain, (size, size))
+        self.size = size
+        self.field = (field / field.std()).astype(np.float32)
+
+    def __call__(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Bilinear values at `u`, `v` in periods, any shape."""
+        x = np.asarray(u, np.float64) * self.size
+        y = np.asarray(v, np.float64) * self.size
+        left, top = np.floor(x), np.floor(y)
+        fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
+        i, j = left.astype(np.int64) % self.size, top.astype(np.int64) % self.size
+        k, m = (i + 1) % self.size, (j + 1) % self.size
+        field = self.field
+        upper = field[j, i] * (1 - fx) + field[j, k] * fx
+        lower = field[m, i] * (1 - fx) + field[m, k] * fx
+        return upper * (1 - fy) + lower * fy
+
+
+def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
+    """0 below `low`, 1 above `high`, smooth between."""
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3 - 2 * t)
