@@ -1,0 +1,369 @@
+import dataclasses
+import pickle
+import subprocess
+import sys
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from stage_scenes import CASES, fixture, make_batch
+from torch import nn
+
+import ghgs_lit
+from ghgs_lit.config import conf_dir
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.points import Unprojection
+from ghgs_lit.heads.depth import DepthHead
+from ghgs_lit.heads.gaussian import GaussianHead
+from ghgs_lit.model import FORMAT_VERSION, GHGS, check_batch
+from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.types import Batch, Cameras, Tokens
+
+TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]
+TINY += ["recalibration.k=8", "recalibration.num_heads=2"]
+ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
+
+
+def config(*overrides):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        composed = compose("train", overrides=[*TINY, *overrides])
+    stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
+    return OmegaConf.to_container(OmegaConf.masked_copy(composed, list(stages)), resolve=True)
+
+
+def make_model(*overrides, seed=0):
+    """A model that has left its initial state, in which many outputs are constant."""
+    torch.manual_seed(seed)
+    model = GHGS.from_config(config(*overrides))
+    for last in (
+        model.depth_head.dpt.scratch.output_conv2[-1],
+        *(
+            getattr(model.gaussian_head, name)[-1]
+            for name in ("offset_header", "scale_header", "rot_header", "opacity_header")
+        ),
+    ):
+        nn.init.normal_(last.weight, std=0.5)
+    return model
+
+
+def element(batch, b):
+    index = slice(b, b + 1)
+    return Batch(
+        batch.images[index], batch.masks[index], batch.cameras[index], depths=batch.depths[index],
+        body_vertices=None,
+    )  # fmt: skip
+
+
+def close(a, b, limit=1e-5):
+    for name in ATTRIBUTES:
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x - y).abs().max() <= limit * y.abs().max(), name
+
+
+class GivenTokens(nn.Module):
+    """An encoder whose tokens come from a fixture."""
+
+    patch_size = 14
+
+    def __init__(self, inputs):
+        super().__init__()
+        latent = tuple(inputs[f"tokens_{layer}"][0, :, 5:].flatten(0, 1) for layer in (4, 11, 17, 23))
+        axes = (torch.arange(n) for n in (3, 5, 5))
+        image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+        self.tokens = Tokens(latent, inputs["dino"].flatten(0, 1), image, row, column, (1, 3, 5, 5), 14)
+
+    def forward(self, images, masks):
+        return self.tokens
+
+
+def release_model(inputs, dtype):
+    dpt = {"features": 16, "out_channels": [16, 20, 24, 32]}
+    model = GHGS(
+        GivenTokens(inputs),
+        DepthHead(64, dpt, parameterization="inverse_linear", bounds="none"),
+        Recalibration(64, k=8, similarity="product_clamped", tokens="all"),
+        GaussianHead(64, dpt, parameterization="release"),
+        Unprojection("release", 3),
+    ).to(dtype)
+    names = {
+        "pos_head.": "depth_head.dpt.",
+        "blk.": "recalibration.block.",
+        "decoder.": "gaussian_head.decoder.",
+    }
+    state = {}
+    for key, value in fixture("predict_gaussian_reduced", "state", dtype).items():
+        for old, new in names.items():
+            if key.startswith(old):
+                key = new + key.removeprefix(old)
+                break
+        else:
+            key = f"gaussian_head.{key}"
+        state[key] = value
+    model.load_state_dict(state)
+    return model
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_pipeline_matches_the_release(dtype):
+    name = "predict_gaussian_reduced"
+    inputs, expected = fixture(name, "in", dtype), fixture(name, "out64", torch.float64)
+    extrinsics = torch.eye(4, dtype=dtype).repeat(1, 3, 1, 1)
+    extrinsics[..., :3, :] = inputs["extr"]
+    masks = nn.functional.pad(inputs["mask"][:, :, 0], (3, 3, 3, 3)) != 0
+    cameras = Cameras(inputs["intr"], extrinsics, 64, 64).cropped(-3, -3, 70, 70)
+    batch = Batch(inputs["image"], masks, cameras)
+    model = release_model(inputs, dtype)
+    prediction = model(batch)
+    found = {
+        "inv_depth": 1 / prediction.depth[..., 3:-3, 3:-3],
+        "offset_free_points": prediction.points.pixels[masks],
+        "pos": prediction.gaussians.means,
+        "rot": prediction.gaussians.quaternions,
+        "scale": prediction.gaussians.scales,
+        "opacity": prediction.gaussians.opacities,
+        "rgb": prediction.gaussians.colors,
+    }
+    bounds = CASES[name]["bounds"]
+    for key, value in found.items():
+        target = expected[key].reshape(value.shape)
+        # The fixture keeps some tables in float32 (position embeddings), as the package does.
+        bound = bounds[key] if dtype == torch.float32 else 1e-7 * target.abs().max().item()
+        torch.testing.assert_close(
+            value.double(), target, atol=bound, rtol=0, msg=lambda m, k=key: f"{k}: {m}"
+        )
+    layers = model.recalibration(model.encoder.tokens, prediction.points, batch).latent
+    for layer, index in zip(layers, (4, 11, 17, 23), strict=True):
+        target = fixture(name, "mid", dtype)[f"fused_{index}"][0]
+        torch.testing.assert_close(layer, target, atol=bounds[f"fused_{index}"], rtol=0)
+
+
+@pytest.mark.parametrize("model_name", ["paper", "hull"])
+def test_a_batch_of_two_equals_two_singles(model_name):
+    batch = make_batch(2, 3)
+    model = make_model(f"model={model_name}").eval()
+    with torch.no_grad():
+        together = model(batch)
+        for b in range(2):
+            alone = model(element(batch, b))
+            close(together.gaussians[b], alone.gaussians)
+            assert torch.equal(together.depth_valid[b], alone.depth_valid[0])
+
+
+@pytest.mark.parametrize(
+    "overrides", [["model=paper"], ["model=hull"], ["compat=release"], ["model=hull", "skip=none"]]
+)
+def test_every_parameter_gets_a_finite_gradient(overrides):
+    batch = make_batch(2, 3, 42, 56)
+    model = make_model(*overrides)
+    prediction = model(batch)
+    g = prediction.gaussians
+    assert len(g) == batch.masks.sum()
+    loss = g.means.square().mean() + g.scales.mean() + g.opacities.mean() + g.quaternions[:, 1].mean()
+    (loss + prediction.depth_maps.confidence.mean()).backward()
+    for name, parameter in model.named_parameters():
+        if parameter.grad is None:
+            assert "mask_token" in name or name.endswith("gaussian_head.decoder.norm.bias"), name
+        else:
+            assert parameter.grad.isfinite().all(), name
+
+
+@pytest.mark.parametrize(("size", "views"), [((56, 56), 2), ((28, 70), 3), ((42, 28), 5)])
+def test_shapes(size, views):
+    batch = make_batch(1, views, *size)
+    prediction = make_model()(batch)
+    assert prediction.depth.shape == prediction.depth_valid.shape == batch.masks.shape
+    assert prediction.points.pixels.shape == (*batch.masks.shape, 3)
+    assert prediction.gaussians.splits == (batch.masks.sum().item(),)
+
+
+def test_a_view_with_an_empty_mask_gives_no_gaussians():
+    batch = make_batch(1, 3)
+    masks = batch.masks.clone()
+    masks[0, 1] = False
+    gaussians = make_model()(dataclasses.replace(batch, masks=masks)).gaussians
+    assert set(gaussians.image.tolist()) == {0, 2}
+    assert gaussians.means.isfinite().all()
+
+
+def test_skip_exact_gives_the_gaussians_of_skip_none():
+    batch = make_batch(2, 3)
+    with torch.no_grad():
+        exact, none = (make_model(f"skip={skip}")(batch).gaussians for skip in ("exact", "none"))
+    close(exact, none)
+
+
+def test_ablations_differ_and_say_what_they_leave_out():
+    batch = make_batch(1, 3)
+    outputs = {}
+    for name in ("full", "no_unprojection", "no_semantic", "neither"):
+        cfg = config("model=paper", f"ablation={name}")
+        assert cfg["ablation"]["unprojection"] == (cfg["recalibration"]["neighborhood"] == "xyz")
+        assert cfg["ablation"]["semantic"] == (cfg["recalibration"]["similarity"] != "none")
+        with torch.no_grad():
+            outputs[name] = make_model("model=paper", f"ablation={name}")(batch).gaussians.means
+    names = list(outputs)
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            assert not torch.equal(outputs[a], outputs[b]), (a, b)
+
+
+def test_an_ablation_wins_over_the_releases_values():
+    cfg = config("compat=release", "ablation=no_semantic")
+    assert cfg["recalibration"]["similarity"] == "none"
+    assert cfg["recalibration"]["tokens"] == "all"
+    assert cfg["points"] == {"tokens": "release", "border": 3}
+
+
+def test_named_models_choose_their_parts_and_the_command_line_wins():
+    assert config("model=hull")["depth_head"]["bounds"] == "hull"
+    assert config("model=paper")["depth_head"]["bounds"] == "box"
+    assert config("model=paper", "depth_head=hull")["depth_head"]["bounds"] == "hull"
+
+
+def test_order_of_later_views_does_not_matter():
+    batch = make_batch(1, 4)
+    order = torch.tensor([0, 3, 1, 2])  # the encoder treats the first view apart
+    swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])
+    model = make_model().double()
+    wide = [dataclasses.replace(b, images=b.images.double()) for b in (batch, swapped)]
+    with torch.no_grad():
+        a, b = (model(x).gaussians for x in wide)
+    parts = [(b.image == i).nonzero()[:, 0] for i in (0, 2, 3, 1)]
+    close(a, b.select(torch.cat(parts), b.splits), 2e-5)
+
+
+def test_geometry_is_wide_under_autocast():
+    batch = make_batch(1, 3)
+    model = make_model("model=hull")
+    with torch.autocast("cpu", torch.bfloat16):
+        prediction = model(batch)
+    expected = model(batch)
+    assert prediction.depth.dtype == prediction.points.pixels.dtype == prediction.gaussians.means.dtype
+    assert prediction.depth.dtype == torch.float32
+    assert torch.equal(prediction.depth_maps.near, expected.depth_maps.near)
+    assert (prediction.depth - expected.depth).abs()[batch.masks].max() < 0.1
+    again = Unprojection()(prediction.depth_maps, model.encoder(batch.images, batch.masks), batch)
+    assert torch.equal(again.pixels, prediction.points.pixels)
+
+
+def checkpoint(path, **changes):
+    model = make_model()
+    content = {
+        "state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}
+        | {"loss.weight": torch.ones(1)},
+        "config": config(),
+        "format_version": FORMAT_VERSION,
+    }
+    torch.save({k: v for k, v in (content | changes).items() if v is not None}, path)
+    return model
+
+
+def test_a_checkpoint_rebuilds_its_model(tmp_path):
+    model = checkpoint(tmp_path / "a.ckpt").eval()
+    loaded = GHGS.from_checkpoint(tmp_path / "a.ckpt")
+    assert not loaded.training
+    batch = make_batch(1, 3)
+    with torch.no_grad():
+        close(loaded(batch).gaussians, model(batch).gaussians, 0)
+
+
+def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
+    path = tmp_path / "a.ckpt"
+    checkpoint(path, config=config("gaussian_head.hidden=[64,32]"))
+    with pytest.raises(
+        InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 32\).*\(128, 32\)"
+    ):
+        GHGS.from_checkpoint(path)
+    checkpoint(path, state_dict={})
+    with pytest.raises(InputError, match=r"a\.ckpt: encoder.*expected a tensor of shape"):
+        GHGS.from_checkpoint(path)
+
+
+class Foreign:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"config": None}, "'config'"),
+        ({"state_dict": None}, "'state_dict'"),
+        ({"format_version": None}, "'format_version'"),
+        ({"format_version": FORMAT_VERSION + 1}, "newer version"),
+        ({"config": {"encoder": {}}}, "depth_head"),
+        ({"config": Foreign()}, "plain data"),
+    ],
+)
+def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
+    path = tmp_path / "b.ckpt"
+    checkpoint(path, **changes)
+    with pytest.raises(InputError, match=message) as error:
+        GHGS.from_checkpoint(path)
+    assert "b.ckpt" in str(error.value) or "depth_head" in message
+
+
+def test_files_that_are_no_checkpoints(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"c\.ckpt"):
+        GHGS.from_checkpoint(tmp_path / "c.ckpt")
+    (tmp_path / "c.ckpt").write_bytes(b"no checkpoint at all")
+    with pytest.raises(InputError, match=r"c\.ckpt"):
+        GHGS.from_checkpoint(tmp_path / "c.ckpt")
+    (tmp_path / "c.ckpt").write_bytes(pickle.dumps([1, 2]))
+    with pytest.raises(InputError, match=r"c\.ckpt"):
+        GHGS.from_checkpoint(tmp_path / "c.ckpt")
+
+
+def bad_batches():
+    batch = make_batch(2, 3)
+    cameras = batch.cameras
+
+    def with_cameras(**changes):
+        return dataclasses.replace(batch, cameras=dataclasses.replace(cameras, **changes))
+
+    def changed(tensor, index, value):
+        tensor = tensor.clone()
+        tensor[index] = value
+        return tensor
+
+    one = Batch(batch.images[:, :1], batch.masks[:, :1], cameras[:, :1])
+    odd = make_batch(1, 2, 56, 50)
+    return {
+        "2 views": one,
+        "divisible by the patch size 14": odd,
+        "the images' size": with_cameras(height=28),
+        r"batch.cameras.extrinsics: expected finite values; found .*\[1, 2\]": with_cameras(
+            extrinsics=changed(cameras.extrinsics, (1, 2, 0, 3), float("nan"))
+        ),
+        r"focal lengths above 0; found .*\[0, 1\]": with_cameras(
+            intrinsics=changed(cameras.intrinsics, (0, 1, 1, 1), -3.0)
+        ),
+        r"batch.masks: expected the subject in one view.*\[1\]": dataclasses.replace(
+            batch, masks=changed(batch.masks, 1, False)
+        ),
+    }
+
+
+@pytest.mark.parametrize("message", list(bad_batches()))
+def test_a_bad_batch_is_refused_by_name(message):
+    with pytest.raises(InputError, match=message):
+        check_batch(bad_batches()[message], 14)
+
+
+def test_a_missing_stage_and_a_bad_value_name_their_key():
+    with pytest.raises(InputError, match="gaussian_head: expected a stage"):
+        GHGS.from_config({k: v for k, v in config().items() if k != "gaussian_head"})
+    with pytest.raises(InputError, match=r"depth_head\.bounds: expected one of box, hull"):
+        GHGS.from_config(config("depth_head.bounds=sphere"))
+    with pytest.raises(InputError, match="recalibration"):
+        GHGS.from_config(config("+recalibration.neighbours=3"))
+
+
+def test_importing_the_package_does_not_import_torch():
+    code = (
+        "import sys, ghgs_lit; assert 'torch' not in sys.modules; from ghgs_lit import GHGS, Batch, Gaussians"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert ghgs_lit.GHGS is GHGS
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = ghgs_lit.nothing
