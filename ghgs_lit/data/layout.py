@@ -208,7 +208,8 @@ class Layout:
         progress = Progress(self.root)
         wanted = sorted({*found, *progress.planned(phase)}) if names is None else list(names)
         wanted = wanted[:limit]
-        missing = [name for name in wanted if name not in found] or progress.missing(phase, wanted)
+        unfinished = {*progress.missing(phase, wanted), *(name for name in wanted if name not in found)}
+        missing = [name for name in wanted if name in unfinished]
         if missing:
             raise InputError(
                 f"{images}: expected {len(wanted)} whole subjects; found {len(wanted) - len(missing)} "

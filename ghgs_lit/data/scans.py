@@ -94,6 +94,8 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
 def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | None]:
     """Texture [h, w, 3 or 4] uint8 and alpha cutoff of a material; None where it has no colour."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and image.format is None:  # not from a file: trimesh's stand-in for a lost material
+        image = None
     factor = getattr(material, "baseColorFactor", None)
     if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
         return np.asarray(factor, np.uint8).reshape(1, 1, -1)[..., :3], None
