@@ -1,4 +1,6 @@
+import copy
 import dataclasses
+import functools
 import pickle
 import subprocess
 import sys
@@ -26,6 +28,11 @@ ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 
 
 def config(*overrides):
+    return copy.deepcopy(_composed(overrides))
+
+
+@functools.cache  # composing costs more than the tiny models
+def _composed(overrides):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         composed = compose("train", overrides=[*TINY, *overrides])
     stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
@@ -314,6 +321,7 @@ def test_files_that_are_no_checkpoints(tmp_path):
         GHGS.from_checkpoint(tmp_path / "c.ckpt")
 
 
+@functools.cache
 def bad_batches():
     batch = make_batch(2, 3)
     cameras = batch.cameras
