@@ -157,15 +157,16 @@ def test_a_protocol_reports_its_metrics_by_name():
     assert torch.equal(release["psnr"], psnr(image * 1.5, target))
 
 
-def test_lpips_is_left_out_with_a_line_or_refused():
+def test_lpips_is_left_out_with_its_reason_or_refused():
     try:
         import torchvision  # noqa: F401
     except ImportError:
         pass
     else:
         pytest.skip("torchvision is installed")
-    with pytest.warns(UserWarning, match="LPIPS needs torchvision"):
-        assert "lpips" not in ImageMetrics(lpips="auto").metrics
+    protocol = ImageMetrics(lpips="auto")
+    assert "lpips" not in protocol.metrics
+    assert "torchvision" in protocol.left_out["lpips"]
     with pytest.raises(InputError, match="torchvision"):
         ImageMetrics(lpips="require")
 

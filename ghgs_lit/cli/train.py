@@ -1,6 +1,8 @@
 """``ghgs train``: train a model, then measure it."""
 
+import logging
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.evaluation import ModelMethod
 from ghgs_lit.experiments.results import read_results
 from ghgs_lit.experiments.session import build_data, measure_and_write
-from ghgs_lit.model import GHGS
+from ghgs_lit.model import GHGS, read_checkpoint
 from ghgs_lit.training import GHGSModule
 
 
@@ -35,6 +37,14 @@ def _refuse_processes_in_multirun(config: dict[str, Any]) -> None:
         )
 
 
+def _quiet() -> None:
+    """Lightning's own lines come twice under Hydra; these warnings do not hold here."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
+    for message in (*messages, "The dirpath has changed"):
+        warnings.filterwarnings("ignore", f".*{message}.*")
+
+
 def build_trainer(config: dict[str, Any], directory: Path) -> L.Trainer:
     """The Trainer with its loggers and callbacks, all writing below ``directory``."""
     loggers = [
@@ -48,9 +58,10 @@ def build_trainer(config: dict[str, Any], directory: Path) -> L.Trainer:
             callbacks=callbacks,
             default_root_dir=str(directory),
             enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
+            enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
         )
     except (MisconfigurationException, TypeError, ValueError) as error:
-        raise InputError(f"trainer: {error}") from error
+        raise InputError(f"trainer: {error}") from None
 
 
 def run(cfg: DictConfig) -> float | None:
@@ -60,12 +71,15 @@ def run(cfg: DictConfig) -> float | None:
     config = save_config(cfg, directory) if is_first else plain(cfg)
     _refuse_processes_in_multirun(config)
     L.seed_everything(config["seed"], workers=True, verbose=False)
+    if config["resume"] is not None:
+        read_checkpoint(config["resume"])  # refuses what is missing, foreign, or no plain data
     data = build_data(config)
     model = GHGS.from_config(config)
     renderer = build(config["renderer"], "renderer")
     module = GHGSModule(
         model, renderer, build(config["loss"], "loss"), build(config["optimizer"], "optimizer"), config
     )
+    _quiet()
     trainer = build_trainer(config, directory)
     device = trainer.strategy.root_device
     started = time.perf_counter()
@@ -77,6 +91,7 @@ def run(cfg: DictConfig) -> float | None:
     trainer.save_checkpoint(checkpoint)
     if not trainer.is_global_zero:
         return None
+    print(f"trained {trainer.global_step} steps in {seconds:.0f} s: {checkpoint}", flush=True)
     path = measure_and_write(
         {"model": ModelMethod(model.to(device).eval(), renderer)},
         data,

@@ -45,13 +45,16 @@ def error_map(image: Tensor, target: Tensor) -> np.ndarray:
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
-def depth_map(depth: Tensor, valid: Tensor) -> np.ndarray:
-    """A depth map in colours between its 1st and 99th percentile; near is bright."""
-    known = depth[valid].detach().float().cpu()
-    if known.numel() == 0:
-        return np.zeros((*depth.shape, 3), np.uint8)
-    low, high = np.quantile(known.numpy(), [0.01, 0.99])
-    return colorize(-depth, -float(high), -float(low), "turbo", valid)
+def depth_range(depth: Tensor, valid: Tensor) -> tuple[float, float]:
+    """1st and 99th percentile of the valid depths; (0, 1) without any."""
+    known = depth[valid].detach().float().cpu().numpy()
+    low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
+    return float(low), float(high)
+
+
+def depth_map(depth: Tensor, valid: Tensor, limits: tuple[float, float]) -> np.ndarray:
+    """A depth map in colours between ``limits`` in metres; near is red, black where not ``valid``."""
+    return colorize(-depth, -limits[1], -limits[0], "turbo", valid)
 
 
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
@@ -73,6 +76,25 @@ def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.pad(r, ((0, _GAP), (0, width - r.shape[1]), (0, 0))) for r in rows])
 
 
+def _depth_rows(
+    batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
+) -> list[np.ndarray]:
+    """Predicted and true depths of one subject's views, in the same colours."""
+    masks, maps = batch.masks[element], {}
+    if depth is not None:
+        maps["depth"] = (depth[element], masks if depth_valid is None else masks & depth_valid[element])
+    if batch.depths is not None:
+        maps["true depth"] = (batch.depths[element], masks & (batch.depths[element] > 0))
+    if not maps:
+        return []
+    # The truth, where it is known, sets the range.
+    limits = [depth_range(d, v) for d, v in zip(*list(maps.values())[-1], strict=True)]
+    return [
+        row([depth_map(*tile) for tile in zip(*values, limits, strict=True)], [name] * len(limits))
+        for name, values in maps.items()
+    ]
+
+
 def sheet(
     batch: Batch,
     image: Tensor,
@@ -86,14 +108,7 @@ def sheet(
     """
     views = batch.views[element] if batch.views else tuple(map(str, range(batch.images.shape[1])))
     rows = [row([to_uint8(i) for i in batch.images[element]], [f"input {name}" for name in views])]
-    masks = batch.masks[element]
-    if depth is not None:
-        valid = masks if depth_valid is None else masks & depth_valid[element]
-        tiles = [depth_map(d, m) for d, m in zip(depth[element], valid, strict=True)]
-        rows.append(row(tiles, ["depth"] * len(tiles)))
-    if batch.depths is not None:
-        known = zip(batch.depths[element], masks & (batch.depths[element] > 0), strict=True)
-        rows.append(row([depth_map(d, m) for d, m in known], ["true depth"] * len(views)))
+    rows += _depth_rows(batch, element, depth, depth_valid)
     for t, (render, target) in enumerate(zip(image[element], batch.targets.images[element], strict=True)):
         name = batch.targets.names[element][t] if batch.targets.names else str(t)
         tiles = [to_uint8(target), to_uint8(render), error_map(render, target)]

@@ -16,6 +16,8 @@ from ghgs_lit.experiments.evaluation import Method, measure_all
 from ghgs_lit.experiments.provenance import provenance
 from ghgs_lit.experiments.results import Row, metric_names, summarize, write_results
 
+# What is printed, with its decimals.
+PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -51,6 +53,8 @@ def measure_and_write(
         found = protocol[key]
         require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
     metrics = build(config["metrics"], "metrics").to(device)
+    for name, reason in metrics.left_out.items():
+        print(f"{name} is left out: {reason}", flush=True)
     rows = measure_all(
         dict(methods),
         data,
@@ -71,6 +75,7 @@ def measure_and_write(
             "views": list(protocol["views"]),
             "targets": list(protocol["targets"]),
             "reported": list(metrics.metrics),
+            "left_out": metrics.left_out,
         },
         choices=choices(),
         **facts,
@@ -80,10 +85,10 @@ def measure_and_write(
 
 
 def print_summary(rows: list[Row]) -> None:
-    """Means over subjects as a table on the terminal."""
-    names = [name for name in metric_names(rows) if name != "gaussians"]
+    """Means over subjects as a table on the terminal; the files have all numbers."""
+    names = [name for name in PRINTED if name in metric_names(rows)]
     table = Table("method", "views", "targets", *names)
     for mean in summarize(rows):
-        numbers = ("-" if mean[n] is None else f"{mean[n]:.{2 if abs(mean[n]) >= 5 else 4}f}" for n in names)
+        numbers = ("-" if mean[n] is None else f"{mean[n]:.{PRINTED[n]}f}" for n in names)
         table.add_row(mean["method"], str(mean["views"]), mean["targets"], *numbers)
     rich.print(table)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+
 from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.results import read_results, summarize
 
@@ -127,13 +129,40 @@ def _text(values: Sequence[float], metric: str) -> str:
 
 
 def _best(table: TableData, views: int, metric: str) -> str | None:
-    """The best mean of a column, as printed; None in a column with one entry or less."""
+    """The best mean of a column, as printed; None where there is no better and worse."""
     found = [table.values((*row, views, metric)) for row in ROWS]
     means = [sum(v) / len(v) for v in found if v]
-    if len(means) < 2:
+    if not means or f"{min(means):.{DECIMALS[metric]}f}" == f"{max(means):.{DECIMALS[metric]}f}":
         return None
     best = max(means) if ARROWS[metric] == "↑" else min(means)
     return f"{best:.{DECIMALS[metric]}f}"
+
+
+def entries(table: TableData, views: Sequence[int]) -> list[list[tuple[str, bool]]]:
+    """The table's rows as printed: texts, and whether each is the best of its column."""
+    columns = [(n, m) for n in views for m in table.metrics()]
+    best = {column: _best(table, *column) for column in columns}
+    rows = []
+    for unprojection, semantic in ROWS:
+        note = " (a)" if semantic and not table.setting.has_semantics else ""
+        row = [("✓" if unprojection else "✗", False), (("✓" if semantic else "✗") + note, False)]
+        for n, m in columns:
+            values = table.values((unprojection, semantic, n, m))
+            text = _text(values, m) if values else MISSING
+            row.append((text, bool(values) and best[n, m] == text.split(" ")[0]))
+        rows.append(row)
+    return rows
+
+
+def notes(table: TableData, illustration: bool = False) -> list[str]:
+    """What has to be said below the table."""
+    said = [f"**{ILLUSTRATION}**"] if illustration else []
+    said.append(FOOTNOTE)
+    if not table.setting.has_semantics:
+        said.append(f"(a) {NO_SEMANTICS}.")
+    if "lpips" not in table.metrics():
+        said.append("FLIP stands in for the paper's LPIPS, which at least one run could not compute.")
+    return said
 
 
 def caption(table: TableData) -> str:
@@ -151,31 +180,24 @@ def caption(table: TableData) -> str:
 
 def to_markdown(table: TableData, views: Sequence[int], illustration: bool = False) -> str:
     """The table with its caption above and its notes below."""
-    metrics = table.metrics()
-    names = [f"{n}-view {m.upper()} {ARROWS[m]}" for n in views for m in metrics]
-    lines = [caption(table), ""]
-    lines += ["| 3D unproj. | Semantic cons. | " + " | ".join(names) + " |"]
-    lines += ["|:-:|:-:|" + "--:|" * len(names)]
-    best = {(n, m): _best(table, n, m) for n in views for m in metrics}
-    for unprojection, semantic in ROWS:
-        entries = []
-        for n in views:
-            for m in metrics:
-                values = table.values((unprojection, semantic, n, m))
-                text = _text(values, m) if values else MISSING
-                is_best = values and best[n, m] == text.split(" ")[0]
-                entries.append(f"**{text}**" if is_best else text)
-        marks = ["✓" if unprojection else "✗", "✓" if semantic else "✗"]
-        marks[1] += "" if not semantic or table.setting.has_semantics else " (a)"
-        lines.append("| " + " | ".join((*marks, *entries)) + " |")
-    notes = [FOOTNOTE]
-    if not table.setting.has_semantics:
-        notes.append(f"(a) {NO_SEMANTICS}.")
-    if "lpips" not in metrics:
-        notes.append("FLIP stands in for the paper's LPIPS, which at least one run could not compute.")
-    if illustration:
-        notes.insert(0, f"**{ILLUSTRATION}**")
-    return "\n".join(lines) + "\n\n" + "\n\n".join(notes) + "\n"
+    names = [f"{n}-view {m.upper()} {ARROWS[m]}" for n in views for m in table.metrics()]
+    lines = ["| 3D unproj. | Semantic cons. | " + " | ".join(names) + " |", "|:-:|:-:|" + "--:|" * len(names)]
+    for row in entries(table, views):
+        lines.append("| " + " | ".join(f"**{text}**" if best else text for text, best in row) + " |")
+    return "\n\n".join((caption(table), "\n".join(lines), *notes(table, illustration))) + "\n"
+
+
+def to_terminal(table: TableData, views: Sequence[int]) -> Table:
+    """The table alone, for a terminal."""
+    printed = Table(padding=(0, 1, 0, 0))
+    printed.add_column("3D\nunp.", justify="center", no_wrap=True)
+    printed.add_column("sem.\ncons.", justify="center", no_wrap=True)
+    for n in views:
+        for metric in table.metrics():
+            printed.add_column(f"{n}-view\n{metric.upper()} {ARROWS[metric]}", justify="right", no_wrap=True)
+    for row in entries(table, views):
+        printed.add_row(*(f"[bold green]{text}[/]" if best else text for text, best in row))
+    return printed
 
 
 def to_csv(tables: Sequence[TableData], views: Sequence[int]) -> str:

@@ -1,6 +1,5 @@
 """A measuring protocol: which metrics, how each is computed, under which names."""
 
-import warnings
 from collections.abc import Sequence
 
 import torch
@@ -26,7 +25,8 @@ class ImageMetrics:
         regions: where PSNR and SSIM are taken: ``image``, ``box``, ``subject``.
         ssim_padding: ``reflect`` (torchmetrics), ``valid`` (scikit-image) or ``zeros`` (the authors).
         clamp: whether renders are clamped to [0, 1] first.
-        lpips: ``auto`` leaves LPIPS out, with one line, where it cannot be had; ``require`` fails; ``off``.
+        lpips: ``auto`` leaves LPIPS out where it cannot be had (``left_out`` says why); ``require`` fails;
+            ``off``.
         lpips_net: ``vgg``, ``alex`` or ``squeeze``.
         lpips_signed: whether LPIPS sees [-1, 1] (as it was calibrated) or [0, 1].
         flip_pixels_per_degree: FLIP's viewing distance.
@@ -48,6 +48,7 @@ class ImageMetrics:
             choice("metrics.regions", region, REGIONS)
         self.protocol, self.clamp = protocol, clamp
         self.metrics: dict[str, PerImageMetric] = {}
+        self.left_out: dict[str, str] = {}
         for region in regions:
             suffix = "" if region == "image" else f"_{region}"
             self.metrics[f"psnr{suffix}"] = PSNR(region)
@@ -60,7 +61,7 @@ class ImageMetrics:
             except InputError as error:
                 if lpips == "require":
                     raise
-                warnings.warn(f"left out: {error}", stacklevel=2)
+                self.left_out["lpips"] = str(error)
 
     def to(self, device: torch.device | str) -> "ImageMetrics":
         self.metrics = {name: metric.to(device) for name, metric in self.metrics.items()}

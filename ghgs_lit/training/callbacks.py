@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from ghgs_lit.errors import require
 from ghgs_lit.experiments.pictures import save_png, sheet
@@ -26,6 +27,57 @@ class Checkpoints(ModelCheckpoint):
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         self.dirpath = self.dirpath or str(Path(trainer.default_root_dir) / "checkpoints")
         super().setup(trainer, pl_module, stage)
+
+
+class RunProgress(ProgressBar):
+    """One bar for the whole run, over its budget of steps or of time; epochs mean little here."""
+
+    def __init__(self):
+        super().__init__()
+        self._bar: Progress | None = None
+
+    def disable(self) -> None:
+        """Called by Lightning in all processes but the first."""
+        self._is_enabled = False
+
+    def enable(self) -> None:
+        self._is_enabled = True
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if not getattr(self, "_is_enabled", True):
+            return
+        columns = (
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[text]}"),
+        )
+        self._bar = Progress(TextColumn("training"), *columns)
+        self._bar.start()
+        self._task = self._bar.add_task("training", total=1.0, text="")
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Batch, batch_idx: int
+    ) -> None:
+        if self._bar is None:
+            return
+        shown = {k: v for k, v in self.get_metrics(trainer, pl_module).items() if k != "v_num"}
+        numbers = "  ".join(f"{name} {value:.4g}" for name, value in shown.items())
+        text = f"step {trainer.global_step}  {numbers}"
+        self._bar.update(self._task, completed=pl_module.used_budget, text=text)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._stop()
+
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
 
 
 class StepTime(Callback):

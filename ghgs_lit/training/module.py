@@ -41,6 +41,7 @@ class GHGSModule(L.LightningModule):
         self.optimization = optimization
         self.config = config
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
+        self.used_budget = 0.0
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         prediction = self.model(batch)
@@ -87,9 +88,12 @@ class GHGSModule(L.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         optimizer = self.optimization.build(self.model.parameters())
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda _: self.optimization.factor(self.progress())
-        )
+
+        def factor(_: int) -> float:
+            self.used_budget = self.progress()
+            return self.optimization.factor(self.used_budget)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
