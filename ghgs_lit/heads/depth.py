@@ -1,6 +1,7 @@
 """The depth stage: one z-depth and one confidence for each pixel (paper, section 3.2)."""
 
 from collections.abc import Mapping
+from math import log
 
 import torch
 from jaxtyping import Float
@@ -14,21 +15,20 @@ from ghgs_lit.heads.proportions import proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Tokens
 
 
-def _bounded_inverse(x: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    """``1 / z`` between ``1 / far`` and ``1 / near``: steps of equal size on the image of another view."""
-    share = x.sigmoid()
-    return near * far / (far * share + near * (1 - share))
+def _bounded_inverse(share: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """Linear in ``1 / z``: equal steps are of equal size on the image of another view."""
+    return near * far / (far * (1 - share) + near * share)
 
 
-def _log(x: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    return near * torch.exp(x.sigmoid() * torch.log(far / near))
+def _log(share: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    return near * torch.exp(share * torch.log(far / near))
 
 
-def _linear(x: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    return near + (far - near) * x.sigmoid()
+def _linear(share: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    return near + (far - near) * share
 
 
-#: From a raw value to a depth within ``[near, far]``; 0 gives a depth in the middle.
+#: From a share in [0, 1] of the way to a depth: 0 is ``near``, 1 is ``far``.
 BOUNDED = {"bounded_inverse": _bounded_inverse, "log": _log, "linear": _linear}
 
 
@@ -43,10 +43,11 @@ class DepthHead(nn.Module):
     Args:
         dim_latent: width of the tokens (from the encoder).
         dpt: options of the dense head; widths that are not given follow the encoder's.
-        parameterization: ``bounded_inverse``, ``log`` or ``linear`` between the near and far of each pixel,
-            starting in their middle; ``inverse_linear`` for the authors' checkpoints only.
+        parameterization: ``bounded_inverse``, ``log`` or ``linear`` between the near and far of each pixel;
+            ``inverse_linear`` for the authors' checkpoints only.
         bounds: where near and far come from: ``box`` or ``hull``; ``none`` with ``inverse_linear``.
         search: options of :class:`SubjectBounds`.
+        start: share of the way from near to far at which training starts.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class DepthHead(nn.Module):
         parameterization: str = "bounded_inverse",
         bounds: str = "box",
         search: Mapping | None = None,
+        start: float = 0.5,
     ):
         super().__init__()
         choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
@@ -66,7 +68,8 @@ class DepthHead(nn.Module):
             "none with inverse_linear, box or hull with all others",
             f"{bounds} with {parameterization}",
         )
-        self.parameterization = parameterization
+        require(0 < start < 1, "depth_head.start", "a share between 0 and 1", start)
+        self.parameterization, self.start = parameterization, log(start / (1 - start))
         self.bounds = None if bounds == "none" else SubjectBounds(kind=bounds, **(search or {}))
         self.dpt = proportioned_dpt(dim_latent, 2, **(dpt or {}))
         if self.bounds is not None:
@@ -83,7 +86,7 @@ class DepthHead(nn.Module):
             depth = inverse_linear(value)
         else:
             near, far = self.bounds(batch.masks, batch.cameras)
-            depth = BOUNDED[self.parameterization](value, near, far)
+            depth = BOUNDED[self.parameterization]((value + self.start).sigmoid(), near, far)
         finite = depth.isfinite()
         return DepthMaps(
             depth=torch.where(finite, depth, 1.0),
