@@ -1,5 +1,6 @@
 """Gaussians to images: one function, one definition of the image, three backends."""
 
+import dataclasses
 import importlib
 import math
 from collections.abc import Sequence
@@ -51,11 +52,11 @@ def render(
     gaussians = _wide_gaussians(gaussians)
     cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        sums = module.render_sums(gaussians, cameras, settings, float(near), float(far))
-        channels = gaussians.colors.shape[1]
-        color, depth, alpha = sums.split((channels, 1, 1), dim=2)
-        image = color + (1 - alpha) * _background(background, color)
-        return Rendering(image=image, alpha=alpha, depth=depth / alpha.clamp_min(1e-10))
+        rendering = module.rasterize(gaussians, cameras, settings, float(near), float(far))
+        if _is_finite(background) and background == 0:
+            return rendering
+        behind = (1 - rendering.alpha) * _background(background, rendering.image)
+        return dataclasses.replace(rendering, image=rendering.image + behind)
 
 
 def resolve(backend: str, device: torch.device) -> str:

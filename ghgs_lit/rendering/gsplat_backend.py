@@ -3,12 +3,11 @@
 import importlib
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.rendering.settings import RasterSettings
-from ghgs_lit.types import Cameras, Gaussians
+from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 _FIXED = ("alpha_max", "alpha_min", "stop", "extent", "frustum_margin")
 
@@ -37,27 +36,27 @@ def load():
         ) from error
 
 
-def render_sums(
+def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
-) -> Float[Tensor, "B T channels h w"]:
-    """Sums over the Gaussians of a pixel: ``w colour`` (C channels), ``w z`` and ``w``; float32."""
+) -> Rendering:
+    """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`."""
     default = RasterSettings()
     for name in _FIXED:
         value, fixed = getattr(settings, name), getattr(default, name)
         require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which gsplat has compiled in", value)
     rasterization = load()
-    images = [
+    channels = gaussians.colors.shape[1]
+    elements = [
         _element(rasterization, gaussians[b], cameras[b], settings, near, far)
         for b in range(len(gaussians.splits))
     ]
-    if not images:
-        shape = (*cameras.shape, gaussians.colors.shape[1] + 2, cameras.height, cameras.width)
-        return gaussians.means.new_zeros(shape)
-    return torch.stack(images)
+    nothing = gaussians.means.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
+    image, depth, alpha = (torch.stack(elements) if elements else nothing).split((channels, 1, 1), dim=2)
+    return Rendering(image=image, alpha=alpha, depth=depth)
 
 
 def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near, far) -> Tensor:
-    """All views of one batch element, [T, C + 2, h, w]."""
+    """All views of one batch element, [T, C + 2, h, w]: colours, expected depth, alpha."""
     channels = gaussians.colors.shape[1]
     if len(gaussians) == 0 or cameras.shape[0] == 0:
         # Keeps the graph, so that a batch of empty elements can be differentiated.
@@ -78,7 +77,7 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
         near_plane=near,
         far_plane=far,
         eps2d=settings.low_pass,
-        render_mode="RGB+D",
+        render_mode="RGB+ED",
         packed=False,
         rasterize_mode="antialiased" if settings.antialiased else "classic",
     )

@@ -13,13 +13,23 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import pixel_centers
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering.settings import RasterSettings
-from ghgs_lit.types import Cameras, Gaussians
+from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 # Gaussians times pixels held at once.
 _CHUNK = 1 << 19
 
 
-def render_sums(
+def rasterize(
+    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
+) -> Rendering:
+    """Gaussians on black; see :func:`ghgs_lit.rendering.render`."""
+    channels = gaussians.colors.shape[1]
+    sums = _sums(gaussians, cameras, settings, near, far)
+    image, depth, alpha = sums.split((channels, 1, 1), dim=2)
+    return Rendering(image=image, alpha=alpha, depth=depth / alpha.clamp_min(1e-10))
+
+
+def _sums(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Float[Tensor, "B T channels h w"]:
     """Sums over the Gaussians of a pixel: ``w colour`` (C channels), ``w z`` and ``w``."""

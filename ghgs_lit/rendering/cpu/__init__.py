@@ -1,5 +1,5 @@
 """The project's own rasterizer for CPUs: Numba kernels on explicit vectors; see ``layout`` and ``raster``."""
 
-from ghgs_lit.rendering.cpu.backend import render_sums
+from ghgs_lit.rendering.cpu.backend import rasterize
 
-__all__ = ["render_sums"]
+__all__ = ["rasterize"]

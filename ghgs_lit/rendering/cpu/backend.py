@@ -2,42 +2,41 @@
 
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.rendering.cpu import binning, layout, pool, projection, raster
+from ghgs_lit.rendering.cpu import binning, gradients, layout, pool, projection, raster, simd
 from ghgs_lit.rendering.settings import RasterSettings
-from ghgs_lit.types import Cameras, Gaussians
+from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 # Tiles are handed to threads in runs of about this many per thread, so that none waits long for the last.
 _RUNS = 8
+# The kernels are compiled for this number of channels, and once more for all others.
+_COLORS = 3
 
 
-def render_sums(
+def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
-) -> Float[Tensor, "B T channels h w"]:
-    """Sums over the Gaussians of a pixel: ``w colour`` (C channels), ``w z`` and ``w``; float32.
+) -> Rendering:
+    """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
 
     Differentiable in the Gaussians, not in the cameras. The same bits with any number of threads.
     """
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = _Plan.of(gaussians, cameras, settings, near, far)
-    image = _Rasterize.apply(*(field.float().contiguous() for field in fields), plan)
-    return image.unflatten(0, cameras.shape)
+    return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What to render, without the Gaussians' values. View ``v`` shows element ``v // T``."""
+    """What to render, without the Gaussians' values. View ``v`` shows batch element ``v // T``."""
 
     views: np.ndarray
     first_gaussians: np.ndarray
     counts: np.ndarray
-    views_each: int
+    shape: tuple[int, int]
     height: int
     width: int
     settings: RasterSettings
@@ -46,13 +45,12 @@ class _Plan:
 
     @classmethod
     def of(cls, gaussians, cameras, settings, near, far) -> "_Plan":
-        views_each = cameras.shape[1]
-        splits = np.array(gaussians.splits, dtype=np.int64)
+        splits, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
         return cls(
             views=_view_rows(cameras, settings),
             first_gaussians=np.repeat(np.cumsum(splits) - splits, views_each),
             counts=np.repeat(splits, views_each),
-            views_each=views_each,
+            shape=tuple(cameras.shape),
             height=cameras.height,
             width=cameras.width,
             settings=settings,
@@ -64,6 +62,10 @@ class _Plan:
     def tiles(self) -> tuple[int, int]:
         """Tiles across and down one view."""
         return -(-self.width // layout.TILE), -(-self.height // layout.TILE)
+
+    @property
+    def constants(self) -> tuple[np.float32, np.float32]:
+        return np.float32(self.settings.alpha_max), np.float32(self.settings.stop)
 
 
 def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
@@ -87,8 +89,8 @@ class _Splats:
     """Splats of all views, and the entries of all tiles; see ``layout``."""
 
     shifts: np.ndarray
-    starts: np.ndarray
-    roots: np.ndarray
+    shared: np.ndarray
+    stride: int
     records: np.ndarray
     rects: np.ndarray
     entry_starts: np.ndarray
@@ -103,38 +105,27 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
     settings, (tiles_x, tiles_y) = plan.settings, plan.tiles
     views, tiles = len(plan.views), tiles_x * tiles_y
     starts = np.cumsum(plan.counts) - plan.counts
-    total = int(plan.counts.sum())
-    roots = np.empty((len(means), 9))
+    total, stride = int(plan.counts.sum()), len(means) + simd.DOUBLES
+    shifts = plan.first_gaussians - starts
+    shared = np.empty(layout.SHARED * stride)
     records = np.empty((total, layout.RECORD), np.float32)
     depths, rects = np.empty(total, np.float32), np.empty((total, 4), np.int32)
     tile_counts = np.zeros(views * tiles + 1, np.int64)
-    shifts = plan.first_gaussians - starts
     seen = np.zeros(views, np.int64)
-    pool.run([partial(projection.roots, quaternions, scales, a, b, roots) for a, b in _parts(len(means))])
+
+    def share(first: int, last: int) -> None:
+        projection.share(
+            means, quaternions, scales, opacities, first, last, settings.alpha_min, stride, shared
+        )
 
     def project(v: int) -> None:
         seen[v] = projection.project(
-            means,
-            roots,
-            opacities,
-            plan.views[v],
-            starts[v],
-            plan.counts[v],
-            shifts[v],
-            plan.near,
-            plan.far,
-            settings.low_pass,
-            settings.alpha_min,
-            settings.extent,
-            settings.antialiased,
-            plan.height,
-            plan.width,
-            records,
-            depths,
-            rects,
-            tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
-        )
+            plan.views[v], shared, stride, starts[v], plan.counts[v], shifts[v], plan.near, plan.far,
+            settings.low_pass, settings.extent, settings.antialiased, plan.height, plan.width, records, depths,
+            rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
+        )  # fmt: skip
 
+    pool.run([partial(share, *part) for part in _parts(0, len(means))])
     pool.run([partial(project, v) for v in range(views)])
     tile_starts = np.cumsum(tile_counts)
     entry_starts = np.zeros(total + 1, np.int64)
@@ -143,28 +134,19 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
 
     def scatter(v: int) -> None:
         binning.scatter(
-            depths,
-            rects,
-            starts[v],
-            plan.counts[v],
-            seen[v],
-            tiles_x,
-            tile_starts,
-            v * tiles,
-            entry_starts,
-            splats,
-            slots,
-        )
+            depths, rects, starts[v], plan.counts[v], seen[v], tiles_x, tile_starts, v * tiles, entry_starts,
+            splats, slots,
+        )  # fmt: skip
 
     pool.run([partial(scatter, v) for v in range(views)])
     hits = np.empty(len(splats), np.uint16)
-    return _Splats(shifts, starts, roots, records, rects, entry_starts, tile_starts, splats, slots, hits)
+    return _Splats(shifts, shared, stride, records, rects, entry_starts, tile_starts, splats, slots, hits)
 
 
-def _parts(count: int) -> list[tuple[int, int]]:
-    """``count`` things in one run for each thread."""
-    edges = np.linspace(0, count, min(torch.get_num_threads(), max(1, count)) + 1).astype(np.int64)
-    return [(int(a), int(b)) for a, b in pairwise(edges)]
+def _parts(first: int, count: int) -> list[tuple[int, int]]:
+    """``count`` things from ``first`` on in a run for each thread, each but the last of whole vectors."""
+    step = -(-count // (torch.get_num_threads() * simd.DOUBLES)) * simd.DOUBLES
+    return [(a, min(a + step, first + count)) for a in range(first, first + count, max(step, 1))]
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
@@ -181,92 +163,66 @@ def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, colors, plan: _Plan) -> Tensor:
+    def forward(ctx, means, quaternions, scales, opacities, colors, plan: _Plan):
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities, colors)]
         found = _prepare(plan, *arrays[:4])
-        image = torch.zeros(len(plan.views), colors.shape[1] + 2, plan.height, plan.width)
-        settings = plan.settings
-        pool.run(
-            [
-                partial(
-                    raster.forward,
-                    run,
-                    *plan.tiles,
-                    found.tile_starts,
-                    found.splats,
-                    found.shifts,
-                    found.records,
-                    arrays[4],
-                    np.float32(settings.alpha_max),
-                    np.float32(settings.stop),
-                    found.hits,
-                    image.numpy(),
-                )
-                for run in _tile_runs(found.tile_starts)
-            ]
-        )
-        ctx.save_for_backward(means, quaternions, scales, opacities, colors, image)
+        channels, size = colors.shape[1], (plan.height, plan.width)
+        image = torch.zeros(*plan.shape, channels, *size)
+        alpha, depth = torch.zeros(*plan.shape, 1, *size), torch.zeros(*plan.shape, 1, *size)
+        outputs = [_flat(t) for t in (image, alpha, depth)]
+        pool.run([
+            partial(
+                raster.forward, tiles, *plan.tiles, *size, found.tile_starts, found.splats, found.shifts,
+                found.records, arrays[4], _channels(channels), *plan.constants, found.hits, *outputs,
+            )
+            for tiles in _tile_runs(found.tile_starts)
+        ])  # fmt: skip
+        ctx.save_for_backward(means, quaternions, scales, opacities, colors, image, alpha, depth)
+        ctx.set_materialize_grads(False)
         ctx.plan, ctx.found = plan, found
-        return image
+        return image, alpha, depth
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, image_gradient: Tensor):
-        *inputs, image = ctx.saved_tensors
-        means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
+    def backward(ctx, d_image, d_alpha, d_depth):
+        *inputs, image, alpha, depth = ctx.saved_tensors
         plan, found, settings = ctx.plan, ctx.found, ctx.plan.settings
+        means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
         width = layout.gradient_width(colors.shape[1])
-        gradients = np.empty((len(found.splats), width), np.float32)
-        upstream = image_gradient.float().contiguous().numpy()
-        pool.run(
-            [
-                partial(
-                    raster.backward,
-                    run,
-                    *plan.tiles,
-                    found.tile_starts,
-                    found.splats,
-                    found.slots,
-                    found.shifts,
-                    found.records,
-                    colors,
-                    np.float32(settings.alpha_max),
-                    np.float32(settings.stop),
-                    found.hits,
-                    image.numpy(),
-                    upstream,
-                    gradients,
-                )
-                for run in _tile_runs(found.tile_starts)
-            ]
-        )
+        # PyTorch's memory starts on a cache line, as the kernels need it.
+        entries = torch.empty(len(found.splats) * width).numpy()
+        d_image = torch.zeros_like(image) if d_image is None else d_image
+        arrays = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
+        pool.run([
+            partial(
+                raster.backward, tiles, *plan.tiles, plan.height, plan.width, found.tile_starts, found.splats,
+                found.slots, found.shifts, found.records, colors, _channels(colors.shape[1]), *plan.constants,
+                found.hits, *arrays, entries,
+            )
+            for tiles in _tile_runs(found.tile_starts)
+        ])  # fmt: skip
         results = [torch.zeros_like(t) for t in inputs]
-        arrays = [t.numpy() for t in results]
-        tasks = []
-        for first_view in range(0, len(plan.views), max(1, plan.views_each)):
-            start = int(plan.first_gaussians[first_view])
-            for a, b in _parts(int(plan.counts[first_view])):
-                tasks.append(
-                    partial(
-                        projection.unproject,
-                        means,
-                        quaternions,
-                        scales,
-                        found.roots,
-                        plan.views,
-                        first_view,
-                        first_view + plan.views_each,
-                        start + a,
-                        start + b,
-                        found.shifts,
-                        settings.low_pass,
-                        settings.antialiased,
-                        found.records,
-                        found.rects,
-                        found.entry_starts,
-                        gradients,
-                        *arrays,
-                    )
-                )
+        views_each = plan.shape[1]
+        tasks = [
+            partial(
+                gradients.collect, quaternions, scales, plan.views, first_view, first_view + views_each, *part,
+                found.shifts, settings.low_pass, settings.antialiased, found.shared, found.stride, found.records,
+                found.rects, found.entry_starts, entries, *(t.numpy() for t in results),
+            )
+            for first_view in range(0, len(plan.views), max(1, views_each))
+            for part in _parts(int(plan.first_gaussians[first_view]), int(plan.counts[first_view]))
+        ]  # fmt: skip
         pool.run(tasks)
         return *results, None
+
+
+def _flat(tensor: Tensor | None) -> np.ndarray:
+    """All numbers of an image in one row; none for an image that is absent."""
+    return (
+        np.empty(0, np.float32) if tensor is None else tensor.detach().float().contiguous().flatten().numpy()
+    )
+
+
+def _channels(count: int):
+    """What tells a kernel the number of channels: a tuple of that length compiles it for them."""
+    return (0,) * count if count == _COLORS else count

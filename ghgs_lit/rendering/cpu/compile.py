@@ -25,13 +25,13 @@ def kernel(function):
     of all sources of this package. Without a writable place for a cache, kernels compile in each process.
     """
     try:
-        compiled = numba.njit(nogil=True, cache=True)(function)
+        compiled = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
         compiled._cache._cache_file._source_stamp = _DIGEST
     except (RuntimeError, AttributeError):
-        compiled = numba.njit(nogil=True)(function)
+        compiled = numba.njit(nogil=True, error_model="numpy")(function)
     return compiled
 
 
 def helper(function):
     """A function that kernels call; it is compiled into them."""
-    return numba.njit(nogil=True, inline="never")(function)
+    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)

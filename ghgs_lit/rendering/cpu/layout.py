@@ -15,8 +15,12 @@ OPACITY, CUTOFF, DEPTH = 7, 8, 9
 HALF_WIDTH, HALF_HEIGHT = 10, 11
 
 TILE = 16
-BLOCK = 4
 PIXELS = TILE * TILE
+
+# What all views share of a Gaussian, in doubles, one row for each number: mean, R(q) S row by row,
+# opacity, and log2(opacity / alpha_min).
+MEAN, ROOT, SHARED_OPACITY, SHARED_CUTOFF = 0, 3, 12, 13
+SHARED = 14
 
 # An entry is one splat in one tile. Its gradients, with ``h = dL / d ln(alpha)`` summed over pixels:
 # the moments of h in whitened coordinates, the depth's gradient, then from COLOR on the colours'.

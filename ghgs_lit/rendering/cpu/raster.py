@@ -5,6 +5,8 @@ of 16. A splat visits the blocks that its bounding box meets and that still have
 The backward pass replays the forward pass front to back: with ``v_i`` the gradient's product with splat
 ``i``'s colour, depth and one, and ``S`` the sum of ``w_j v_j`` over the splats behind, ``dL/d alpha_i =
 T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the pixel's own total and shrinks: one number a pixel.
+
+The planes of a tile are its colour channels, then the sum of ``w z``, then the sum of ``w``.
 """
 
 import numpy as np
@@ -13,100 +15,109 @@ from ghgs_lit.rendering.cpu import layout, simd
 from ghgs_lit.rendering.cpu.compile import helper, kernel
 
 _LANES = simd.LANES
+_BLOCKS = layout.PIXELS // _LANES
+_ZERO, _ONE = np.float32(0), np.float32(1)
+# Gradients of the expected depth end where alpha does: its denominator is held at this.
+_LEAST_ALPHA = np.float32(1e-10)
 
 
 @helper
-def _scratch(vectors):
-    """``vectors`` x 16 floats whose memory starts on a cache line."""
-    buffer = np.empty((vectors + 1) * _LANES, np.float32)
-    skip = (-(buffer.ctypes.data // 4)) % _LANES
-    return buffer[skip : skip + vectors * _LANES]
-
-
-@helper
-def _inside(transmittance, x0, y0, width, height):
-    """Set T to 1 inside the image and 0 outside; returns the blocks that have a pixel in the image."""
+def _inside(transmittance, rows, columns):
+    """Set T to 1 in the first ``rows`` x ``columns`` pixels of the tile, else 0; returns their blocks."""
     live = 0
-    for pixel in range(layout.PIXELS):
-        block, lane = pixel // _LANES, pixel % _LANES
-        x = x0 + (block % 4) * 4 + lane % 4
-        y = y0 + (block // 4) * 4 + lane // 4
-        is_inside = x < width and y < height
-        transmittance[pixel] = 1.0 if is_inside else 0.0
-        if is_inside:
+    for block in range(_BLOCKS):
+        y, x = block // 4 * 4, block % 4 * 4
+        for lane in range(_LANES):
+            is_inside = y + lane // 4 < rows and x + lane % 4 < columns
+            transmittance[block * _LANES + lane] = _ONE if is_inside else _ZERO
+        if y < rows and x < columns:
             live |= 1 << block
     return live
 
 
 @helper
-def _touched(record, x0, y0):
+def _read(image, first, width, rows, columns, block):
+    """One block of a tile whose first pixel is ``image[first]``; zero beyond ``rows`` x ``columns``."""
+    y, x = block // 4 * 4, block % 4 * 4
+    if y + 4 <= rows and x + 4 <= columns:
+        return simd.load_block(image, first + y * width + x, width)
+    edge = np.zeros(_LANES, np.float32)
+    for i in range(y, min(y + 4, rows)):
+        for j in range(x, min(x + 4, columns)):
+            edge[(i - y) * 4 + j - x] = image[first + i * width + j]
+    return simd.load_block(edge, 0, 4)
+
+
+@helper
+def _write(image, first, width, rows, columns, block, value):
+    """Write one block of a tile, cut at ``rows`` x ``columns``."""
+    y, x = block // 4 * 4, block % 4 * 4
+    if y + 4 <= rows and x + 4 <= columns:
+        simd.store_block(image, first + y * width + x, width, value)
+        return
+    edge = np.empty(_LANES, np.float32)
+    simd.store_block(edge, 0, 4, value)
+    for i in range(y, min(y + 4, rows)):
+        for j in range(x, min(x + 4, columns)):
+            image[first + i * width + j] = edge[(i - y) * 4 + j - x]
+
+
+@helper
+def _touched(records, s, x0, y0):
     """The blocks of a tile that a splat's bounding box meets, as bits; a hair more than those it hits."""
-    x = (record[layout.COLUMN] - x0) - record[layout.REST_X]
-    y = (record[layout.ROW] - y0) - record[layout.REST_Y]
-    reach_x, reach_y = (
-        record[layout.HALF_WIDTH] + np.float32(0.01),
-        record[layout.HALF_HEIGHT] + np.float32(0.01),
-    )
-    left = int(max(np.float32(0), np.ceil(x - reach_x))) // 4
-    right = int(min(np.float32(layout.TILE - 1), np.floor(x + reach_x))) // 4
-    top = int(max(np.float32(0), np.ceil(y - reach_y))) // 4
-    bottom = int(min(np.float32(layout.TILE - 1), np.floor(y + reach_y))) // 4
+    x = (records[s, layout.COLUMN] - x0) - records[s, layout.REST_X]
+    y = (records[s, layout.ROW] - y0) - records[s, layout.REST_Y]
+    reach_x = records[s, layout.HALF_WIDTH] + np.float32(0.01)
+    reach_y = records[s, layout.HALF_HEIGHT] + np.float32(0.01)
+    last = np.float32(layout.TILE - 1)
+    left, right = int(max(_ZERO, np.ceil(x - reach_x))) // 4, int(min(last, np.floor(x + reach_x))) // 4
+    top, bottom = int(max(_ZERO, np.ceil(y - reach_y))) // 4, int(min(last, np.floor(y + reach_y))) // 4
     row = ((2 << right) - 1) & ~((1 << left) - 1)
     rows = ((1 << (4 * bottom + 4)) - 1) & ~((1 << (4 * top)) - 1)
     return (row * 0x1111) & rows
 
 
 @helper
-def _image_rows(image, y0, x0, plane):
-    """Copy one plane of a tile from blocks to rows of the image, cut at its border."""
-    height, width = image.shape
-    for y in range(min(layout.TILE, height - y0)):
-        for x in range(min(layout.TILE, width - x0)):
-            image[y0 + y, x0 + x] = plane[(y // 4 * 4 + x // 4) * _LANES + y % 4 * 4 + x % 4]
+def _splat(records, s, x0, y0):
+    """A splat's numbers in all lanes: offsets of the tile's first block, then the record's own."""
+    x = np.float32(x0) - records[s, layout.COLUMN] + records[s, layout.REST_X]
+    y = np.float32(y0) - records[s, layout.ROW] + records[s, layout.REST_Y]
+    return (
+        simd.lane_columns() + simd.full(x),
+        simd.lane_rows() + simd.full(y),
+        simd.full(records[s, layout.K_XX]),
+        simd.full(records[s, layout.K_YX]),
+        simd.full(records[s, layout.K_YY]),
+        simd.full(records[s, layout.OPACITY]),
+        simd.full(records[s, layout.CUTOFF]),
+    )
 
 
 @helper
-def _tile_rows(image, y0, x0, plane):
-    """Copy a tile of the image into blocks; zero beyond its border."""
-    height, width = image.shape
-    plane[:] = 0.0
-    for y in range(min(layout.TILE, height - y0)):
-        for x in range(min(layout.TILE, width - x0)):
-            plane[(y // 4 * 4 + x // 4) * _LANES + y % 4 * 4 + x % 4] = image[y0 + y, x0 + x]
+def _whiten(splat, block):
+    """Whitened distances from a splat's centre to the pixels of a block."""
+    dx = splat[0] + simd.full(np.float32(block % 4 * 4))
+    dy = splat[1] + simd.full(np.float32(block // 4 * 4))
+    return splat[2] * dx, simd.fma(splat[3], dx, splat[4] * dy)
 
 
 @helper
-def _offsets(record, x0, y0, block):
-    """Distances from a splat's centre to the pixels of a block."""
-    x = np.float32(x0 + block % 4 * 4) - record[layout.COLUMN] + record[layout.REST_X]
-    y = np.float32(y0 + block // 4 * 4) - record[layout.ROW] + record[layout.REST_Y]
-    return simd.lane_columns() + simd.full(x), simd.lane_rows() + simd.full(y)
-
-
-@helper
-def _whiten(record, dx, dy):
-    p = simd.full(record[layout.K_XX]) * dx
-    q = simd.fma(simd.full(record[layout.K_YX]), dx, simd.full(record[layout.K_YY]) * dy)
-    return p, q
-
-
-@helper
-def _blend(record, squared, transmittance, alpha_max, stop):
+def _blend(splat, p, q, before, alpha_max, stop):
     """One splat over one block of pixels.
 
     Returns the unclamped and the clamped alpha, the lanes where the splat is meant to be seen, those
     where it is, and T behind it. Where T would fall to ``stop`` the splat is left out and T becomes 0,
-    which stops all that follow: ``0 > stop`` is false.
+    which stops all that follow.
     """
-    cutoff = simd.full(record[layout.CUTOFF])
-    reached = (squared <= cutoff) & (transmittance > simd.full(np.float32(0)))
-    raw = simd.full(record[layout.OPACITY]) * simd.exp2(
-        simd.full(np.float32(0)) - simd.minimum(squared, cutoff)
-    )
-    alpha = simd.minimum(raw, simd.full(alpha_max))
-    behind = transmittance - transmittance * alpha
-    seen = reached & (behind > simd.full(stop))
-    left = simd.select(reached, simd.select(seen, behind, simd.full(np.float32(0))), transmittance)
+    zero = simd.full(_ZERO)
+    squared = simd.fma(p, p, q * q)
+    reached = (squared <= splat[6]) & (before > zero)
+    # Lanes out of reach are held at the cutoff: denormals there would be slow.
+    raw = splat[5] * simd.exp2(zero - simd.minimum(squared, splat[6]))
+    alpha = simd.minimum(raw, alpha_max)
+    behind = before - before * alpha
+    seen = reached & (behind > stop)
+    left = simd.select(reached, simd.select(seen, behind, zero), before)
     return raw, alpha, reached, seen, left
 
 
@@ -118,80 +129,123 @@ def _add(planes, position, seen, weight, value):
 
 
 @helper
-def _forward_splat(record, color, x0, y0, live, planes, transmittance, alpha_max, stop):
+def _forward_splat(records, s, colors, n, count, x0, y0, live, planes, transmittance, alpha_max, stop):
     """Add one splat to a tile; returns the blocks it reached and the blocks that are still open."""
-    channels = len(color)
-    todo, hit = _touched(record, x0, y0) & live, 0
+    todo, hit = _touched(records, s, x0, y0) & live, 0
+    splat = _splat(records, s, x0, y0)
+    depth = records[s, layout.DEPTH]
     while todo != 0:
         block = simd.trailing_zeros(todo)
         todo &= todo - 1
         at = block * _LANES
-        dx, dy = _offsets(record, x0, y0, block)
-        p, q = _whiten(record, dx, dy)
+        p, q = _whiten(splat, block)
         before = simd.load(transmittance, at)
-        _, alpha, reached, seen, left = _blend(record, simd.fma(p, p, q * q), before, alpha_max, stop)
+        _, alpha, reached, seen, left = _blend(splat, p, q, before, alpha_max, stop)
         if simd.bits(reached) == 0:
             continue
         hit |= 1 << block
         simd.store(transmittance, at, left)
-        if simd.bits(left > simd.full(np.float32(0))) == 0:
+        if simd.bits(left > simd.full(_ZERO)) == 0:
             live &= ~(1 << block)
         weight = before * alpha
-        for c in range(channels):
-            _add(planes, c * layout.PIXELS + at, seen, weight, color[c])
-        _add(planes, channels * layout.PIXELS + at, seen, weight, record[layout.DEPTH])
-        _add(planes, (channels + 1) * layout.PIXELS + at, seen, weight, np.float32(1))
+        for c in range(simd.length(count)):
+            _add(planes, c * layout.PIXELS + at, seen, weight, colors[n, c])
+        _add(planes, simd.length(count) * layout.PIXELS + at, seen, weight, depth)
+        _add(planes, (simd.length(count) + 1) * layout.PIXELS + at, seen, weight, _ONE)
     return hit, live
+
+
+@helper
+def _place(tile, tiles_x, tiles_y, height, width):
+    """View of a tile, its first column and row, the image's rows and columns in it, its first pixel."""
+    view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
+    y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
+    rows, columns = min(layout.TILE, height - y0), min(layout.TILE, width - x0)
+    return view, x0, y0, rows, columns, y0 * width + x0
 
 
 @kernel
 def forward(
-    tiles, tiles_x, tiles_y, tile_starts, splats, shifts, records, colors, alpha_max, stop, hits, image
-):
-    """Blend the given ``tiles`` into ``image`` [V, C + 2, h, w]: colours, sum of w z, sum of w.
+    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, shifts, records, colors, count, alpha_max, stop,
+    hits, image, alpha, depth,
+):  # fmt: skip
+    """Blend the given ``tiles`` into flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
 
-    ``hits`` [entries] receives the blocks that each entry reached, for the backward pass.
+    ``hits`` [entries] receives the blocks that each entry reached, for the backward pass. ``count`` is
+    the number of channels, or a tuple of that length, for which the kernel is then compiled.
     """
-    planes_count, height, width = image.shape[1:]
-    transmittance, planes = (
-        _scratch(layout.PIXELS // _LANES),
-        _scratch(planes_count * layout.PIXELS // _LANES),
-    )
+    channels = simd.length(count)
+    transmittance, planes = simd.aligned(layout.PIXELS), simd.aligned((channels + 2) * layout.PIXELS)
+    alpha_max, stop = simd.full(alpha_max), simd.full(stop)
     for tile in tiles:
-        view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
-        y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
-        planes[:] = 0.0
-        live = _inside(transmittance, x0, y0, width, height)
+        view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
+        planes[:] = _ZERO
+        live = _inside(transmittance, rows, columns)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
-            if live == 0:
-                hits[entry] = 0
-                continue
-            s = splats[entry]
-            hit, live = _forward_splat(
-                records[s], colors[s + shifts[view]], x0, y0, live, planes, transmittance, alpha_max, stop
-            )
+            hit = 0
+            if live != 0:
+                s = splats[entry]
+                hit, live = _forward_splat(
+                    records, s, colors, s + shifts[view], count, x0, y0, live, planes, transmittance, alpha_max, stop
+                )  # fmt: skip
             hits[entry] = hit
-        for c in range(planes_count):
-            _image_rows(image[view, c], y0, x0, planes[c * layout.PIXELS : (c + 1) * layout.PIXELS])
+        for block in range(_BLOCKS):
+            at = block * _LANES
+            for c in range(channels):
+                start = (view * channels + c) * height * width + first
+                _write(image, start, width, rows, columns, block, simd.load(planes, c * layout.PIXELS + at))
+            total = simd.load(planes, (channels + 1) * layout.PIXELS + at)
+            start = view * height * width + first
+            _write(alpha, start, width, rows, columns, block, total)
+            expected = simd.load(planes, channels * layout.PIXELS + at) / simd.maximum(
+                total, simd.full(_LEAST_ALPHA)
+            )
+            _write(depth, start, width, rows, columns, block, expected)
 
 
 @helper
-def _suffix(planes, upstream, count, suffix):
-    """``S`` before the first splat: each pixel's gradient times its own values."""
-    suffix[:] = 0.0
-    for c in range(count):
-        for pixel in range(layout.PIXELS):
-            at = c * layout.PIXELS + pixel
-            # A pixel without gradient owes nothing, also where its value is not finite.
-            if upstream[at] != 0:
-                suffix[pixel] += upstream[at] * planes[at]
+def _read_gradients(
+    view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth, upstream,
+    suffix,
+):  # fmt: skip
+    """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
+
+    Gradients of alpha and depth may be absent (of size 0). With depth = D / A, ``dL/dD = g / A`` and
+    ``dL/dA = -g depth / A``; so D's and A's shares of ``S`` cancel.
+    """
+    channels, start = simd.length(count), view * height * width + first
+    for block in range(_BLOCKS):
+        at = block * _LANES
+        total, d_sum, d_total = simd.full(_ZERO), simd.full(_ZERO), simd.full(_ZERO)
+        for c in range(channels):
+            plane = (view * channels + c) * height * width + first
+            slope = _read(d_image, plane, width, rows, columns, block)
+            total = simd.fma(slope, _read(image, plane, width, rows, columns, block), total)
+            simd.store(upstream, c * layout.PIXELS + at, slope)
+        seen = _read(alpha, start, width, rows, columns, block)
+        if len(d_alpha) > 0:
+            d_total = _read(d_alpha, start, width, rows, columns, block)
+            total = simd.fma(d_total, seen, total)
+        if len(d_depth) > 0:
+            least, slope = simd.full(_LEAST_ALPHA), _read(d_depth, start, width, rows, columns, block)
+            d_sum = slope / simd.maximum(seen, least)
+            product = slope * _read(depth, start, width, rows, columns, block)
+            free = seen > least
+            d_total = simd.select(free, d_total - product / seen, d_total)
+            total = simd.select(free, total, total + product)
+        simd.store(upstream, channels * layout.PIXELS + at, d_sum)
+        simd.store(upstream, (channels + 1) * layout.PIXELS + at, d_total)
+        simd.store(suffix, at, total)
 
 
 @helper
-def _backward_splat(record, color, x0, y0, hit, transmittance, upstream, suffix, sums, alpha_max, stop):
+def _backward_splat(
+    records, s, colors, n, count, x0, y0, hit, transmittance, upstream, suffix, sums, alpha_max, stop
+):
     """Sum one splat's gradients over a tile into the rows of ``sums``."""
-    channels = len(color)
-    zero = simd.full(np.float32(0))
+    channels = simd.length(count)
+    zero, one = simd.full(_ZERO), simd.full(_ONE)
+    splat, depth = _splat(records, s, x0, y0), simd.full(records[s, layout.DEPTH])
     h, h_p, h_q, h_pp, h_pq, h_qq, d_depth = zero, zero, zero, zero, zero, zero, zero
     for c in range(channels):
         simd.store(sums, (layout.COLOR + c) * _LANES, zero)
@@ -199,28 +253,25 @@ def _backward_splat(record, color, x0, y0, hit, transmittance, upstream, suffix,
         block = simd.trailing_zeros(hit)
         hit &= hit - 1
         at = block * _LANES
-        dx, dy = _offsets(record, x0, y0, block)
-        p, q = _whiten(record, dx, dy)
+        p, q = _whiten(splat, block)
         before = simd.load(transmittance, at)
-        raw, alpha, _, seen, left = _blend(record, simd.fma(p, p, q * q), before, alpha_max, stop)
+        raw, alpha, _, seen, left = _blend(splat, p, q, before, alpha_max, stop)
         simd.store(transmittance, at, left)
         weight = simd.select(seen, before * alpha, zero)
-        d_z = simd.load(upstream, channels * layout.PIXELS + at)
-        value = simd.fma(
-            d_z, simd.full(record[layout.DEPTH]), simd.load(upstream, (channels + 1) * layout.PIXELS + at)
-        )
-        d_depth = simd.fma(weight, d_z, d_depth)
+        d_sum = simd.load(upstream, channels * layout.PIXELS + at)
+        value = simd.fma(d_sum, depth, simd.load(upstream, (channels + 1) * layout.PIXELS + at))
+        d_depth = simd.fma(weight, d_sum, d_depth)
         for c in range(channels):
-            d_c = simd.load(upstream, c * layout.PIXELS + at)
-            value = simd.fma(d_c, simd.full(color[c]), value)
+            slope = simd.load(upstream, c * layout.PIXELS + at)
+            value = simd.fma(slope, simd.full(colors[n, c]), value)
             row = (layout.COLOR + c) * _LANES
-            simd.store(sums, row, simd.fma(weight, d_c, simd.load(sums, row)))
+            simd.store(sums, row, simd.fma(weight, slope, simd.load(sums, row)))
         rest = simd.load(suffix, at)
         rest = simd.select(seen, rest - weight * value, rest)
         simd.store(suffix, at, rest)
-        # h = alpha dL/d alpha, where alpha is not clamped.
-        slope = alpha * (before * value - rest / (simd.full(np.float32(1)) - alpha))
-        slope = simd.select(seen & (raw < simd.full(alpha_max)), slope, zero)
+        # dL / d ln(alpha), where alpha is not clamped.
+        slope = alpha * (before * value - rest / (one - alpha))
+        slope = simd.select(seen & (raw < alpha_max), slope, zero)
         s_p, s_q = slope * p, slope * q
         h, h_p, h_q = h + slope, h_p + s_p, h_q + s_q
         h_pp, h_pq, h_qq = simd.fma(s_p, p, h_pp), simd.fma(s_p, q, h_pq), simd.fma(s_q, q, h_qq)
@@ -235,57 +286,37 @@ def _backward_splat(record, color, x0, y0, hit, transmittance, upstream, suffix,
 
 @kernel
 def backward(
-    tiles,
-    tiles_x,
-    tiles_y,
-    tile_starts,
-    splats,
-    slots,
-    shifts,
-    records,
-    colors,
-    alpha_max,
-    stop,
-    hits,
-    image,
-    image_gradient,
-    gradients,
-):
-    """Gradients of every entry of the given ``tiles``, from the gradient of ``image``, into ``gradients``."""
-    planes_count, height, width = image.shape[1:]
-    transmittance, suffix = _scratch(layout.PIXELS // _LANES), _scratch(layout.PIXELS // _LANES)
-    planes = _scratch(planes_count * layout.PIXELS // _LANES)
-    upstream = _scratch(planes_count * layout.PIXELS // _LANES)
-    rows = gradients.shape[1]
-    sums, line = _scratch(rows), _scratch(1)
-    sums[:] = 0.0
+    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, slots, shifts, records, colors, count, alpha_max,
+    stop, hits, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
+):  # fmt: skip
+    """Gradients of every entry of the given ``tiles`` into ``gradients`` [entries x gradient_width].
+
+    ``gradients`` is flat and starts on a cache line; images and their gradients are flat as in
+    ``forward``.
+    """
+    channels = simd.length(count)
+    transmittance, suffix = simd.aligned(layout.PIXELS), simd.aligned(layout.PIXELS)
+    upstream = simd.aligned((channels + 2) * layout.PIXELS)
+    stride = (layout.COLOR + channels + _LANES - 1) // _LANES * _LANES
+    sums = simd.aligned(stride * _LANES)
+    sums[:] = _ZERO
+    alpha_max, stop = simd.full(alpha_max), simd.full(stop)
     for tile in tiles:
-        view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
-        y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
-        for c in range(planes_count):
-            _tile_rows(image[view, c], y0, x0, planes[c * layout.PIXELS : (c + 1) * layout.PIXELS])
-            _tile_rows(image_gradient[view, c], y0, x0, upstream[c * layout.PIXELS : (c + 1) * layout.PIXELS])
-        _suffix(planes, upstream, planes_count, suffix)
-        _inside(transmittance, x0, y0, width, height)
+        view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
+        _read_gradients(
+            view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth, upstream,
+            suffix,
+        )  # fmt: skip
+        _inside(transmittance, rows, columns)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
-            slot = slots[entry]
-            if hits[entry] == 0:
-                gradients[slot] = 0.0
+            s, hit, slot = splats[entry], np.int64(hits[entry]), slots[entry] * stride
+            if hit == 0:
+                for k in range(0, stride, _LANES):
+                    simd.store(gradients, slot + k, simd.full(_ZERO))
                 continue
-            s = splats[entry]
             _backward_splat(
-                records[s],
-                colors[s + shifts[view]],
-                x0,
-                y0,
-                np.int64(hits[entry]),
-                transmittance,
-                upstream,
-                suffix,
-                sums,
-                alpha_max,
-                stop,
-            )
-            for first in range(0, rows, _LANES):
-                simd.store(line, 0, simd.row_sums(sums, first * _LANES))
-                gradients[slot, first : first + _LANES] = line
+                records, s, colors, s + shifts[view], count, x0, y0, hit, transmittance, upstream, suffix, sums,
+                alpha_max, stop,
+            )  # fmt: skip
+            for k in range(0, stride, _LANES):
+                simd.store(gradients, slot + k, simd.row_sums(sums, k * _LANES))
