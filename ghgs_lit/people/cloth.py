@@ -23,9 +23,9 @@ def _tint(colour: np.ndarray, mask: np.ndarray, ink: np.ndarray) -> np.ndarray:
 
 
 def _folds(across: np.ndarray, along: np.ndarray, noise: Noise, strength: np.ndarray) -> np.ndarray:
-    """Light and dark of small folds, as a factor [k]."""
-    height = noise(across / 0.75 + 0.13, along / 0.36)
-    return 1 - strength * np.clip(0.6 - height, 0.0, 1.6)
+    """Light and dark of folds as a factor [k]: the hollows are darker."""
+    height = noise(across / 0.95 + 0.13, along / 0.45)
+    return 1 + strength * np.clip(0.8 * height, -1.2, 0.5)
 
 
 def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
@@ -49,12 +49,11 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
     if top.kind in ("shirt", "jacket"):
         colour = _front_closure(colour, place, top, on_arm)
     colour = _darken(colour, _line(place.arm - 0.5, 0.10) * (place.y > 1.15), 0.12)  # armhole seam
-    strength = 0.05 + 0.10 * on_arm * np.exp(-(((place.sleeve - 0.25) / 0.10) ** 2))
-    strength = strength + 0.07 * ~on_arm * np.exp(-(((place.y - 1.0) / 0.12) ** 2))
+    strength = 0.04 + 0.09 * on_arm * np.exp(-(((place.sleeve - 0.25) / 0.10) ** 2))
+    strength = strength + 0.06 * ~on_arm * np.exp(-(((place.y - 1.0) / 0.12) ** 2))
     shade = _folds(across, along, noise, strength)
-    shade = shade * (
-        1 - 0.22 * np.exp(-(((place.sleeve + 0.02) / 0.06) ** 2)) * (place.y < 1.27) * (place.y > 1.1)
-    )
+    armpit = [(np.abs(place.x) - 0.165) / 0.035, (place.y - 1.235) / 0.05, (place.z - 0.06) / 0.05]
+    shade = shade * (1 - 0.25 * np.exp(-np.square(armpit).sum(0)))
     return piece.image(colour * shade[:, None])
 
 
@@ -105,11 +104,8 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
     colour = _darken(colour, _line(edge - 0.016, 0.0025), 0.25)
     band = _line(np.clip(place.y - bottom.waist + 0.018, -1, 1), 0.021)
     colour = _belt(colour, band, bottom, place)
-    strength = (
-        0.05
-        + 0.10 * np.exp(-(((place.y - 0.49) / 0.09) ** 2))
-        + 0.10 * np.exp(-(((place.y - 0.15) / 0.10) ** 2))
-    )
+    strength = 0.03 + 0.09 * np.exp(-(((place.y - 0.49) / 0.08) ** 2))
+    strength = strength + 0.09 * np.exp(-(((place.y - 0.18) / 0.08) ** 2))
     strength = strength * (0.4 if bottom.kind == "leggings" else 1.0)
     inner = 1 - 0.18 * np.exp(-((place.x / 0.035) ** 2)) * smoothstep(0.86, 0.74, place.y)
     return piece.image(colour * (_folds(across, place.y, noise, strength) * inner)[:, None])

@@ -7,10 +7,8 @@ import numpy as np
 from ghgs_lit.people.body import load_body
 from ghgs_lit.people.noise import Noise, smoothstep
 from ghgs_lit.people.outfit import Shoes
-from ghgs_lit.people.surface import Chart, chart, hairline
+from ghgs_lit.people.surface import EYE, Chart, chart, face_frame, hairline
 
-EYE = np.array([0.0288, 1.5661, 0.1909])  # centre of the average body's left eye
-MOUTH = np.array([0.0, 1.496, 0.222])
 SKINS = (
     (0.95, 0.80, 0.71), (0.90, 0.72, 0.60), (0.83, 0.64, 0.50), (0.72, 0.52, 0.38), (0.56, 0.38, 0.27),
     (0.42, 0.27, 0.19), (0.29, 0.18, 0.13),
@@ -51,7 +49,7 @@ def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Com
     )
     shares = (0.72, 0.22, 0.06, 0, 0, 0) if dark else (0.2, 0.25, 0.22, 0.13, 0.13, 0.07)
     hair = np.array(hairs[rng.choice(6, p=shares)]) * rng.uniform(0.85, 1.15)
-    grey = rng.random() < (age - 0.68) * 3.5
+    grey = rng.random() < (age - 0.68) * 2.4
     if grey:
         hair = hair + (np.array([0.72, 0.71, 0.70]) - hair) * rng.uniform(0.4, 0.95)
     elif rng.random() < 0.06:
@@ -86,7 +84,8 @@ def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
 def head_texture(look: Complexion, scalp: float) -> np.ndarray:
     """Texture [h, w, 3] of the head; `scalp` (0 to 1) is how much hair shows on the scalp."""
     piece = chart("head")
-    point = piece.texel_place.point
+    point = face_frame(piece.texel_place.point)
+    above = hairline(piece.texel_place.point)
     masks = _masks(piece)
     lips, lids, ears = masks.T
     colour = np.tile(look.skin, (len(point), 1))
@@ -104,17 +103,13 @@ def head_texture(look: Complexion, scalp: float) -> np.ndarray:
         )
         colour = colour * (1 - 0.35 * look.freckles * spots)[:, None]
     colour = colour + (look.lips - colour) * (0.85 * lips)[:, None]
-    seam = np.exp(-(((v - MOUTH[1]) / 0.0016) ** 2)) * (np.abs(u) < 0.026) * (point[:, 2] > 0.19)
+    seam = np.exp(-(((v - 1.496) / 0.0016) ** 2)) * (np.abs(u) < 0.026) * (point[:, 2] > 0.19)
     colour = colour * (1 - 0.5 * seam)[:, None]
     colour = colour * _grain(look, point)[:, None]
     colour = _eyes_and_brows(colour, look, point, lids)
     colour = _beard(colour, look, point, lips)
     strands = 0.8 + 0.2 * look.fine(point[:, 0] / 0.10, point[:, 2] / 0.10)
-    shadow = (
-        smoothstep(-0.004, 0.012, hairline(point) + 0.003 * look.fine(u / 0.06, v / 0.06))
-        * (1 - ears)
-        * scalp
-    )
+    shadow = smoothstep(-0.004, 0.012, above + 0.003 * look.fine(u / 0.06, v / 0.06)) * (1 - ears) * scalp
     shadow = shadow * (1 - smoothstep(1.48, 1.46, point[:, 1]))
     colour = colour + (look.hair * 0.85 * strands[:, None] - colour) * (0.92 * shadow)[:, None]
     nostril = _blob(point, (0.0085, 1.5155, 0.2235), (0.0035, 0.0028, 0.006))
@@ -188,7 +183,7 @@ def skin_texture(look: Complexion, shoes: Shoes) -> np.ndarray:
 def eye_texture(look: Complexion) -> np.ndarray:
     """Texture [h, w, 3] of both eyeballs: white, iris, pupil."""
     piece = chart("eyes")
-    point = piece.texel_place.point
+    point = face_frame(piece.texel_place.point)
     folded = np.stack([np.abs(point[:, 0]), point[:, 1], point[:, 2]], 1) - EYE
     angle = np.degrees(np.arctan2(np.hypot(folded[:, 0], folded[:, 1]), folded[:, 2]))
     colour = np.tile([0.90, 0.88, 0.86], (len(point), 1))

@@ -31,11 +31,14 @@ class Figure:
 
 def neckline(place: Place, kind: str) -> np.ndarray:
     """Positive below the neckline."""
-    front = smoothstep(0.02, 0.11, place.z)
-    drop = {"crew": 0.050, "scoop": 0.095, "vee": 0.058, "collar": 0.052}[kind]
-    line = 1.432 - drop * front
-    radius = np.hypot(place.x, 0.9 * (place.z - 0.055))
-    field = np.maximum(line - place.y, radius - {"scoop": 0.098, "crew": 0.076}.get(kind, 0.072))
+    back, slope, radius, rise = {
+        "crew": (1.422, 0.50, 0.072, 0.03),
+        "scoop": (1.410, 0.82, 0.088, 0.05),
+        "vee": (1.422, 0.50, 0.074, 0.03),
+        "collar": (1.448, 0.46, 0.066, 0.03),
+    }[kind]
+    line = back - slope * (place.z - 0.03) + rise * (np.abs(place.x) / radius) ** 4
+    field = line - place.y
     if kind in ("vee", "collar"):
         depth, slope = (1.27, 0.42) if kind == "vee" else (1.335, 0.40)
         wedge = (np.abs(place.x) - slope * (place.y - depth)) * 0.9
@@ -96,12 +99,25 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
         ease = np.where(
             place.y < 1.02, np.maximum(0.002, ease - 0.012), ease + 0.008 * _bump(place.y, 1.05, 0.03)
         )
+    else:  # over what is worn below
+        ease = np.maximum(ease, 0.0145 * (1 - smoothstep(1.02, 1.08, place.y)))
     points = points + (ease + _wrinkles(place, noise, top))[:, None] * vertex_normals(
         points, piece.vertex_faces
     )
     if top.hang > 0:
         points = _hang(points, place, top.hang)
     return _pose(figure, piece, points, 0.4 * ease + 0.002)
+
+
+def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
+    """The collar of a shirt that is turned down over it: posed points of the upper chart, and where it ends."""
+    piece = chart("upper")
+    below = neckline(piece.place, top.neck)
+    lift = 0.004 + 0.006 * smoothstep(0.0, 0.03, below)
+    points = posed + lift[:, None] * vertex_normals(posed, piece.vertex_faces)
+    depth = 0.036 + 0.022 * np.exp(-(((np.abs(piece.place.x) - 0.045) / 0.022) ** 2)) * (piece.place.z > 0.07)
+    field = np.minimum(below, depth - below)
+    return points, np.minimum(field, piece.place.y - 1.33)
 
 
 def _wrinkles(place: Place, noise: Noise, top: Top) -> np.ndarray:
@@ -166,7 +182,7 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     ease = 0.003 if tight else 0.0085 - 0.003 * waist
     bends = noise(place.leg_angle * 0.07 / 0.9, place.y / 0.45)
     slant = noise(place.x / 0.7, (place.y + 0.7 * np.abs(place.x)) / 0.5)
-    creases = 0.0018 + 0.005 * _bump(place.y, 0.50, 0.09) + 0.008 * _bump(place.y, 0.13, 0.09)
+    creases = 0.0015 + 0.005 * _bump(place.y, 0.50, 0.09) + 0.005 * _bump(place.y, 0.19, 0.05)
     crotch = 0.004 * _bump(place.y, 0.80, 0.08)
     folds = (0.25 if tight else 1.0) * (creases * bends * (place.y < 0.95) + crotch * slant)
     points = points + (ease + folds)[:, None] * vertex_normals(points, piece.vertex_faces)
@@ -174,31 +190,28 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
         points = _widen_legs(figure, points, place, bottom, folds)
     if bottom.hem < 0.2:  # the helper surface ends at the ankle; the hem falls on the shoe
         points[:, 1] -= 0.055 * (1 - smoothstep(0.11, 0.24, place.y))
-    return _pose(figure, piece, points, np.full(len(points), 0.002))
+    return _pose(
+        figure, piece, points, np.where(place.y < 0.15, -1.0, 0.002)
+    )  # the hem keeps off the foot itself
 
 
 def _widen_legs(
     figure: Figure, points: np.ndarray, place: Place, bottom: Bottom, folds: np.ndarray
 ) -> np.ndarray:
-    """Give each leg the cut's radius where that is wider than the body."""
+    """Give each leg the radius of the cut, where that is wider than the body: a straight tube from the thigh."""
     joints = [figure.joints[i] for i in _leg_bones()]
     moved = points.copy()
-    width = np.interp(
-        place.y,
-        [bottom.hem, max(0.5, bottom.hem + 0.02), 0.74],
-        [bottom.width, 0.92 * bottom.width + 0.012, 0.0],
-    )
     for side in (1.0, -1.0):
-        own = (place.side == side) & (place.y < CROTCH)
+        own = np.flatnonzero((place.side == side) & (place.y < CROTCH))
         line = np.array([[side * j[0], j[1], j[2]] for j in joints])
-        heights = points[own, 1]
-        centre = np.stack([np.interp(-heights, -line[:, 1], line[:, i]) for i in (0, 2)], 1)
+        centre = np.stack([np.interp(-points[own, 1], -line[:, 1], line[:, i]) for i in (0, 2)], 1)
         offset = points[own][:, [0, 2]] - centre
         radius = np.hypot(*offset.T)
-        wanted = np.maximum(radius, width[own] + 1.5 * folds[own])
-        moved[np.flatnonzero(own)[:, None], [0, 2]] = (
-            centre + offset * (wanted / np.maximum(radius, 1e-6))[:, None]
-        )
+        thigh = radius[np.abs(place.y[own] - 0.69) < 0.03].mean()
+        hem = thigh + bottom.width if bottom.kind == "shorts" else bottom.width
+        cut = np.interp(place.y[own], [bottom.hem, 0.70, CROTCH], [hem, 0.94 * thigh, 0.0])
+        wanted = np.maximum(radius, cut + folds[own])
+        moved[own[:, None], [0, 2]] = centre + offset * (wanted / np.maximum(radius, 1e-6))[:, None]
         moved[own, 0] = side * np.maximum(side * moved[own, 0], 0.006)
     return moved
 

@@ -44,6 +44,7 @@ def generate(seed: int, index: int) -> Person:
     parts = dress(figure, outfit, cloth_rng)
     parts += undressed_parts(figure, outfit, look, scalp=0.25 if cut.style == "bald" else 1.0)
     parts += make_hair(figure, cut, look, look_rng)
+    parts = [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
     turn = Rotation.from_euler("y", pose_rng.uniform(-YAW, YAW), degrees=True).as_matrix()
     return _on_the_ground(f"person_{seed}_{index:04d}", parts, figure.posed, turn)
 
@@ -77,7 +78,7 @@ def arm_depth(body: BodyModel, posed: np.ndarray, faces: np.ndarray) -> float:
 
 def dress(figure: Figure, outfit: Outfit, rng: np.random.Generator) -> list[TexturedMesh]:
     """Shoes, trousers or skirt, top and jacket, each without what the next one hides."""
-    noise = Noise(rng, 1.1, 3.0, 128)
+    noise = Noise(rng, 2.3, 3.0, 128)
     top, jacket, bottom, shoes = outfit.top, outfit.jacket, outfit.bottom, outfit.shoes
     upper, lower = chart("upper"), chart("skirt" if bottom.kind == "skirt" else "lower")
     field = garments.top_field(upper.place, top)
@@ -85,7 +86,11 @@ def dress(figure: Figure, outfit: Outfit, rng: np.random.Generator) -> list[Text
         field = np.minimum(field, HIDDEN - garments.bottom_field(upper.place, bottom))
     if jacket:
         field = np.minimum(field, HIDDEN - garments.top_field(upper.place, jacket))
-    parts = [upper.mesh(garments.drape_top(figure, top, noise), field, top_texture(top, noise, rng))]
+    points, texture = garments.drape_top(figure, top, noise), top_texture(top, noise, rng)
+    parts = [upper.mesh(points, field, texture)]
+    if top.neck == "collar":
+        points, collar = garments.fold_collar(points, top)
+        parts.append(upper.mesh(points, np.minimum(collar, field), texture))
     if jacket:
         points = garments.drape_top(figure, jacket, noise)
         parts.append(

@@ -59,7 +59,7 @@ def _strands(look: Complexion, across: np.ndarray, along: np.ndarray, curl: floa
     streak = look.fine(across / 0.10, along / 1.6) + 0.7 * look.fine(across / 0.28 + 0.3, along / 2.5)
     clump = look.noise(across / 0.30, along / 0.8)
     curls = look.fine(across / 0.14, along / 0.14) if curl else 0.0
-    shade = 0.92 + 0.20 * streak + 0.12 * clump + 0.22 * curl * curls
+    shade = 0.92 + 0.15 * streak + 0.10 * clump + 0.18 * curl * curls
     tint = look.hair + np.array([0.06, 0.04, 0.02])
     return tint * np.clip(shade, 0.35, 1.8)[:, None]
 
@@ -83,14 +83,14 @@ def _shell(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
         height = height * (0.55 + 0.6 * up)
     elif cut.style == "quiff":
         front = smoothstep(-0.02, 0.09, centred[:, 2])
-        height = height * (0.30 + 0.75 * up + 0.75 * up * front * smoothstep(0.0, 0.02, above))
+        height = height * (0.30 + 0.55 * up + 0.60 * up * front * smoothstep(0.0, 0.02, above))
     strands = look.noise(azimuth / 1.2, polar / 3.0)
     rough = (
         look.fine(azimuth / 2.2, polar / 2.2)
         if cut.style == "afro"
         else look.noise(azimuth / 0.5, polar / 2.0)
     )
-    height = height * (1 + 0.14 * strands + (0.10 if cut.style == "afro" else 0.16) * rough)
+    height = height * np.clip(1 + 0.10 * strands + 0.10 * rough, 0.6, 1.4)
     lean = np.array([0.0, 0.12, -0.25]) if cut.style in ("short", "quiff") else np.zeros(3)
     points = points + height[:, None] * (normals + lean) + 0.0012 * normals
     posed = skin(points, piece.weights, figure.transforms)

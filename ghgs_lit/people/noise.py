@@ -18,17 +18,18 @@ class Noise:
         self.field = (field / field.std()).astype(np.float32)
 
     def __call__(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear values at `u`, `v` in periods, any shape."""
-        x = np.asarray(u, np.float64) * self.size
-        y = np.asarray(v, np.float64) * self.size
+        """Bilinear values (float32) at `u`, `v` in periods, any shape."""
+        x = np.asarray(u, np.float32) * np.float32(self.size)
+        y = np.asarray(v, np.float32) * np.float32(self.size)
         left, top = np.floor(x), np.floor(y)
-        fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
-        i, j = left.astype(np.int64) % self.size, top.astype(np.int64) % self.size
-        k, m = (i + 1) % self.size, (j + 1) % self.size
-        field = self.field
-        upper = field[j, i] * (1 - fx) + field[j, k] * fx
-        lower = field[m, i] * (1 - fx) + field[m, k] * fx
-        return upper * (1 - fy) + lower * fy
+        fx, fy = x - left, y - top
+        i, j = left.astype(np.int32) % self.size, top.astype(np.int32) % self.size
+        k, row, below = (i + 1) % self.size, j * self.size, (j + 1) % self.size * self.size
+        field = self.field.ravel()
+        a, b = field[row + i], field[below + i]
+        upper = a + (field[row + k] - a) * fx
+        lower = b + (field[below + k] - b) * fx
+        return upper + (lower - upper) * fy
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:

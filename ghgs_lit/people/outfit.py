@@ -39,7 +39,8 @@ class Top:
 
 @dataclass(frozen=True)
 class Bottom:
-    """Trousers (jeans, chinos, joggers, leggings, shorts) or a skirt: `hem` height, `width` of a leg's hem."""
+    """Trousers (jeans, chinos, joggers, leggings, shorts) or a skirt: `hem` height, `width` is the radius of a
+    leg's hem in metres (of shorts: what it has over the thigh; of a skirt: its flare)."""
 
     kind: str
     waist: float
@@ -82,7 +83,7 @@ def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
     jacket = None
     if not dress and top.kind in ("tee", "tank", "shirt") and rng.random() < 0.3:
         jacket = Top(
-            "jacket", 0.49, rng.uniform(0.82, 0.95), "vee", 0.024, 0.5, False,
+            "jacket", 0.478, rng.uniform(0.82, 0.95), "vee", 0.024, 0.5, False,
             sample_fabric(rng, ("plain", "melange", "knit", "checks", "pinstripes")), None, rng.uniform(0.035, 0.09),
         )  # fmt: skip
     return Outfit(top, jacket, bottom, _sample_shoes(rng, bottom))
@@ -97,11 +98,11 @@ def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
         ease, hang = rng.uniform(0.007, 0.016), rng.uniform(0.2, 0.9)
     elif kind == "sweater":
         neck = str(rng.choice(("crew", "vee"), p=(0.8, 0.2)))
-        fabric, sleeve = sample_fabric(rng, WOOLS), rng.uniform(0.45, 0.49)
+        fabric, sleeve = sample_fabric(rng, WOOLS), rng.uniform(0.45, 0.475)
         ease, hang = rng.uniform(0.012, 0.022), rng.uniform(0.4, 1.0)
     elif kind == "shirt":
         neck, fabric = "collar", sample_fabric(rng, WOVEN)
-        sleeve = 0.485 if rng.random() < 0.6 else rng.uniform(0.17, 0.30)
+        sleeve = 0.472 if rng.random() < 0.6 else rng.uniform(0.17, 0.30)
         ease, hang = rng.uniform(0.009, 0.017), rng.uniform(0.4, 0.9)
     else:
         neck, fabric, sleeve = "scoop", sample_fabric(rng, SMOOTH_KNITS), 0.0
@@ -135,7 +136,7 @@ def _sample_trousers(rng: np.random.Generator, female: bool) -> Bottom:
     elif rng.random() < 0.6:
         fabric.colours[0] = random_colour(rng, 0.9)
     hem = rng.uniform(0.40, 0.58) if kind == "shorts" else rng.uniform(0.045, 0.10)
-    width = {"leggings": 0.0, "joggers": 0.058, "shorts": rng.uniform(0.10, 0.13)}.get(
+    width = {"leggings": 0.0, "joggers": 0.058, "shorts": rng.uniform(0.0, 0.022)}.get(
         kind, rng.uniform(0.058, 0.098)
     )
     belt = random_colour(rng, 0.9) * 0.6 if kind in ("jeans", "chinos") and rng.random() < 0.6 else None

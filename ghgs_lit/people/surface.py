@@ -16,12 +16,13 @@ from ghgs_lit.people.mesh import TexturedMesh
 from ghgs_lit.people.noise import smoothstep
 
 CROTCH = 0.766  # height of the average body's crotch, metres
+EYE = np.array([0.0288, 1.5661, 0.1909])  # centre of the left eye in the frame that faces are described in
 FEET_UV = 0.9068  # in the UV layout of the helper garment the feet lie below
 
 
 @dataclass(frozen=True)
 class Place:
-    """Points on the average body at rest, n of them.
+    """Points on the average body at rest, n of them, float32.
 
     Attributes:
         point: [n, 3] metres.
@@ -76,7 +77,8 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
     centre[:, 0] = np.where(high, 0.09, centre[:, 0])
     leg_angle = np.arctan2(folded[:, 0] - centre[:, 0], folded[:, 2] - centre[:, 1])
     trunk_angle = np.arctan2(point[:, 0] / 1.45, point[:, 2] - 0.09)
-    return Place(point, arm, sleeve, legs[0][1] - point[:, 1], side, trunk_angle, arm_angle, leg_angle)
+    values = (point, arm, sleeve, legs[0][1] - point[:, 1], side, trunk_angle, arm_angle, leg_angle)
+    return Place(*(value.astype(np.float32) for value in values))
 
 
 def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -104,8 +106,16 @@ def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.n
     return best[1], best[2]
 
 
+def face_frame(point: np.ndarray) -> np.ndarray:
+    """Points [n, 3] of the average head, moved up or down and to and fro so that the left eye is at `EYE`."""
+    body = load_body()
+    eyes = body.mean[np.unique(body.surfaces["eyes"].quads)]
+    return point + (EYE - eyes[eyes[:, 0] > 0].mean(0)) * [0, 1, 1]
+
+
 def hairline(point: np.ndarray) -> np.ndarray:
     """Metres above the hairline (positive on the scalp) for points [n, 3] of the average head."""
+    point = face_frame(point)
     angle = np.degrees(np.arctan2(np.abs(point[:, 0]), point[:, 2] - 0.105))
     line = np.interp(
         angle,
