@@ -49,7 +49,7 @@ def sample_fabric(rng: np.random.Generator, patterns: tuple[str, ...] | None = N
     scale = rng.uniform(0.03, 0.085)
     tilt = rng.uniform(-0.5, 0.5) if pattern in ("blobs", "camouflage") else 0.0
     return Fabric(
-        pattern, colours, scale, tilt, rng.uniform(0.02, 0.05), Noise(rng, 1.3, 3.0), Noise(rng, 0.45, 12.0)
+        pattern, colours, scale, tilt, rng.uniform(0.02, 0.05), Noise(rng, 1.6, 3.0), Noise(rng, 0.45, 12.0)
     )
 
 

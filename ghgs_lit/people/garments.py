@@ -68,8 +68,6 @@ def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
 
 def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
     """Positive where shoes are: low in front of the ankle, higher at the heel."""
-    if shoes.kind == "boots":
-        return np.full(len(place.y), 0.2)
     instep = smoothstep(0.06, 0.13, place.z)
     return shoes.top - place.y + 0.02 * instep + 0.008 * np.cos(place.leg_angle)
 

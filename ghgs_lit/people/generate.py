@@ -136,8 +136,10 @@ def undressed_parts(figure: Figure, outfit: Outfit, look: Complexion, scalp: flo
 def bare_field(place: Place, outfit: Outfit) -> np.ndarray:
     """Positive where skin shows, and a little way under the clothes."""
     covered = np.maximum(garments.top_field(place, outfit.top), garments.shoe_field(place, outfit.shoes))
-    if outfit.bottom.kind != "skirt":
-        covered = np.maximum(covered, garments.bottom_field(place, outfit.bottom))
+    bottom = garments.bottom_field(place, outfit.bottom)
+    if outfit.bottom.kind == "skirt":  # legs are seen from below
+        bottom = np.minimum(bottom, place.y - outfit.bottom.hem - 0.12)
+    covered = np.maximum(covered, bottom)
     return HIDDEN - covered
 
 

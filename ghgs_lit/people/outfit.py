@@ -122,8 +122,12 @@ def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
 def _sample_trousers(rng: np.random.Generator, female: bool) -> Bottom:
     shares = (0.36, 0.20, 0.12, 0.14, 0.18) if female else (0.40, 0.26, 0.12, 0.0, 0.22)
     kind = str(rng.choice(("jeans", "chinos", "joggers", "leggings", "shorts"), p=shares))
-    patterns = {"jeans": ("plain",), "chinos": ("plain", "melange", "pinstripes", "checks")}
-    fabric = sample_fabric(rng, patterns.get(kind, ("plain", "melange", "camouflage", "dots", "checks")))
+    patterns = ("plain", "melange")
+    if kind != "jeans" and rng.random() < 0.4:
+        patterns = (
+            ("pinstripes", "checks") if kind == "chinos" else ("camouflage", "dots", "checks", "melange")
+        )
+    fabric = sample_fabric(rng, patterns)
     if kind == "jeans":
         shades = (
             (0.17, 0.24, 0.38),
@@ -133,7 +137,7 @@ def _sample_trousers(rng: np.random.Generator, female: bool) -> Bottom:
             (0.30, 0.30, 0.32),
         )
         fabric.colours[0] = np.clip(np.array(shades[rng.integers(5)]) + rng.normal(0, 0.02, 3), 0.05, 0.9)
-    elif rng.random() < 0.6:
+    elif rng.random() < 0.7:
         fabric.colours[0] = random_colour(rng, 0.9)
     hem = rng.uniform(0.40, 0.58) if kind == "shorts" else rng.uniform(0.045, 0.10)
     width = {"leggings": 0.0, "joggers": 0.058, "shorts": rng.uniform(0.0, 0.022)}.get(
@@ -156,7 +160,7 @@ def _sample_shoes(rng: np.random.Generator, bottom: Bottom) -> Shoes:
     if kind != "sneakers":
         upper = random_colour(rng, 1.0) * 0.55
     sole = np.array([0.92, 0.92, 0.89]) if kind == "sneakers" and rng.random() < 0.75 else 0.4 * upper
-    top = {"sneakers": rng.uniform(0.070, 0.085), "leather": 0.066, "boots": 0.2}[kind]
+    top = {"sneakers": rng.uniform(0.070, 0.085), "leather": 0.066, "boots": 0.122}[kind]
     socks = None
     if kind != "boots" and rng.random() < 0.7:
         socks = (rng.uniform(0.10, 0.16) if bottom.hem > 0.2 else 0.2, random_colour(rng, 0.7))
