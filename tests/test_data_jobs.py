@@ -132,7 +132,8 @@ def test_other_settings_and_other_folders_are_refused(scans, tmp_path):
     render_boxes(root, scans, 1, 0, settings=SMALL)
     before = contents(root)
     with pytest.raises(
-        InputError, match=r"settings\.json: expected render = .*; found .*render into another folder"
+        InputError,
+        match=r"settings\.json: expected render\.quality = 90; found 98 .render into another folder",
     ):
         render_boxes(root, scans, 2, 0, settings=replace(SMALL, quality=90))
     with pytest.raises(InputError, match=r"settings\.json: expected seed = 1; found 0"):

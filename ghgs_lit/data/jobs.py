@@ -8,6 +8,7 @@ workspaces; the one process that holds the lock moves finished subjects to their
 import contextlib
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -144,6 +145,7 @@ def render_people(
     if not any(progress.missing(phase, listed) for phase, listed in names.items()):
         return 0
     with progress.lock():
+        progress.check_settings(identity(rig, settings, seed))  # another process may have been faster
         progress.clear_workspaces()
         progress.plan(names)
         todo = [
@@ -170,7 +172,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
         yield from map(render_subject, jobs)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
         try:
             futures = [pool.submit(render_subject, job) for job in jobs]
             for future in as_completed(futures):
@@ -179,6 +181,12 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
             raise RuntimeError("a rendering process died (out of memory?); run again to go on") from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _start_worker() -> None:
+    """One thread a process; Ctrl-C is the parent's to answer."""
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _bar() -> Bar:

