@@ -178,6 +178,15 @@ def test_half_precision_weights_run():
     assert tokens.latent[0].isfinite().all()
 
 
+def test_weights_can_be_assigned_to_a_model_without_storage():
+    encoder = _encoder()
+    with torch.device("meta"):
+        empty = VGGTEncoder(**SMALL)
+    empty.load_state_dict(encoder.state_dict(), assign=True)
+    images, masks = _views(1, 2, 28, 28)
+    assert torch.equal(empty(images, masks).latent[1], encoder(images, masks).latent[1])
+
+
 def test_normalisation_is_no_part_of_a_checkpoint():
     assert all(key.startswith("aggregator.") for key in _encoder().state_dict())
 

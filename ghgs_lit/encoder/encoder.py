@@ -54,8 +54,10 @@ class VGGTEncoder(nn.Module):
         self.dim_latent, self.dim_semantic = 2 * width, width
         channels = 4 if mask_input else 3
         mean, std = (*IMAGENET_MEAN, 0.5)[:channels], (*IMAGENET_STD, 0.5)[:channels]
-        self.register_buffer("mean", torch.tensor(mean).view(-1, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(std).view(-1, 1, 1), persistent=False)
+        # Not in a checkpoint, so real even in a model that is built on the meta device and then assigned.
+        for name, values in (("mean", mean), ("std", std)):
+            constant = torch.tensor(values, device="cpu").view(-1, 1, 1)
+            self.register_buffer(name, constant, persistent=False)
         patch_embed = _patch_embedding(vit, channels, width, patch_size, image_size, registers, checkpointing)
         self.aggregator = Aggregator(
             patch_embed, patch_size, width, heads, depth, registers, layers, layer_scale, checkpointing

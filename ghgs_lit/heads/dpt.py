@@ -102,7 +102,7 @@ class DPTHead(nn.Module):
         output_dim: int,
         hidden: int = 32,
         image_skip: bool = False,
-        images_per_step: int = 8,
+        images_per_step: int = 2,
     ):
         super().__init__()
         require(features % 8 == 0, "features", "a multiple of 8", features)
