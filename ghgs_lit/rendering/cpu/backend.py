@@ -121,8 +121,8 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
     def project(v: int) -> None:
         seen[v] = projection.project(
             plan.views[v], shared, stride, starts[v], plan.counts[v], shifts[v], plan.near, plan.far,
-            settings.low_pass, settings.extent, settings.antialiased, plan.height, plan.width, records, depths,
-            rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
+            settings.low_pass, settings.extent, settings.antialiased, plan.height, plan.width, records,
+            depths, rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
         )  # fmt: skip
 
     pool.run([partial(share, *part) for part in _parts(0, len(means))])
@@ -187,7 +187,7 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, d_image, d_alpha, d_depth):
         *inputs, image, alpha, depth = ctx.saved_tensors
         plan, found, settings = ctx.plan, ctx.found, ctx.plan.settings
-        means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
+        _, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
         width = layout.gradient_width(colors.shape[1])
         # PyTorch's memory starts on a cache line, as the kernels need it.
         entries = torch.empty(len(found.splats) * width).numpy()
@@ -205,9 +205,9 @@ class _Rasterize(torch.autograd.Function):
         views_each = plan.shape[1]
         tasks = [
             partial(
-                gradients.collect, quaternions, scales, plan.views, first_view, first_view + views_each, *part,
-                found.shifts, settings.low_pass, settings.antialiased, found.shared, found.stride, found.records,
-                found.rects, found.entry_starts, entries, *(t.numpy() for t in results),
+                gradients.collect, quaternions, scales, plan.views, first_view, first_view + views_each,
+                *part, found.shifts, settings.low_pass, settings.antialiased, found.shared, found.stride,
+                found.records, found.rects, found.entry_starts, entries, *(t.numpy() for t in results),
             )
             for first_view in range(0, len(plan.views), max(1, views_each))
             for part in _parts(int(plan.first_gaussians[first_view]), int(plan.counts[first_view]))

@@ -86,9 +86,9 @@ def affine(view, x, y, inverse):
     r = layout.ROTATION
     a, b, c = simd.full(view[r + 6]), simd.full(view[r + 7]), simd.full(view[r + 8])
     return (
-        fx * (simd.full(view[r]) - x * a), fx * (simd.full(view[r + 1]) - x * b), fx * (simd.full(view[r + 2]) - x * c),
-        fy * (simd.full(view[r + 3]) - y * a), fy * (simd.full(view[r + 4]) - y * b),
-        fy * (simd.full(view[r + 5]) - y * c),
+        fx * (simd.full(view[r]) - x * a), fx * (simd.full(view[r + 1]) - x * b),
+        fx * (simd.full(view[r + 2]) - x * c), fy * (simd.full(view[r + 3]) - y * a),
+        fy * (simd.full(view[r + 4]) - y * b), fy * (simd.full(view[r + 5]) - y * c),
     )  # fmt: skip
 
 
@@ -98,8 +98,9 @@ def load_root(shared, stride, n):
     at = layout.ROOT * stride + n
     return (
         simd.load(shared, at), simd.load(shared, at + stride), simd.load(shared, at + 2 * stride),
-        simd.load(shared, at + 3 * stride), simd.load(shared, at + 4 * stride), simd.load(shared, at + 5 * stride),
-        simd.load(shared, at + 6 * stride), simd.load(shared, at + 7 * stride), simd.load(shared, at + 8 * stride),
+        simd.load(shared, at + 3 * stride), simd.load(shared, at + 4 * stride),
+        simd.load(shared, at + 5 * stride), simd.load(shared, at + 6 * stride),
+        simd.load(shared, at + 7 * stride), simd.load(shared, at + 8 * stride),
     )  # fmt: skip
 
 

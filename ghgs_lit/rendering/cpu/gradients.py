@@ -124,7 +124,7 @@ def _point_gradient(view, x, y, inverse, d_u, d_v, d_z, d_t):
 def _splat_gradients(view, shared, stride, n, rows, low_pass, antialiased, sums):
     """Add eight splats' gradients to those of their Gaussians."""
     seen = _row(rows, _SEEN) > simd.full(0.0)
-    x, y, z, inverse = geometry.camera_points(view, shared, stride, n)
+    x, y, _, inverse = geometry.camera_points(view, shared, stride, n)
     held_x, held_y = geometry.held(view, x, y)
     t, root = geometry.affine(view, held_x, held_y, inverse), geometry.load_root(shared, stride, n)
     d_m, d_opacity = _footprint_gradient(rows, geometry.footprint(t, root), low_pass, antialiased)
@@ -188,8 +188,9 @@ def _scatter(rows, first, count, out):
 
 @kernel
 def collect(
-    quaternions, scales, views, first_view, last_view, first, last, shifts, low_pass, antialiased, shared, stride,
-    records, rects, entry_starts, gradients, d_means, d_quaternions, d_scales, d_opacities, d_colors,
+    quaternions, scales, views, first_view, last_view, first, last, shifts, low_pass, antialiased, shared,
+    stride, records, rects, entry_starts, gradients, d_means, d_quaternions, d_scales, d_opacities,
+    d_colors,
 ):  # fmt: skip
     """Gradients of Gaussians ``first`` to ``last``, summed over the views that show them."""
     width = (layout.COLOR + d_colors.shape[1] + simd.LANES - 1) // simd.LANES * simd.LANES

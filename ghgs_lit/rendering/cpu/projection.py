@@ -109,8 +109,8 @@ def _project_vector(view, shared, stride, n, near, far, low_pass, extent, antial
 
 @kernel
 def project(
-    view, shared, stride, start, count, shift, near, far, low_pass, extent, antialiased, height, width, records,
-    depths, rects, tile_counts,
+    view, shared, stride, start, count, shift, near, far, low_pass, extent, antialiased, height, width,
+    records, depths, rects, tile_counts,
 ):  # fmt: skip
     """Splats ``start`` to ``start + count`` of one view; returns how many are seen.
 

@@ -166,8 +166,8 @@ def _place(tile, tiles_x, tiles_y, height, width):
 
 @kernel
 def forward(
-    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, shifts, records, colors, count, alpha_max, stop,
-    hits, image, alpha, depth,
+    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, shifts, records, colors, count, alpha_max,
+    stop, hits, image, alpha, depth,
 ):  # fmt: skip
     """Blend the given ``tiles`` into flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
 
@@ -186,7 +186,8 @@ def forward(
             if live != 0:
                 s = splats[entry]
                 hit, live = _forward_splat(
-                    records, s, colors, s + shifts[view], count, x0, y0, live, planes, transmittance, alpha_max, stop
+                    records, s, colors, s + shifts[view], count, x0, y0, live, planes, transmittance,
+                    alpha_max, stop
                 )  # fmt: skip
             hits[entry] = hit
         for block in range(_BLOCKS):
@@ -205,8 +206,8 @@ def forward(
 
 @helper
 def _read_gradients(
-    view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth, upstream,
-    suffix,
+    view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth,
+    upstream, suffix,
 ):  # fmt: skip
     """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
 
@@ -286,8 +287,8 @@ def _backward_splat(
 
 @kernel
 def backward(
-    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, slots, shifts, records, colors, count, alpha_max,
-    stop, hits, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
+    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, slots, shifts, records, colors, count,
+    alpha_max, stop, hits, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
     """Gradients of every entry of the given ``tiles`` into ``gradients`` [entries x gradient_width].
 
@@ -304,8 +305,8 @@ def backward(
     for tile in tiles:
         view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
         _read_gradients(
-            view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth, upstream,
-            suffix,
+            view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha,
+            d_depth, upstream, suffix,
         )  # fmt: skip
         _inside(transmittance, rows, columns)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
@@ -315,8 +316,8 @@ def backward(
                     simd.store(gradients, slot + k, simd.full(_ZERO))
                 continue
             _backward_splat(
-                records, s, colors, s + shifts[view], count, x0, y0, hit, transmittance, upstream, suffix, sums,
-                alpha_max, stop,
+                records, s, colors, s + shifts[view], count, x0, y0, hit, transmittance, upstream, suffix,
+                sums, alpha_max, stop,
             )  # fmt: skip
             for k in range(0, stride, _LANES):
                 simd.store(gradients, slot + k, simd.row_sums(sums, k * _LANES))
