@@ -52,6 +52,10 @@ class GHGS(nn.Module):
         gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
         return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps)
 
+    def set_progress(self, share: float) -> None:
+        """Say how much of the training is over, from 0 to 1; stages that change on the way ask for it."""
+        self.gaussian_head.set_progress(share)
+
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> "GHGS":
         """Build from the nodes ``encoder``, ``depth_head``, ``recalibration``, ``gaussian_head``, and, where

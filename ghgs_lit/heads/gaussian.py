@@ -113,6 +113,8 @@ class GaussianHead(nn.Module):
         attributes: options of :class:`FootprintAttributes`.
         pixels: ``subject`` runs the four networks on the subject's pixels, ``all`` on every pixel and
             selects after; the Gaussians are the same.
+        freeze_attributes: share of the training (told by :meth:`set_progress`) during which scale, rotation
+            and opacity stay as they start: while depths are wrong, transparency is the best answer to them.
     """
 
     def __init__(
@@ -124,12 +126,14 @@ class GaussianHead(nn.Module):
         parameterization: str = "footprint",
         attributes: Mapping | None = None,
         pixels: str = "subject",
+        freeze_attributes: float = 0.0,
     ):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
-        self.pixels = pixels
+        require(0 <= freeze_attributes <= 1, "gaussian_head.freeze_attributes", "a share", freeze_attributes)
+        self.pixels, self.freeze_attributes, self.frozen = pixels, freeze_attributes, False
         self.decoder = proportioned_dpt(dim_latent, channels, **(dpt or {}))
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
@@ -141,6 +145,10 @@ class GaussianHead(nn.Module):
             for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header):
                 nn.init.zeros_(header[-1].weight)
                 nn.init.zeros_(header[-1].bias)
+
+    def set_progress(self, share: float) -> None:
+        """Say how much of the training is over."""
+        self.frozen = share < self.freeze_attributes
 
     def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians of the valid pixels in the order of element, view, row, column."""
@@ -172,4 +180,7 @@ class GaussianHead(nn.Module):
             wide(header(descriptors))
             for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header)
         )
+        if self.frozen:
+            # Zero gradients and not none: every process of a distributed run waits for all of them.
+            scale, rotation, opacity = (value.detach() + 0 * value for value in (scale, rotation, opacity))
         return offset, scale, rotation, opacity[..., 0]
