@@ -56,7 +56,7 @@ def _body_depth(batch: Batch) -> Tensor:
     if batch.body_vertices is None:
         raise InputError("baselines: body_depth expects body vertices in the data; found none")
     means = [
-        world_to_camera(vertices, cameras[:, None])[..., 2].mean(-1)
+        world_to_camera(vertices.expand(len(cameras), -1, -1), cameras[:, None])[..., 2].mean(-1)
         for vertices, cameras in zip(batch.body_vertices, batch.cameras.extrinsics, strict=True)
     ]
     return torch.stack(means)[..., None, None].expand(batch.masks.shape)

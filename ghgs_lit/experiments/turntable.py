@@ -9,11 +9,15 @@ from ghgs_lit.types import Cameras
 
 
 def look_at_point(cameras: Cameras) -> Tensor:
-    """The world point nearest to all optical axes (least squares); cameras are [V]."""
-    forward = cameras.extrinsics[:, 2, :3].double()
+    """The world point nearest to all optical axes (least squares); cameras are [V].
+
+    Where axes are parallel, the one of those points that is nearest to the cameras' mean position.
+    """
+    forward, centers = cameras.extrinsics[:, 2, :3].double(), cameras.centers.double()
+    middle = centers.mean(0)
     away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
-    right = (away @ cameras.centers.double()[:, :, None]).sum(0)
-    return (torch.linalg.pinv(away.sum(0)) @ right)[:, 0]
+    right = (away @ (centers - middle)[:, :, None]).sum(0)
+    return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]
 
 
 def turntable(cameras: Cameras, frames: int) -> Cameras:
