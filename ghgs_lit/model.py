@@ -68,9 +68,15 @@ class GHGS(nn.Module):
             require(name in config, name, "a stage of the model", "nothing")
         encoder = build(config["encoder"], "encoder")
         skip = config.get("skip") or {}
-        widths = {"dim_latent": encoder.dim_latent}
-        extra = {"gaussian_head": {"pixels": skip["pixels"]}} if "pixels" in skip else {}
-        stages = {name: build(config[name], name, **widths, **extra.get(name, {})) for name in STAGES[1:]}
+        extra = {name: {} for name in STAGES}
+        extra["gaussian_head"] = {key: skip[key] for key in ("pixels", "views") if key in skip}
+        if "views" in skip and config["recalibration"].get("tokens") != "all":
+            # Otherwise tokens of views without the subject need a depth as well.
+            extra["depth_head"] = {"views": skip["views"]}
+        stages = {
+            name: build(config[name], name, dim_latent=encoder.dim_latent, **extra[name])
+            for name in STAGES[1:]
+        }
         points = config.get("points")
         return cls(encoder, **stages, unprojection=Unprojection(**points) if points else None)
 

@@ -195,9 +195,23 @@ def test_a_view_with_an_empty_mask_gives_no_gaussians():
 
 def test_skip_exact_gives_the_gaussians_of_skip_none():
     batch = make_batch(2, 3)
+    batch.masks[0, 1] = False
     with torch.no_grad():
         exact, none = (make_model(f"skip={skip}")(batch).gaussians for skip in ("exact", "none"))
     close(exact, none)
+
+
+def test_views_without_the_subject_are_not_decoded():
+    batch = make_batch(2, 3)
+    batch.masks[1, 0] = False
+    model = make_model("skip=exact")
+    decoded = []
+    for head in (model.depth_head.dpt, model.gaussian_head.decoder):
+        head.register_forward_hook(lambda _, args, maps: decoded.append(len(maps)))
+    model(batch)
+    assert decoded == [5, 5]
+    assert config("skip=exact")["skip"]["views"] == "subject"
+    assert GHGS.from_config(config("skip=exact", "compat=release")).depth_head.views == "all"
 
 
 def test_ablations_differ_and_say_what_they_leave_out():

@@ -11,7 +11,7 @@ from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
 from ghgs_lit.geometry.visual_hull import SubjectBounds
 from ghgs_lit.heads.activations import CONFIDENCES
-from ghgs_lit.heads.proportions import proportioned_dpt
+from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Tokens
 
 
@@ -48,6 +48,7 @@ class DepthHead(nn.Module):
         bounds: where near and far come from: ``box`` or ``hull``; ``none`` with ``inverse_linear``.
         search: options of :class:`SubjectBounds`.
         start: share of the way from near to far at which training starts.
+        views: ``all``, or ``subject``: views whose mask is empty are not decoded (their depths mean nothing).
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class DepthHead(nn.Module):
         bounds: str = "box",
         search: Mapping | None = None,
         start: float = 0.5,
+        views: str = "all",
     ):
         super().__init__()
         choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
@@ -68,8 +70,10 @@ class DepthHead(nn.Module):
             "none with inverse_linear, box or hull with all others",
             f"{bounds} with {parameterization}",
         )
+        choice("depth_head.views", views, ("all", "subject"))
         require(0 < start < 1, "depth_head.start", "a share between 0 and 1", start)
         self.parameterization, self.start = parameterization, log(start / (1 - start))
+        self.views = views
         self.bounds = None if bounds == "none" else SubjectBounds(kind=bounds, **(search or {}))
         self.dpt = proportioned_dpt(dim_latent, 2, **(dpt or {}))
         if self.bounds is not None:
@@ -79,7 +83,8 @@ class DepthHead(nn.Module):
 
     def forward(self, tokens: Tokens, batch: Batch) -> DepthMaps:
         """Depths of all pixels; those of the subject are valid. What is not finite becomes 1 m, invalid."""
-        raw = wide(self.dpt(tokens, batch.images, batch.masks))
+        wanted = batch.masks.flatten(2).any(-1) | (self.views == "all")
+        raw = wide(decode_views(self.dpt, tokens, batch, wanted))
         value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
         near = far = None
         if self.bounds is None:

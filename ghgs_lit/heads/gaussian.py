@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
 from ghgs_lit.heads.activations import unit
-from ghgs_lit.heads.proportions import proportioned_dpt
+from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Tokens
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -113,6 +113,7 @@ class GaussianHead(nn.Module):
         attributes: options of :class:`FootprintAttributes`.
         pixels: ``subject`` runs the four networks on the subject's pixels, ``all`` on every pixel and
             selects after; the Gaussians are the same.
+        views: ``subject`` decodes views with a pixel of the subject only, ``all`` every view.
         freeze_attributes: share of the training (told by :meth:`set_progress`) during which scale, rotation
             and opacity stay as they start: while depths are wrong, transparency is the best answer to them.
     """
@@ -126,14 +127,17 @@ class GaussianHead(nn.Module):
         parameterization: str = "footprint",
         attributes: Mapping | None = None,
         pixels: str = "subject",
+        views: str = "subject",
         freeze_attributes: float = 0.0,
     ):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
+        choice("gaussian_head.views", views, ("subject", "all"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
         require(0 <= freeze_attributes <= 1, "gaussian_head.freeze_attributes", "a share", freeze_attributes)
-        self.pixels, self.freeze_attributes, self.frozen = pixels, freeze_attributes, False
+        self.pixels, self.views = pixels, views
+        self.freeze_attributes, self.frozen = freeze_attributes, False
         self.decoder = proportioned_dpt(dim_latent, channels, **(dpt or {}))
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
@@ -152,7 +156,8 @@ class GaussianHead(nn.Module):
 
     def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians of the valid pixels in the order of element, view, row, column."""
-        maps = self.decoder(tokens, batch.images, batch.masks)
+        wanted = points.valid.flatten(2).any(-1) | (self.views == "all")
+        maps = decode_views(self.decoder, tokens, batch, wanted)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
         descriptors = maps.flatten(2).transpose(1, 2)
         if self.pixels == "subject":
