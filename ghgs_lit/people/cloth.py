@@ -3,7 +3,7 @@
 import numpy as np
 
 from ghgs_lit.people.fabric import Fabric, paint, print_emblem
-from ghgs_lit.people.garments import neckline
+from ghgs_lit.people.garments import ANKLE, neckline
 from ghgs_lit.people.noise import Noise, smoothstep
 from ghgs_lit.people.outfit import Bottom, Shoes, Top
 from ghgs_lit.people.surface import Place, chart
@@ -42,7 +42,10 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
     if top.emblem in ("back", "both"):
         back = (place.z < 0.05) & (np.abs(place.x) < 0.16) & ~on_arm
         colour[back] = print_emblem(colour[back], -place.x[back], place.y[back], (0.0, 1.24), rng)
-    edge = np.minimum(neckline(place, top.neck), np.where(on_arm, top.sleeve - place.sleeve, 1.0))
+    edge = np.minimum(
+        neckline(place, top.neck),
+        np.where(on_arm, top.sleeve - place.sleeve, 1.0) if top.kind != "tank" else 1.0,
+    )
     if not top.tucked:
         edge = np.minimum(edge, np.where(on_arm, 1.0, place.y - top.hem))
     colour = _trim(colour, edge, top, rng)
@@ -92,7 +95,7 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
         return _skirt_texture(bottom, noise)
     piece = chart("lower")
     place = piece.texel_place
-    across = place.side * place.leg_angle * np.where(place.y > 0.77, 0.115, 0.08)
+    across = place.side * place.leg_angle * np.interp(place.y, [0.62, 0.95], [0.08, 0.115])
     if bottom.kind == "jeans":
         colour = _denim(bottom.fabric, across, place, noise)
     else:
@@ -100,7 +103,7 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
     colour = _darken(colour, _line(place.leg_angle - np.pi / 2, 0.035), 0.2)
     if bottom.kind != "leggings":
         colour = _pockets(colour, place, bottom)
-    edge = np.minimum(place.y - (bottom.hem - 0.055 * (bottom.hem < 0.2) + 0.055), bottom.waist - place.y)
+    edge = np.minimum(place.y - max(bottom.hem, ANKLE), bottom.waist - place.y)
     colour = _darken(colour, _line(edge - 0.016, 0.0025), 0.25)
     band = _line(np.clip(place.y - bottom.waist + 0.018, -1, 1), 0.021)
     colour = _belt(colour, band, bottom, place)
@@ -126,7 +129,7 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
     worn = np.exp(-(((place.y - 0.62) / 0.20) ** 2)) * smoothstep(1.5, 0.3, np.abs(place.leg_angle))
     worn = worn * np.clip(0.75 + 0.35 * noise(across / 0.5, place.y / 0.9), 0, 1.4)
     base = fabric.colours[0]
-    colour = base + (np.minimum(base * 1.5 + 0.16, 0.92) - base) * (0.65 * worn)[:, None]
+    colour = base + (np.minimum(base * 1.5 + 0.16, 0.92) - base) * (0.42 * worn)[:, None]
     shade = (
         1
         + 0.06 * twill
@@ -187,5 +190,5 @@ def shoe_texture(shoes: Shoes) -> np.ndarray:
     if shoes.kind != "leather" or shoes.upper.mean() > 0.12:
         colour = _darken(colour, instep.astype(float), 0.25)
         colour = _tint(colour, laces.astype(float), shoes.laces)
-    colour = _darken(colour, _line(place.y - 0.03, 0.004), 0.35)
-    return piece.image(_tint(colour, 1 - smoothstep(0.024, 0.028, place.y), shoes.sole))
+    colour = _darken(colour, _line(place.y - 0.018, 0.003), 0.35)
+    return piece.image(_tint(colour, 1 - smoothstep(0.014, 0.017, place.y), shoes.sole))

@@ -76,7 +76,7 @@ def paint(fabric: Fabric, across: np.ndarray, along: np.ndarray) -> np.ndarray:
     colour = colour + (three - colour) * third[:, None]
     shade = 1 + fabric.grain * fine + 0.025 * coarse
     if fabric.pattern == "knit":
-        ribs = np.sin(2 * np.pi * across / 0.011) * (0.75 + 0.25 * np.sin(2 * np.pi * along / 0.009))
+        ribs = np.sin(2 * np.pi * across / 0.016) * (0.75 + 0.25 * np.sin(2 * np.pi * along / 0.013))
         shade = shade + 0.10 * ribs
     if fabric.pattern == "melange":
         shade = shade + 0.09 * fine + 0.07 * fabric.fine(across / 0.5, along / 0.06)

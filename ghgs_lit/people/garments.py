@@ -12,7 +12,8 @@ from ghgs_lit.people.noise import Noise, smoothstep
 from ghgs_lit.people.outfit import Bottom, Shoes, Top
 from ghgs_lit.people.surface import CROTCH, Chart, Place, chart
 
-SOLE = 0.018  # thickness of a sole, metres
+ANKLE = 0.120  # where the surface that trousers are cut from is still whole, metres
+SOLE = 0.013  # thickness of a sole, metres
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ def neckline(place: Place, kind: str) -> np.ndarray:
     back, slope, radius, rise = {
         "crew": (1.422, 0.50, 0.072, 0.03),
         "scoop": (1.410, 0.82, 0.088, 0.05),
+        "straps": (1.412, 0.80, 0.076, 0.06),
         "vee": (1.422, 0.50, 0.074, 0.03),
         "collar": (1.448, 0.46, 0.066, 0.03),
     }[kind]
@@ -51,7 +53,7 @@ def top_field(place: Place, top: Top) -> np.ndarray:
     hem = place.y - top.hem + 2.0 * place.arm
     sleeve = top.sleeve - place.sleeve
     if top.kind == "tank":  # armholes run from the shoulder strap to under the arm
-        sleeve = 0.128 + 0.25 * np.clip(1.30 - place.y, 0, 0.2) - np.abs(place.x) - 0.5 * place.arm
+        sleeve = top.sleeve + 0.25 * np.clip(1.30 - place.y, 0, 0.2) - np.abs(place.x) - 0.5 * place.arm
         sleeve = np.where(place.y > 1.19, sleeve, 0.03 - 0.2 * place.arm)
     field = np.minimum(np.minimum(hem, sleeve), neckline(place, top.neck))
     if top.opening:
@@ -62,7 +64,9 @@ def top_field(place: Place, top: Top) -> np.ndarray:
 
 def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
     """Positive where trousers or a skirt are."""
-    field = np.minimum(bottom.waist - place.y, place.y - bottom.hem)
+    field = np.minimum(
+        bottom.waist - place.y, place.y - max(bottom.hem, ANKLE if bottom.kind != "skirt" else 0.0)
+    )
     return np.minimum(field, 0.5 - place.arm)
 
 
@@ -90,7 +94,7 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     piece = chart("upper")
     place = piece.place
     points = piece.operator @ figure.rest
-    sleeve_end = smoothstep(top.sleeve - 0.20, top.sleeve, place.sleeve) * (top.sleeve > 0.05)
+    sleeve_end = smoothstep(top.sleeve - 0.20, top.sleeve, place.sleeve) * (top.kind != "tank")
     flare = {"tee": 0.012, "shirt": 0.007, "jacket": 0.006}.get(top.kind, 0.0) if top.sleeve < 0.4 else -0.004
     ease = top.ease + flare * sleeve_end * place.arm
     if top.tucked:
@@ -98,7 +102,8 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
             place.y < 1.02, np.maximum(0.002, ease - 0.012), ease + 0.008 * _bump(place.y, 1.05, 0.03)
         )
     else:  # over what is worn below
-        ease = np.maximum(ease, 0.0145 * (1 - smoothstep(1.02, 1.08, place.y)))
+        low = max(1.02, top.hem + 0.03)
+        ease = np.maximum(ease, 0.0145 * (1 - smoothstep(low, low + 0.06, place.y)))
     points = points + (ease + _wrinkles(place, noise, top))[:, None] * vertex_normals(
         points, piece.vertex_faces
     )
@@ -186,8 +191,8 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     points = points + (ease + folds)[:, None] * vertex_normals(points, piece.vertex_faces)
     if not tight:
         points = _widen_legs(figure, points, place, bottom, folds)
-    if bottom.hem < 0.2:  # the helper surface ends at the ankle; the hem falls on the shoe
-        points[:, 1] -= 0.055 * (1 - smoothstep(0.11, 0.24, place.y))
+    drop = max(ANKLE - bottom.hem, 0.0)  # the helper surface ends at the ankle; the hem falls on the shoe
+    points[:, 1] -= drop * (1 - smoothstep(ANKLE, 0.24, place.y))
     return _pose(
         figure, piece, points, np.where(place.y < 0.15, -1.0, 0.002)
     )  # the hem keeps off the foot itself
@@ -248,7 +253,7 @@ def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
     points = points + 0.008 * normals
     toe = smoothstep(0.16, 0.26, place.z) * smoothstep(0.02, 0.06, place.y + 0.02)
     points[:, 1] += 0.006 * toe
-    sole = 1 - smoothstep(0.006, 0.026, place.y)
+    sole = 1 - smoothstep(0.003, 0.017, place.y)
     points[:, 1] = points[:, 1] * (1 - sole) - SOLE * sole
     if shoes.kind == "leather":
         points[:, 1] -= 0.004 * sole * (place.z < 0.10)

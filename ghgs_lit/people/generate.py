@@ -16,8 +16,10 @@ from ghgs_lit.people.meshing import triangles, vertex_normals
 from ghgs_lit.people.noise import Noise
 from ghgs_lit.people.outfit import Outfit, sample_outfit
 from ghgs_lit.people.pose import sample_pose
-from ghgs_lit.people.surface import Place, chart
+from ghgs_lit.people.shading import shade, spheres
+from ghgs_lit.people.surface import Chart, Place, chart
 
+Spheres = tuple[np.ndarray, np.ndarray]
 HIDDEN = 0.03  # skin and inner layers this far inside an outer garment are left out, metres
 YAW = 30.0  # degrees to either side
 TRIES = 6  # poses drawn before the arms are simply spread
@@ -41,8 +43,9 @@ def generate(seed: int, index: int) -> Person:
     outfit = sample_outfit(cloth_rng, female)
     look = sample_complexion(look_rng, female, age)
     cut = sample_haircut(look_rng, female)
-    parts = dress(figure, outfit, cloth_rng)
-    parts += undressed_parts(figure, outfit, look, scalp=0.25 if cut.style == "bald" else 1.0)
+    balls = spheres(figure)
+    parts = [naked_part(figure, outfit, look, balls, scalp=0.25 if cut.style == "bald" else 1.0)]
+    parts += dress(figure, outfit, balls, cloth_rng)
     parts += make_hair(figure, cut, look, look_rng)
     parts = [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
     turn = Rotation.from_euler("y", pose_rng.uniform(-YAW, YAW), degrees=True).as_matrix()
@@ -76,26 +79,28 @@ def arm_depth(body: BodyModel, posed: np.ndarray, faces: np.ndarray) -> float:
     return float(np.clip(-height, 0, None).max(initial=0.0))
 
 
-def dress(figure: Figure, outfit: Outfit, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Shoes, trousers or skirt, top and jacket, each without what the next one hides."""
+def dress(figure: Figure, outfit: Outfit, balls: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
+    """Top and jacket, trousers or skirt, shoes, each without what the next one hides."""
     noise = Noise(rng, 2.3, 3.0, 128)
     top, jacket, bottom, shoes = outfit.top, outfit.jacket, outfit.bottom, outfit.shoes
-    upper, lower = chart("upper"), chart("skirt" if bottom.kind == "skirt" else "lower")
+    upper, lower, feet = chart("upper"), chart("skirt" if bottom.kind == "skirt" else "lower"), chart("shoes")
+
+    def sew(piece: Chart, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
+        return piece.mesh(points, field, piece.shaded(texture, shade(piece, points, balls)))
+
     field = garments.top_field(upper.place, top)
     if top.tucked:
         field = np.minimum(field, HIDDEN - garments.bottom_field(upper.place, bottom))
     if jacket:
         field = np.minimum(field, HIDDEN - garments.top_field(upper.place, jacket))
     points, texture = garments.drape_top(figure, top, noise), top_texture(top, noise, rng)
-    parts = [upper.mesh(points, field, texture)]
+    parts = [sew(upper, points, field, texture)]
     if top.neck == "collar":
         points, collar = garments.fold_collar(points, top)
-        parts.append(upper.mesh(points, np.minimum(collar, field), texture))
+        parts.append(sew(upper, points, np.minimum(collar, field), texture))
     if jacket:
-        points = garments.drape_top(figure, jacket, noise)
-        parts.append(
-            upper.mesh(points, garments.top_field(upper.place, jacket), top_texture(jacket, noise, rng))
-        )
+        points, texture = garments.drape_top(figure, jacket, noise), top_texture(jacket, noise, rng)
+        parts.append(sew(upper, points, garments.top_field(upper.place, jacket), texture))
     field = garments.bottom_field(lower.place, bottom)
     for outer in (jacket, None if top.tucked else top):
         if outer:
@@ -104,33 +109,52 @@ def dress(figure: Figure, outfit: Outfit, rng: np.random.Generator) -> list[Text
         points = garments.drape_skirt(figure, bottom, noise, rng)
     else:
         points = garments.drape_trousers(figure, bottom, noise)
-    parts.append(lower.mesh(points, field, bottom_texture(bottom, noise)))
-    feet = chart("shoes")
-    parts.append(
-        feet.mesh(
-            garments.shape_shoes(figure, shoes), garments.shoe_field(feet.place, shoes), shoe_texture(shoes)
-        )
-    )
+    parts.append(sew(lower, points, field, bottom_texture(bottom, noise)))
+    field = garments.shoe_field(feet.place, shoes)
+    if bottom.hem < 0.2:  # what trousers cover
+        field = np.minimum(field, bottom.hem + HIDDEN - feet.place.y)
+    parts.append(sew(feet, garments.shape_shoes(figure, shoes), field, shoe_texture(shoes)))
     return parts
 
 
-def undressed_parts(figure: Figure, outfit: Outfit, look: Complexion, scalp: float) -> list[TexturedMesh]:
-    """Head, eyes and the skin that the clothes leave bare."""
-    parts = []
+def naked_part(
+    figure: Figure, outfit: Outfit, look: Complexion, balls: Spheres, scalp: float
+) -> TexturedMesh:
+    """Head, eyes and the skin that the clothes leave bare: one mesh, so that normals agree across the neck."""
     textures = {
-        "head": lambda: head_texture(look, scalp),
-        "skin": lambda: skin_texture(look, outfit.shoes),
-        "eyes": lambda: eye_texture(look),
+        "head": head_texture(look, scalp),
+        "skin": skin_texture(look, outfit.shoes),
+        "eyes": eye_texture(look),
     }
+    parts = []
     for name, texture in textures.items():
         piece = chart(name)
         points = skin(piece.operator @ figure.rest, piece.weights, figure.transforms)
-        field = bare_field(piece.place, outfit) if name == "skin" else np.ones(len(points))
-        inner = np.clip(HIDDEN - field, 0.0, HIDDEN)  # what clothes cover keeps clear of them
+        field = np.ones(len(points))
+        if name != "eyes":
+            texture = piece.shaded(texture, shade(piece, points, balls))
         if name == "skin":
-            points = points - 0.12 * inner[:, None] * vertex_normals(points, piece.vertex_faces)
-        parts.append(piece.mesh(points, field, texture()))
-    return parts
+            field = bare_field(piece.place, outfit)
+            under = np.clip(HIDDEN - field, 0.0, HIDDEN)  # what clothes cover keeps clear of them
+            points = points - 0.12 * under[:, None] * vertex_normals(points, piece.vertex_faces)
+        parts.append(piece.mesh(points, field, texture))
+    return join(parts)
+
+
+def join(parts: list[TexturedMesh]) -> TexturedMesh:
+    """One mesh of several opaque ones, their textures side by side."""
+    height = max(part.texture.shape[0] for part in parts)
+    width = sum(part.texture.shape[1] for part in parts)
+    textures, uv, faces, left, count = [], [], [], 0, 0
+    for part in parts:
+        h, w, _ = part.texture.shape
+        textures.append(np.pad(part.texture, ((height - h, 0), (0, 0), (0, 0)), mode="edge"))
+        uv.append((part.uv * [w, h] + [left, 0]) / [width, height])
+        faces.append(part.faces + count)
+        left, count = left + w, count + len(part.vertices)
+    vertices = np.concatenate([part.vertices for part in parts])
+    uv = np.concatenate(uv).astype(np.float32)
+    return TexturedMesh(vertices, np.concatenate(faces), uv, np.concatenate(textures, 1))
 
 
 def bare_field(place: Place, outfit: Outfit) -> np.ndarray:

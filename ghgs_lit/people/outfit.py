@@ -1,7 +1,7 @@
 """What a person wears: drawn once, then cut (`garments`) and painted (`cloth`).
 
 Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0, neck 1.43),
-sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.48).
+sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ SKIRTINGS = ("plain", "dots", "blobs", "checks", "zigzag", "gradient", "gingham"
 class Top:
     """A garment for the upper body.
 
-    `kind`: tee, sweater, shirt, tank or jacket. `neck` is the neckline: crew, scoop, vee or collar. `ease` is the air
+    `kind`: tee, sweater, shirt, tank or jacket. `neck` is the neckline: crew, scoop, vee, collar or straps. `sleeve` is its length, for a tank the
+    distance from the middle to the armhole. `ease` is the air
     between cloth and body in metres, `hang` (0 to 1) how far it falls straight down from the chest, `opening` the
     half width in metres of a jacket that is not closed.
     """
@@ -105,7 +106,8 @@ def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
         sleeve = 0.472 if rng.random() < 0.6 else rng.uniform(0.17, 0.30)
         ease, hang = rng.uniform(0.009, 0.017), rng.uniform(0.4, 0.9)
     else:
-        neck, fabric, sleeve = "scoop", sample_fabric(rng, SMOOTH_KNITS), 0.0
+        neck, fabric = "straps", sample_fabric(rng, SMOOTH_KNITS)
+        sleeve = rng.uniform(0.122, 0.135) if female else rng.uniform(0.140, 0.155)
         ease, hang = rng.uniform(0.005, 0.010), rng.uniform(0.0, 0.6)
     emblem = None
     if (

@@ -71,10 +71,8 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
     centre = np.stack(
         [np.interp(-folded[:, 1], [-j[1] for j in legs], [j[i] for j in legs]) for i in (0, 2)], 1
     )
-    high = (
-        folded[:, 1] > CROTCH
-    )  # above the legs each panel of a garment turns about its own half of the trunk
-    centre[:, 0] = np.where(high, 0.09, centre[:, 0])
+    # Above the legs each panel of a garment turns about its own half of the trunk.
+    centre[:, 0] += smoothstep(CROTCH - 0.1, 0.95, folded[:, 1]) * (0.09 - centre[:, 0])
     leg_angle = np.arctan2(folded[:, 0] - centre[:, 0], folded[:, 2] - centre[:, 1])
     trunk_angle = np.arctan2(point[:, 0] / 1.45, point[:, 2] - 0.09)
     values = (point, arm, sleeve, legs[0][1] - point[:, 1], side, trunk_angle, arm_angle, leg_angle)
@@ -147,6 +145,7 @@ class Chart:
         corner: [c] the point of each textured vertex; faces: [m, 3] and uv: [c, 2] over those.
         place: of the g points; shape: height and width of the texture.
         texels, nearest: covered texels [k], nearest covered one of each texel; texel_place: of the k texels.
+        texel_points, texel_shares: the three points [k, 3] that a texel lies between, and their shares [k, 3].
     """
 
     operator: sparse.csr_matrix
@@ -161,10 +160,18 @@ class Chart:
     texels: np.ndarray
     nearest: np.ndarray
     texel_place: Place
+    texel_points: np.ndarray
+    texel_shares: np.ndarray
 
     def image(self, colours: np.ndarray) -> np.ndarray:
         """Texture [h, w, 3] uint8 from colours [k, 3] in [0, 1] of the covered texels, bled over the rest."""
         return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)[self.nearest].reshape(*self.shape, 3)
+
+    def shaded(self, texture: np.ndarray, factor: np.ndarray) -> np.ndarray:
+        """A texture [h, w, 3] times a factor [g] of the points."""
+        factor = factor.astype(np.float32)[self.texel_points]
+        spread = np.einsum("kc,kc->k", factor, self.texel_shares)[self.nearest].reshape(*self.shape, 1)
+        return np.rint(np.minimum(texture * spread, 255)).astype(np.uint8)
 
     def mesh(self, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
         """The surface at `points` [g, 3] where `field` [g] is positive."""
@@ -234,6 +241,8 @@ def _chart(
         texels,
         nearest,
         locate(texel_points, texel_arm),
+        blend.astype(np.int32),
+        bary.astype(np.float32),
     )
 
 
