@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -125,6 +127,21 @@ def test_dilation_is_a_maximum_over_a_square(radius):
     padded = F.pad(masks.float(), (radius,) * 4)
     expected = padded.unfold(-2, 2 * radius + 1, 1).unfold(-2, 2 * radius + 1, 1).amax((-1, -2)).bool()
     assert torch.equal(dilate(masks, radius), expected)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
+    batch = make_batch(1, 3)
+    cameras = batch.cameras
+    for name, index in (("intrinsics", (..., [0, 1], [0, 1])), ("extrinsics", (..., slice(3), 3))):
+        changed = getattr(cameras, name).clone()
+        changed[index] *= factor
+        odd = dataclasses.replace(cameras, **{name: changed})
+        for kind in ("box", "hull"):
+            near, far = SubjectBounds(kind=kind)(batch.masks, odd)
+            assert near.isfinite().all()
+            assert far.isfinite().all()
+            assert ((near > 0) & (far >= near)).all()
 
 
 def test_autocast_changes_nothing():

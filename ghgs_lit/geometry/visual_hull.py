@@ -26,6 +26,9 @@ Interval = tuple[Tensor, Tensor]
 #: The depth below which a point counts as behind its camera when masks are looked up, in metres.
 _BEHIND = 1e-4
 
+#: No bound lies beyond, in metres: cameras of absurd sizes overflow.
+_FARTHEST = 1e6
+
 
 @dataclass(frozen=True)
 class SubjectBounds:
@@ -86,6 +89,10 @@ class SubjectBounds:
 
     def _positive(self, near: Tensor, far: Tensor) -> Interval:
         """Intervals before the camera and at least ``min_thickness`` long, widened about their middle."""
+        near, far = (
+            near.nan_to_num(nan=0.0).clamp(max=_FARTHEST),
+            far.nan_to_num(nan=0.0).clamp(max=_FARTHEST),
+        )
         lack = (self.min_thickness - (far - near)).clamp(min=0) / 2
         near = (near - lack).clamp(min=self.min_depth)
         return near, torch.maximum(far + lack, near + self.min_thickness)
@@ -109,7 +116,7 @@ def subject_box(
         depth = _project_one((lower + upper) / 2, cameras)[1]
         # Half a cell's diagonal in pixels, for subjects that come up to 0.6 of the distance of their middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=_BEHIND)
-        grow = pixels.amax(1).clamp(max=max(masks.shape[-2:])).ceil().int().tolist()
+        grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int().tolist()
         grown = torch.stack([dilate(mask, radius + more) for mask, more in zip(masks, grow, strict=True)])
         kept = _carve(_outside(grown, votes), cameras, lower, cell, cells, tolerance)
         found = kept.flatten(1).any(-1)[:, None]
@@ -247,8 +254,9 @@ def _look_up(table: Tensor, x: Tensor, y: Tensor, w: Tensor) -> Tensor:
     """
     height, width = table.shape
     inverse = w.clamp_(min=_BEHIND).reciprocal_()
-    column = x.mul_(inverse).clamp_(0, width - 1).int()
-    row = y.mul_(inverse).clamp_(0, height - 1).int()
+    # Cameras of absurd sizes overflow to NaN, which has no index.
+    column = x.mul_(inverse).nan_to_num_().clamp_(0, width - 1).int()
+    row = y.mul_(inverse).nan_to_num_().clamp_(0, height - 1).int()
     return table.flatten().take(row.mul_(width).add_(column).long())
 
 

@@ -80,5 +80,6 @@ def _smallest(distance: Float[Tensor, "m n"], k: int) -> Int[Tensor, "m k"]:
     if distance.dtype == torch.float64:
         return distance.sort(dim=1, stable=True).indices[:, :k]
     column = torch.arange(distance.shape[1], device=distance.device)
-    key = (distance.view(torch.int32).long() << 32) | column
+    # The sign of inf - inf is negative on some machines; abs() clears it.
+    key = (distance.abs().view(torch.int32).long() << 32) | column
     return key.topk(k, dim=1, largest=False).values & 0xFFFFFFFF
