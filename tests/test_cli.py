@@ -3,6 +3,7 @@
 import importlib
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
 
 from ghgs_lit.cli import main as cli
 from ghgs_lit.config import conf_dir
@@ -12,6 +13,7 @@ def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
     monkeypatch.setattr("sys.argv", ["ghgs", *argv])
     # main() asks Hydra to raise rather than to print; restored here for the other tests.
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    GlobalHydra.instance().clear()
     try:
         code = cli.main()
     except SystemExit as stop:
@@ -43,7 +45,7 @@ def test_bad_verb_is_bad_usage(monkeypatch, capsys, argv):
         (("train", "optimizer.speed=9"), "speed"),
         (("train", "encoder=vggt_huge"), "vggt_huge"),
         (("train", "seed="), "seed"),
-        (("train", "views=[4"), "views"),
+        (("train", "views=[4"), "'[4'"),
     ],
 )
 def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys, argv, expected):
@@ -84,7 +86,7 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
 
             seen["argv"] = list(sys.argv)
 
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Module)
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
+    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Module)
     cli.Verb("train", ("ghgs", "train", "seed=1"))(None)
     assert seen["argv"] == ["ghgs", "train", "seed=1"]

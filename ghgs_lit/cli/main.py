@@ -7,12 +7,16 @@ import sys
 from dataclasses import dataclass
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.errors import InputError
+
+BAD_INPUT = (InputError, FileNotFoundError)
 
 # verb: (what it does, an example)
 VERBS = {
@@ -53,11 +57,19 @@ class Verb:
 
     name: str
     argv: tuple[str, ...]
+    wants_trace: bool = False
 
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning starts the other processes of a DDP job by running sys.argv again: it needs the verb.
         sys.argv = list(self.argv)
-        return importlib.import_module(f"ghgs_lit.cli.{self.name}").run(cfg)
+        try:
+            return importlib.import_module(f"ghgs_lit.cli.{self.name}").run(cfg)
+        except BAD_INPUT as error:
+            # Hydra would add a line of its own; in a sweep that line says which run it was.
+            if self.wants_trace or HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            print(f"ghgs {self.name}: {_one_line(error)}", file=sys.stderr)
+            raise SystemExit(1) from error
 
 
 def _completion_argv(argv: list[str]) -> list[str] | None:
@@ -80,7 +92,7 @@ def _completion_argv(argv: list[str]) -> list[str] | None:
 def _one_line(error: Exception) -> str:
     """A configuration error's own words and those of its cause, on one line."""
     texts = [str(error)]
-    if error.__cause__ is not None:
+    if error.__cause__ is not None and not isinstance(error, BAD_INPUT):
         texts.append(str(error.__cause__))
     words = " ".join(" ".join(texts).split())
     return words.replace("To append to your config use +", "it is no key of this verb; to add it: +")
@@ -91,10 +103,10 @@ def _run(verb: str, argv: list[str]) -> int:
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = [argv[0], *argv[2:]]
-    task = Verb(verb, tuple(argv))
+    task = Verb(verb, tuple(argv), wants_trace)
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
-    except (InputError, HydraException, OmegaConfBaseException, FileNotFoundError) as error:
+    except (*BAD_INPUT, HydraException, OmegaConfBaseException) as error:
         if wants_trace:
             raise
         print(f"ghgs {verb}: {_one_line(error)}", file=sys.stderr)

@@ -7,7 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.syntax import Syntax
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 
 def output_dir() -> Path:
@@ -16,11 +16,14 @@ def output_dir() -> Path:
 
 
 def plain(cfg: DictConfig) -> dict:
-    """The configuration as plain data with interpolations resolved; a missing value names its key."""
+    """The configuration as plain data, interpolations resolved; a missing value or a bad seed is refused."""
     missing = OmegaConf.missing_keys(cfg)
     if missing:
         raise InputError(f"{sorted(missing)[0]}: expected a value ({sorted(missing)[0]}=...); found none")
-    return OmegaConf.to_container(cfg, resolve=True)
+    data = OmegaConf.to_container(cfg, resolve=True)
+    seed = data.get("seed", 0)
+    require(isinstance(seed, int) and 0 <= seed < 2**32, "seed", "an integer from 0 to 4294967295", seed)
+    return data
 
 
 def save_config(cfg: DictConfig, directory: Path) -> dict:
