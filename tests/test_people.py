@@ -199,7 +199,7 @@ def test_arms_stay_out_of_the_trunk():
     for index in range(20):
         rng = np.random.default_rng(index)
         figure = pose_figure(body, body.sample_shape(rng)[0], rng)
-        depths.append(arm_depth(body, figure.posed, faces))
+        depths.append(arm_depth(figure.posed, faces))
     assert np.mean(np.array(depths) < 0.015) >= 0.9
     assert max(depths) < 0.04
 

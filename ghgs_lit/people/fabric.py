@@ -79,7 +79,7 @@ def paint(fabric: Fabric, across: np.ndarray, along: np.ndarray) -> np.ndarray:
         ribs = np.sin(2 * np.pi * across / 0.016) * (0.75 + 0.25 * np.sin(2 * np.pi * along / 0.013))
         shade = shade + 0.10 * ribs
     if fabric.pattern == "melange":
-        shade = shade + 0.09 * fine + 0.07 * fabric.fine(across / 0.5, along / 0.06)
+        shade = shade + 0.055 * fine + 0.06 * fabric.fine(across / 0.5, along / 0.06)
     return colour * shade[:, None]
 
 
@@ -166,5 +166,5 @@ def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.rando
             dx, dy = bx - ax, by - ay
             t = np.clip(((u - ax) * dx + (v - ay) * dy) / (dx * dx + dy * dy), 0, 1)
             distance = np.hypot(u - ax - t * dx, v - ay - t * dy)
-            mask = np.maximum(mask, 1 - _edge(distance, 0.085, soft))
+            mask = np.maximum(mask, 1 - _edge(distance, 0.13, soft))
     return mask

@@ -1,5 +1,7 @@
 """Make a person: shape, pose, clothes, colours, all from two numbers."""
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -59,24 +61,30 @@ def pose_figure(body: BodyModel, coefficients: np.ndarray, rng: np.random.Genera
     for attempt in range(TRIES):
         pose = sample_pose(body, joints, rng, widen=attempt / (TRIES - 1))
         posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], pose.transforms)
-        if arm_depth(body, posed, faces) < 0.012:
+        if arm_depth(posed, faces) < 0.012:
             break
     return Figure(rest, joints, faces, pose.transforms, posed)
 
 
-def arm_depth(body: BodyModel, posed: np.ndarray, faces: np.ndarray) -> float:
+def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
     """How deep, in metres, forearms and hands are inside trunk and thighs."""
-    bones = np.array(body.bone_names)[body.weights[:BODY_VERTICES].argmax(1)]
-    limb = np.flatnonzero([b.startswith(("lowerarm", "wrist", "finger")) for b in bones])[::4]
-    solid = np.flatnonzero([b.startswith(("spine", "root", "upperleg", "clavicle", "head")) for b in bones])[
-        ::3
-    ]
+    limb, solid = _limbs_and_trunk()
     normals = vertex_normals(posed, faces)
     distance, nearest = cKDTree(posed[solid]).query(posed[limb], distance_upper_bound=0.08)
     near = np.isfinite(distance)
     nearest, limb = solid[nearest[near]], limb[near]
     height = np.einsum("ki,ki->k", posed[limb] - posed[nearest], normals[nearest])
     return float(np.clip(-height, 0, None).max(initial=0.0))
+
+
+@lru_cache(maxsize=1)
+def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
+    """Some vertices of forearms and hands, and of what they must not run into."""
+    body = load_body()
+    bones = body.weights[:BODY_VERTICES].argmax(1)
+    limbs = [name.startswith(("lowerarm", "wrist", "finger")) for name in body.bone_names]
+    trunk = [name.startswith(("spine", "root", "upperleg", "clavicle", "head")) for name in body.bone_names]
+    return np.flatnonzero(np.array(limbs)[bones])[::4], np.flatnonzero(np.array(trunk)[bones])[::3]
 
 
 def dress(figure: Figure, outfit: Outfit, balls: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
