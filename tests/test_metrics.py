@@ -62,9 +62,9 @@ def test_ssim_without_padding_is_the_interior():
 
 
 def test_ssim_gradient_is_that_of_finite_differences():
-    image, target = (i.double() for i in _images(1, 12, 13))
+    image, target = (i[:, :1].double() for i in _images(1, 12, 13))
     image.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: ssim(x, target, "valid"), (image,))
+    assert torch.autograd.gradcheck(lambda x: ssim(x, target, "valid"), (image,), fast_mode=True)
 
 
 def test_ssim_is_wide_under_autocast():

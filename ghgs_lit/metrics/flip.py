@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import wide
+from ghgs_lit.metrics.functional import correlate
 
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
 """The paper's viewer: 0.7 m away from a 0.7 m wide screen of 3840 pixels."""
@@ -74,11 +75,10 @@ def _hyab(a: Tensor, b: Tensor) -> Float[Tensor, "n h w"]:
     return difference[:, 0].abs() + difference[:, 1:].square().sum(1).sqrt()
 
 
-def _convolve(channel: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
-    """Separable filter (correlation) with the edge pixels repeated outside; channel is [n, 1, h, w]."""
+def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
+    """Separable filter of [n, c, h, w] with the edge pixels repeated outside."""
     ry, rx = len(along_y) // 2, len(along_x) // 2
-    padded = F.pad(channel, (rx, rx, ry, ry), mode="replicate")
-    return F.conv2d(F.conv2d(padded, along_y[None, None, :, None]), along_x[None, None, None, :])
+    return correlate(F.pad(maps, (rx, rx, ry, ry), mode="replicate"), along_y, along_x)
 
 
 def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
@@ -91,8 +91,7 @@ def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
         kernels = [torch.exp(-(math.pi**2) * x.square() / b) for _, b in terms]
         masses = [a * math.sqrt(math.pi / b) * k.sum() ** 2 for (a, b), k in zip(terms, kernels, strict=True)]
         parts = [
-            _convolve(channel, k / k.sum(), k / k.sum()) * mass
-            for k, mass in zip(kernels, masses, strict=True)
+            _filter(channel, k / k.sum(), k / k.sum()) * mass for k, mass in zip(kernels, masses, strict=True)
         ]
         filtered.append(sum(parts) / sum(masses))
     return torch.cat(filtered, dim=1)
@@ -124,8 +123,8 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
     for kernel in (-x * bell, (x.square() / sigma**2 - 1) * bell):
         positive, negative = kernel.clamp(min=0), kernel.clamp(max=0)
         kernel = positive / positive.sum() - negative / negative.sum()
-        gx = _convolve(lightness, bell / bell.sum(), kernel)
-        gy = _convolve(lightness, kernel, bell / bell.sum())
+        gx = _filter(lightness, bell / bell.sum(), kernel)
+        gy = _filter(lightness, kernel, bell / bell.sum())
         strengths.append((gx.square() + gy.square()).sqrt()[:, 0])
     return strengths[0], strengths[1]
 
@@ -136,6 +135,7 @@ def flip_map(
     pixels_per_degree: float = PIXELS_PER_DEGREE,
 ) -> Float[Tensor, "n h w"]:
     """FLIP of each pixel; values outside [0, 1] are clamped first."""
+    # Each image by itself: elementwise kernels round by position, and equal images must give 0.
     with torch.autocast(image.device.type, enabled=False):
         image, target = wide(image).clamp(0, 1), wide(target).clamp(0, 1)
         to_xyz, _ = _constants(image)

@@ -27,6 +27,18 @@ def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | No
     return torch.where(count > 0, total / count.clamp(min=1), torch.full_like(total, torch.nan))
 
 
+def mean_inside(
+    values: Float[Tensor, "n hh ww"], region: Bool[Tensor, "n h w"] | None
+) -> Float[Tensor, " n"]:
+    """:func:`mean_over` for maps that lack a border of the image: the region loses it too."""
+    if region is not None:
+        top, left = (
+            (big - small) // 2 for big, small in zip(region.shape[1:], values.shape[1:], strict=True)
+        )
+        region = region[:, top : top + values.shape[1], left : left + values.shape[2]]
+    return mean_over(values, region)
+
+
 def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
     """The smallest upright box around each mask, as a mask; empty where the mask is."""
 
@@ -39,7 +51,21 @@ def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
 def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
     """Region ``image`` (None: all pixels), ``box`` or ``subject`` of a subject's mask."""
     choice("region", name, REGIONS)
-    return {"image": lambda: None, "box": lambda: box_of(mask), "subject": lambda: mask}[name]()
+    if name == "image":
+        return None
+    return box_of(mask) if name == "box" else mask
+
+
+def squared_error(
+    image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
+) -> Float[Tensor, "n h w"]:
+    """Squared error of each pixel, mean over the channels."""
+    return (wide(image) - wide(target)).square().mean(1)
+
+
+def decibels(mse: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """``-10 log10(MSE)``, at most ``PSNR_CAP``; nan stays nan."""
+    return -10 * mse.clamp(min=10 ** (-PSNR_CAP / 10)).log10()
 
 
 def psnr(
@@ -47,9 +73,8 @@ def psnr(
     target: Float[Tensor, "n c h w"],
     region: Bool[Tensor, "n h w"] | None = None,
 ) -> Float[Tensor, " n"]:
-    """Peak signal-to-noise ratio in dB, ``-10 log10(MSE)``, at most ``PSNR_CAP``."""
-    mse = mean_over((wide(image) - wide(target)).square().mean(1), region)
-    return -10 * mse.clamp(min=10 ** (-PSNR_CAP / 10)).log10()
+    """Peak signal-to-noise ratio in dB, at most ``PSNR_CAP``."""
+    return decibels(mean_over(squared_error(image, target), region))
 
 
 def gaussian_window(size: int, sigma: float, like: Tensor) -> Float[Tensor, " size"]:
@@ -59,12 +84,16 @@ def gaussian_window(size: int, sigma: float, like: Tensor) -> Float[Tensor, " si
     return weights / weights.sum()
 
 
-def _blur(maps: Float[Tensor, "n c h w"], window: Float[Tensor, " k"]) -> Tensor:
-    """Separable convolution of every channel with ``window``, where it lies inside."""
+def correlate(
+    maps: Float[Tensor, "n c h w"], along_y: Float[Tensor, " ky"], along_x: Float[Tensor, " kx"]
+) -> Float[Tensor, "n c hh ww"]:
+    """Separable filter of every map, where its window lies inside the image."""
     n, c, h, w = maps.shape
-    maps = F.conv2d(maps.reshape(n * c, 1, h, w), window[None, None, :, None])
-    maps = F.conv2d(maps, window[None, None, None, :])
-    return maps.reshape(n, c, *maps.shape[-2:])
+    # All maps as channels of one depthwise convolution: ten times faster on a CPU than as a batch.
+    flat = maps.reshape(1, n * c, h, w)
+    flat = F.conv2d(flat, along_y.expand(n * c, 1, -1)[..., None].contiguous(), groups=n * c)
+    flat = F.conv2d(flat, along_x.expand(n * c, 1, 1, -1).contiguous(), groups=n * c)
+    return flat.reshape(n, c, *flat.shape[-2:])
 
 
 def ssim_map(
@@ -91,7 +120,8 @@ def ssim_map(
             border, mode = [window // 2] * 4, "reflect" if padding == "reflect" else "constant"
             x, y = F.pad(x, border, mode), F.pad(y, border, mode)
         moments = torch.cat((x, y, x * x, y * y, x * y), dim=1)
-        blurred = _blur(moments, gaussian_window(window, sigma, moments))
+        weights = gaussian_window(window, sigma, moments)
+        blurred = correlate(moments, weights, weights)
         mx, my, xx, yy, xy = blurred.chunk(5, dim=1)
         c1, c2 = 0.01**2, 0.03**2
         luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
@@ -107,11 +137,7 @@ def ssim(
     sigma: float = 1.5,
 ) -> Float[Tensor, " n"]:
     """Mean of :func:`ssim_map` over the channels and over the pixels of ``region`` that it covers."""
-    values = ssim_map(image, target, padding, window, sigma).mean(1)
-    if region is not None and padding == "valid":
-        border = window // 2
-        region = region[:, border : region.shape[1] - border, border : region.shape[2] - border]
-    return mean_over(values, region)
+    return mean_inside(ssim_map(image, target, padding, window, sigma).mean(1), region)
 
 
 def depth_error_mm(

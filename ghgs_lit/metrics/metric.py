@@ -20,15 +20,25 @@ class PerImageMetric(Metric):
 
     full_state_update = False
     is_differentiable = False
+    source: tuple = ()
+    """What :meth:`maps` depends on: metrics of equal source can share one map."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
 
-    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
-        """The value of each image; ``mask`` is the subject's in the target."""
+    def maps(self, image: Images, target: Images) -> Tensor:
+        """The part that does not depend on the region."""
         raise NotImplementedError
+
+    def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
+        """One value an image; ``mask`` is the subject's in the target."""
+        raise NotImplementedError
+
+    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+        """The value of each image."""
+        return self.pool(self.maps(image, target), mask)
 
     def update(self, image: Images, target: Images, mask: Masks) -> None:
         values = self.per_image(image, target, mask)
@@ -48,14 +58,18 @@ class PSNR(PerImageMetric):
     """PSNR in dB over a region; equal images count as ``functional.PSNR_CAP``."""
 
     higher_is_better = True
+    source = ("squared_error",)
 
     def __init__(self, region: str = "image", **kwargs):
         super().__init__(**kwargs)
         choice("region", region, functional.REGIONS)
         self.region = region
 
-    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
-        return functional.psnr(image, target, functional.region_of(mask, self.region))
+    def maps(self, image: Images, target: Images) -> Tensor:
+        return functional.squared_error(image, target)
+
+    def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
+        return functional.decibels(functional.mean_over(maps, functional.region_of(mask, self.region)))
 
 
 class SSIM(PerImageMetric):
@@ -67,10 +81,13 @@ class SSIM(PerImageMetric):
         super().__init__(**kwargs)
         choice("ssim.padding", padding, functional.PADDINGS)
         choice("region", region, functional.REGIONS)
-        self.padding, self.region = padding, region
+        self.padding, self.region, self.source = padding, region, ("ssim", padding)
 
-    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
-        return functional.ssim(image, target, self.padding, functional.region_of(mask, self.region))
+    def maps(self, image: Images, target: Images) -> Tensor:
+        return functional.ssim_map(image, target, self.padding).mean(1)
+
+    def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
+        return functional.mean_inside(maps, functional.region_of(mask, self.region))
 
 
 class FLIP(PerImageMetric):
@@ -83,10 +100,13 @@ class FLIP(PerImageMetric):
         choice("region", region, functional.REGIONS)
         require(pixels_per_degree > 0, "pixels_per_degree", "a positive number", pixels_per_degree)
         self.region, self.pixels_per_degree = region, pixels_per_degree
+        self.source = ("flip", pixels_per_degree)
 
-    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
-        values = flip_map(image, target, self.pixels_per_degree)
-        return functional.mean_over(values, functional.region_of(mask, self.region))
+    def maps(self, image: Images, target: Images) -> Tensor:
+        return flip_map(image, target, self.pixels_per_degree)
+
+    def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
+        return functional.mean_over(maps, functional.region_of(mask, self.region))
 
 
 class LPIPS(PerImageMetric):
@@ -113,9 +133,12 @@ class LPIPS(PerImageMetric):
                 self.network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=signed)
         except Exception as error:  # the download fails in as many ways as networks do
             raise InputError(f"LPIPS: the weights of {net!r} could not be had: {error}") from error
-        self.signed = signed
+        self.source = ("lpips", net, signed)
 
-    def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
+    def maps(self, image: Images, target: Images) -> Tensor:
         # The network's range check has no use for a render that overshoots by a rounding error.
         singles = (images.float().clamp(0, 1).split(1) for images in (image, target))
         return torch.stack([self.network(a, b) for a, b in zip(*singles, strict=True)])
+
+    def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
+        return maps

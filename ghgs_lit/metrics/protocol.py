@@ -76,7 +76,8 @@ class ImageMetrics:
     ) -> dict[str, Tensor]:
         """One value an image for each metric; nan where a region is empty."""
         image = image.clamp(0, 1) if self.clamp else image
-        return {name: metric.per_image(image, target, mask) for name, metric in self.metrics.items()}
-
-    def higher_is_better(self, name: str) -> bool:
-        return bool(self.metrics[name].higher_is_better)
+        maps: dict[tuple, Tensor] = {}
+        for metric in self.metrics.values():
+            if metric.source not in maps:
+                maps[metric.source] = metric.maps(image, target)
+        return {name: metric.pool(maps[metric.source], mask) for name, metric in self.metrics.items()}
