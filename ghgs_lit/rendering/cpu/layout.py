@@ -11,10 +11,11 @@ RECORD = 16
 COLUMN, ROW, REST_X, REST_Y = 0, 1, 2, 3
 K_XX, K_YX, K_YY = 4, 5, 6
 OPACITY, CUTOFF, DEPTH = 7, 8, 9
-# Half sides in pixels of the box around the ellipse outside which the splat adds nothing.
-HALF_WIDTH, HALF_HEIGHT = 10, 11
+# Along a column of pixels p^2 + q^2 is least at dy = SLOPE_Y dx, along a row at dx = SLOPE_X dy.
+SLOPE_X, SLOPE_Y = 10, 11
 
 TILE = 16
+BLOCK = 4
 PIXELS = TILE * TILE
 
 # What all views share of a Gaussian, in doubles, one row for each number: mean, R(q) S row by row,
@@ -25,7 +26,7 @@ SHARED = 14
 # An entry is one splat in one tile. Its gradients, with ``h = dL / d ln(alpha)`` summed over pixels:
 # the moments of h in whitened coordinates, the depth's gradient, then from COLOR on the colours'.
 H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH = 0, 1, 2, 3, 4, 5, 6
-COLOR = 8
+COLOR = 7
 
 # A view: focal lengths, principal point, rotation, translation, then the limits of x/z and y/z.
 FX, FY, CX, CY, ROTATION, TRANSLATION = 0, 1, 2, 3, 4, 13

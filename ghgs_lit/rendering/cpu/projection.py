@@ -14,7 +14,7 @@ _FAR = 1e30
 # Rows of 8 doubles between the vectors of splats and what is written of each: first the pixels of its
 # box, then its record, in the record's order.
 _LEFT, _RIGHT, _TOP, _BOTTOM, _RECORD = 0, 1, 2, 3, 4
-_ROWS = _RECORD + layout.HALF_HEIGHT + 1
+_ROWS = _RECORD + layout.SLOPE_Y + 1
 
 
 @kernel
@@ -102,8 +102,8 @@ def _project_vector(view, shared, stride, n, near, far, low_pass, extent, antial
     simd.store(rows, first + layout.OPACITY * _WIDE, opacity)
     simd.store(rows, first + layout.CUTOFF * _WIDE, cutoff)
     simd.store(rows, first + layout.DEPTH * _WIDE, z)
-    simd.store(rows, first + layout.HALF_WIDTH * _WIDE, half_width)
-    simd.store(rows, first + layout.HALF_HEIGHT * _WIDE, half_height)
+    simd.store(rows, first + layout.SLOPE_X * _WIDE, b / c)
+    simd.store(rows, first + layout.SLOPE_Y * _WIDE, b * inverse_a)
     return simd.bits(visible)
 
 
@@ -138,7 +138,7 @@ def project(
             for y in range(y0, y1):
                 for x in range(x0, x1):
                     tile_counts[y * tiles_x + x] += 1
-            for k in range(layout.HALF_HEIGHT + 1):
+            for k in range(layout.SLOPE_Y + 1):
                 records[m, k] = rows[(_RECORD + k) * _WIDE + lane]
             depths[m] = records[m, layout.DEPTH]
     return seen

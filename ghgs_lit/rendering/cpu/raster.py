@@ -1,7 +1,7 @@
 """Splats to pixels and back, one tile of 16 x 16 at a time, one block of 4 x 4 pixels per vector.
 
 Small splats are the rule (a splat for each input pixel), and a 4 x 4 block holds one better than a row
-of 16. A splat visits the blocks that its bounding box meets and that still have a transparent pixel.
+of 16. A splat visits the blocks that its ellipse meets and that still have a transparent pixel.
 The backward pass replays the forward pass front to back: with ``v_i`` the gradient's product with splat
 ``i``'s colour, depth and one, and ``S`` the sum of ``w_j v_j`` over the splats behind, ``dL/d alpha_i =
 T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the pixel's own total and shrinks: one number a pixel.
@@ -63,28 +63,24 @@ def _write(image, first, width, rows, columns, block, value):
 
 
 @helper
-def _touched(records, s, x0, y0):
-    """The blocks of a tile that a splat's bounding box meets, as bits; a hair more than those it hits."""
-    x = (records[s, layout.COLUMN] - x0) - records[s, layout.REST_X]
-    y = (records[s, layout.ROW] - y0) - records[s, layout.REST_Y]
-    reach_x = records[s, layout.HALF_WIDTH] + np.float32(0.01)
-    reach_y = records[s, layout.HALF_HEIGHT] + np.float32(0.01)
-    last = np.float32(layout.TILE - 1)
-    left, right = int(max(_ZERO, np.ceil(x - reach_x))) // 4, int(min(last, np.floor(x + reach_x))) // 4
-    top, bottom = int(max(_ZERO, np.ceil(y - reach_y))) // 4, int(min(last, np.floor(y + reach_y))) // 4
-    row = ((2 << right) - 1) & ~((1 << left) - 1)
-    rows = ((1 << (4 * bottom + 4)) - 1) & ~((1 << (4 * top)) - 1)
-    return (row * 0x1111) & rows
+def _grid():
+    """Columns, then rows, of a tile's pixels, block by block."""
+    grid = simd.aligned(2 * layout.PIXELS)
+    for pixel in range(layout.PIXELS):
+        block, lane = pixel // _LANES, pixel % _LANES
+        grid[pixel] = block % 4 * 4 + lane % 4
+        grid[layout.PIXELS + pixel] = block // 4 * 4 + lane // 4
+    return grid
 
 
 @helper
 def _splat(records, s, x0, y0):
-    """A splat's numbers in all lanes: offsets of the tile's first block, then the record's own."""
+    """A splat's numbers in all lanes: the way from its centre to the tile's first pixel, its record."""
     x = np.float32(x0) - records[s, layout.COLUMN] + records[s, layout.REST_X]
     y = np.float32(y0) - records[s, layout.ROW] + records[s, layout.REST_Y]
     return (
-        simd.lane_columns() + simd.full(x),
-        simd.lane_rows() + simd.full(y),
+        simd.full(x),
+        simd.full(y),
         simd.full(records[s, layout.K_XX]),
         simd.full(records[s, layout.K_YX]),
         simd.full(records[s, layout.K_YY]),
@@ -94,11 +90,36 @@ def _splat(records, s, x0, y0):
 
 
 @helper
-def _whiten(splat, block):
-    """Whitened distances from a splat's centre to the pixels of a block."""
-    dx = splat[0] + simd.full(np.float32(block % 4 * 4))
-    dy = splat[1] + simd.full(np.float32(block // 4 * 4))
+def _whiten(splat, dx, dy):
+    """Whitened distances ``p``, ``q``."""
     return splat[2] * dx, simd.fma(splat[3], dx, splat[4] * dy)
+
+
+@helper
+def _touched(splat, slope_x, slope_y):
+    """The blocks of a tile that a splat's ellipse meets, as bits: one block a lane.
+
+    A convex function that is least at the centre is least over a box either where the box's column
+    nearest to the centre crosses the valley along it, or the same for rows. Compared with a hair more
+    than the cutoff, since it only saves work.
+    """
+    zero, side, four = (
+        simd.full(_ZERO),
+        simd.full(np.float32(layout.BLOCK - 1)),
+        simd.full(np.float32(layout.BLOCK)),
+    )
+    left, top = simd.fma(simd.lane_columns(), four, splat[0]), simd.fma(simd.lane_rows(), four, splat[1])
+    right, bottom = left + side, top + side
+    near_x, near_y = (
+        simd.minimum(simd.maximum(left, zero), right),
+        simd.minimum(simd.maximum(top, zero), bottom),
+    )
+    along_x = simd.minimum(simd.maximum(left, near_y * simd.full(slope_x)), right)
+    along_y = simd.minimum(simd.maximum(top, near_x * simd.full(slope_y)), bottom)
+    p, q = _whiten(splat, near_x, along_y)
+    u, v = _whiten(splat, along_x, near_y)
+    least = simd.minimum(simd.fma(p, p, q * q), simd.fma(u, u, v * v))
+    return simd.bits(least <= simd.fma(splat[6], simd.full(np.float32(1.001)), simd.full(np.float32(0.001))))
 
 
 @helper
@@ -129,16 +150,17 @@ def _add(planes, position, seen, weight, value):
 
 
 @helper
-def _forward_splat(records, s, colors, n, count, x0, y0, live, planes, transmittance, alpha_max, stop):
+def _forward_splat(records, s, colors, n, count, x0, y0, live, grid, planes, transmittance, alpha_max, stop):
     """Add one splat to a tile; returns the blocks it reached and the blocks that are still open."""
-    todo, hit = _touched(records, s, x0, y0) & live, 0
-    splat = _splat(records, s, x0, y0)
+    splat, hit = _splat(records, s, x0, y0), 0
+    todo = _touched(splat, records[s, layout.SLOPE_X], records[s, layout.SLOPE_Y]) & live
     depth = records[s, layout.DEPTH]
     while todo != 0:
         block = simd.trailing_zeros(todo)
         todo &= todo - 1
         at = block * _LANES
-        p, q = _whiten(splat, block)
+        dx, dy = splat[0] + simd.load(grid, at), splat[1] + simd.load(grid, layout.PIXELS + at)
+        p, q = _whiten(splat, dx, dy)
         before = simd.load(transmittance, at)
         _, alpha, reached, seen, left = _blend(splat, p, q, before, alpha_max, stop)
         if simd.bits(reached) == 0:
@@ -176,7 +198,7 @@ def forward(
     """
     channels = simd.length(count)
     transmittance, planes = simd.aligned(layout.PIXELS), simd.aligned((channels + 2) * layout.PIXELS)
-    alpha_max, stop = simd.full(alpha_max), simd.full(stop)
+    grid, alpha_max, stop = _grid(), simd.full(alpha_max), simd.full(stop)
     for tile in tiles:
         view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
         planes[:] = _ZERO
@@ -186,7 +208,7 @@ def forward(
             if live != 0:
                 s = splats[entry]
                 hit, live = _forward_splat(
-                    records, s, colors, s + shifts[view], count, x0, y0, live, planes, transmittance,
+                    records, s, colors, s + shifts[view], count, x0, y0, live, grid, planes, transmittance,
                     alpha_max, stop
                 )  # fmt: skip
             hits[entry] = hit
@@ -241,7 +263,7 @@ def _read_gradients(
 
 @helper
 def _backward_splat(
-    records, s, colors, n, count, x0, y0, hit, transmittance, upstream, suffix, sums, alpha_max, stop
+    records, s, colors, n, count, x0, y0, hit, grid, transmittance, upstream, suffix, sums, alpha_max, stop
 ):
     """Sum one splat's gradients over a tile into the rows of ``sums``."""
     channels = simd.length(count)
@@ -254,7 +276,8 @@ def _backward_splat(
         block = simd.trailing_zeros(hit)
         hit &= hit - 1
         at = block * _LANES
-        p, q = _whiten(splat, block)
+        dx, dy = splat[0] + simd.load(grid, at), splat[1] + simd.load(grid, layout.PIXELS + at)
+        p, q = _whiten(splat, dx, dy)
         before = simd.load(transmittance, at)
         raw, alpha, _, seen, left = _blend(splat, p, q, before, alpha_max, stop)
         simd.store(transmittance, at, left)
@@ -301,7 +324,7 @@ def backward(
     stride = (layout.COLOR + channels + _LANES - 1) // _LANES * _LANES
     sums = simd.aligned(stride * _LANES)
     sums[:] = _ZERO
-    alpha_max, stop = simd.full(alpha_max), simd.full(stop)
+    grid, alpha_max, stop = _grid(), simd.full(alpha_max), simd.full(stop)
     for tile in tiles:
         view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
         _read_gradients(
@@ -316,8 +339,8 @@ def backward(
                     simd.store(gradients, slot + k, simd.full(_ZERO))
                 continue
             _backward_splat(
-                records, s, colors, s + shifts[view], count, x0, y0, hit, transmittance, upstream, suffix,
-                sums, alpha_max, stop,
+                records, s, colors, s + shifts[view], count, x0, y0, hit, grid, transmittance, upstream,
+                suffix, sums, alpha_max, stop,
             )  # fmt: skip
             for k in range(0, stride, _LANES):
-                simd.store(gradients, slot + k, simd.row_sums(sums, k * _LANES))
+                simd.store(gradients, slot + k, simd.row_sums(sums, k * _LANES, count))

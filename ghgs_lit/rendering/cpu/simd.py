@@ -14,6 +14,7 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, overload, register_model
 
+from ghgs_lit.rendering.cpu import layout
 from ghgs_lit.rendering.cpu.compile import helper
 
 LANES = 16
@@ -255,22 +256,27 @@ def _fold(builder, first, second, width):
 
 
 @intrinsic
-def row_sums(typing_context, array, index):
-    """Sums of the 16 rows of 16 floats from ``index`` on: row ``k``'s in lane ``k``, by a fixed tree."""
+def row_sums(typing_context, array, index, count):
+    """Sums of the 16 rows of 16 floats from ``index`` on: row ``k``'s in lane ``k``, by a fixed tree.
+
+    Where ``count`` is a tuple, rows from ``COLOR + len(count)`` on are taken for zero.
+    """
+    used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
     def emit(context, builder, sig, args):
         rows = []
-        for k in range(LANES):
+        for k in range(min(used, LANES)):
             position = builder.add(args[1], ir.Constant(args[1].type, k * LANES))
             address, align = _pointer(context, builder, array, args[0], position, index)
             rows.append(builder.load(address, align=align))
+        rows += [_constant(floats, 0.0)] * (LANES - len(rows))
         width = LANES
         while len(rows) > 1:
             rows = [_fold(builder, a, b, width) for a, b in zip(rows[::2], rows[1::2], strict=True)]
             width //= 2
         return rows[0]
 
-    return floats(array, index), emit
+    return floats(array, index, count), emit
 
 
 def _block_rows(context, builder, array_type, array, index, stride, index_type):

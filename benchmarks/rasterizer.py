@@ -1,0 +1,148 @@
+"""Time the CPU rasterizer against two peers: ``python benchmarks/rasterizer.py [--quick] [--json FILE]``.
+
+The scene is a closed body of flat splats that covers 19 % of the frame, one splat's sigma to a splat's
+distance on the surface. Runs are interleaved, so that whatever else the machine does hits all alike;
+ratios are of minima.
+"""
+
+import argparse
+import json
+import math
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parent))
+import peers
+
+from ghgs_lit.rendering import render
+from ghgs_lit.types import Cameras, Gaussians
+
+COVERED = 0.19
+FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
+
+
+def scene(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
+    """Splats on an ellipsoid seen by one camera, with gradients wanted for all of them."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    focal, distance = 1.4 * size, 3.0
+    pixel = distance / focal
+    half = math.sqrt(COVERED * size**2 / math.pi / 2.2)
+    axes = torch.tensor([half, 2.2 * half, half]) * pixel
+    # Knud Thomsen's formula for the surface of an ellipsoid.
+    products = torch.stack((axes[0] * axes[1], axes[0] * axes[2], axes[1] * axes[2])) ** 1.6075
+    surface = 4 * math.pi * float(products.mean()) ** (1 / 1.6075)
+    spacing = math.sqrt(surface / count)
+    scales = spacing * (0.6 + 0.8 * torch.rand(count, 3, generator=generator))
+    scales[:, 2] *= 0.1
+    # The rotation that takes z to the normal of the unit sphere: near enough to the ellipsoid's.
+    quaternions = torch.stack((1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(count)), dim=-1)
+    values = {
+        "means": normal * axes,
+        "quaternions": quaternions,
+        "scales": scales,
+        "opacities": 0.6 + 0.39 * torch.rand(count, generator=generator),
+        "colors": torch.rand(count, 3, generator=generator),
+    }
+    intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    extrinsics = torch.eye(4)
+    extrinsics[2, 3] = distance
+    gaussians = Gaussians(**{name: value.requires_grad_() for name, value in values.items()}, splits=(count,))
+    return gaussians, Cameras(intrinsics[None, None], extrinsics[None, None], size, size)
+
+
+def ours(gaussians: Gaussians, cameras: Cameras) -> Tensor:
+    return render(gaussians, cameras, "cpu").image[0, 0]
+
+
+CONTENDERS: dict[str, Callable[[Gaussians, Cameras], Tensor]] = {
+    "ours": ours,
+    "box": lambda gaussians, cameras: peers.render_box(gaussians, cameras[0, 0]),
+    "torch": lambda gaussians, cameras: peers.render_torch(gaussians, cameras[0, 0]),
+}
+
+
+def time_once(name: str, threads: int, gaussians: Gaussians, cameras: Cameras, upstream: Tensor):
+    """Seconds of one forward and one backward pass."""
+    torch.set_num_threads(threads)
+    for field in FIELDS:
+        getattr(gaussians, field).grad = None
+    start = time.perf_counter()
+    image = CONTENDERS[name](gaussians, cameras)
+    middle = time.perf_counter()
+    image.backward(upstream)
+    return middle - start, time.perf_counter() - middle
+
+
+def measure(count: int, size: int, repeats: dict[str, int]) -> dict[tuple[str, int], dict]:
+    """Minima and medians in ms of every contender: ours with one and two threads, box with one."""
+    gaussians, cameras = scene(count, size)
+    upstream = torch.randn(3, size, size, generator=torch.Generator().manual_seed(1))
+    runs = [("ours", 1), ("ours", 2), ("box", 1), ("torch", 2)]
+    times: dict[tuple[str, int], list] = {run: [] for run in runs if repeats[run[0]] > 0}
+    for name, threads in times:
+        if name != "torch":
+            time_once(name, threads, gaussians, cameras, upstream)
+    for turn in range(max(repeats.values())):
+        for run, found in times.items():
+            if turn < repeats[run[0]]:
+                found.append(time_once(*run, gaussians, cameras, upstream))
+    return {run: _summary(found) for run, found in times.items()}
+
+
+def _summary(found: list[tuple[float, float]]) -> dict:
+    forward, backward = ([1e3 * value for value in values] for values in zip(*found, strict=True))
+    totals = [a + b for a, b in zip(forward, backward, strict=True)]
+    return {
+        "forward": min(forward),
+        "backward": min(backward),
+        "total": min(totals),
+        "median": statistics.median(totals),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--quick", action="store_true", help="512 x 512 only, fewer runs; under three minutes"
+    )
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    options = parser.parse_args()
+    sizes = (512,) if options.quick else (256, 512, 1024)
+    rows = []
+    print("| splats | size | threads | forward ms | backward ms | median ms | peer | peer ms | peer / ours |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for size in sizes:
+        for count in (5_000, 50_000, 200_000):
+            slow = 2 if options.quick or count > 50_000 else 5
+            repeats = {"ours": 10 if options.quick else 30, "box": 4 if options.quick else 10, "torch": slow}
+            found = measure(count, size, repeats)
+            for threads in (1, 2):
+                own = found["ours", threads]
+                for peer, peer_threads in (("box", 1), ("torch", 2)):
+                    other = found[peer, peer_threads]
+                    rows.append({
+                        "splats": count, "size": size, "threads": threads, "peer": peer,
+                        "forward_ms": own["forward"], "backward_ms": own["backward"], "median_ms": own["median"],
+                        "peer_forward_ms": other["forward"], "peer_backward_ms": other["backward"],
+                        "ratio": other["total"] / own["total"],
+                    })  # fmt: skip
+                    print(
+                        f"| {count} | {size} | {threads} | {own['forward']:.2f} | {own['backward']:.2f} | "
+                        f"{own['median']:.2f} | {peer} ({peer_threads} thr.) | {other['total']:.1f} | "
+                        f"{rows[-1]['ratio']:.1f} |",
+                        flush=True,
+                    )
+    if options.json:
+        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+        print(f"rows: {options.json}")
+
+
+if __name__ == "__main__":
+    main()
