@@ -10,7 +10,9 @@ from torch import nn
 from ghgs_lit.config import build
 from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.geometry.crop import subject_windows
 from ghgs_lit.geometry.points import Unprojection
+from ghgs_lit.geometry.visual_hull import Interval
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.recalibration import Recalibration
@@ -26,7 +28,11 @@ STATE_PREFIX = "model."
 
 
 class GHGS(nn.Module):
-    """Encode, predict depth, unproject, recalibrate, regress Gaussians: ``model(batch) -> Prediction``."""
+    """Encode, predict depth, unproject, recalibrate, regress Gaussians: ``model(batch) -> Prediction``.
+
+    With ``crop`` the stages see windows around the subject in place of the whole photographs; what
+    comes back is that of the whole photographs.
+    """
 
     def __init__(
         self,
@@ -35,6 +41,7 @@ class GHGS(nn.Module):
         recalibration: Recalibration,
         gaussian_head: GaussianHead,
         unprojection: Unprojection | None = None,
+        crop: bool = False,
     ):
         super().__init__()
         self.encoder = encoder
@@ -42,11 +49,22 @@ class GHGS(nn.Module):
         self.unproject = unprojection or Unprojection()
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
+        self.crop = crop
 
     def forward(self, batch: Batch) -> Prediction:
         check_batch(batch, self.encoder.patch_size)
+        # From the whole frames: a window would hide from the hull what lies beside it.
+        interval = self.depth_head.interval(batch)
+        if not self.crop:
+            return self._predict(batch, interval)
+        windows = subject_windows(batch.masks, self.encoder.patch_size)
+        if interval is not None:
+            interval = (windows.cut(interval[0]), windows.cut(interval[1]))
+        return windows.paste_prediction(self._predict(windows.cut_batch(batch), interval))
+
+    def _predict(self, batch: Batch, interval: Interval | None) -> Prediction:
         tokens = self.encoder(batch.images, batch.masks)
-        depth_maps = self.depth_head(tokens, batch)
+        depth_maps = self.depth_head(tokens, batch, interval)
         points = self.unproject(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points, batch)
         gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
@@ -78,7 +96,12 @@ class GHGS(nn.Module):
             for name in STAGES[1:]
         }
         points = config.get("points")
-        return cls(encoder, **stages, unprojection=Unprojection(**points) if points else None)
+        return cls(
+            encoder,
+            **stages,
+            unprojection=Unprojection(**points) if points else None,
+            crop=bool(skip.get("crop", False)),
+        )
 
     @classmethod
     def from_checkpoint(cls, path: str | Path, map_location: Any = "cpu") -> "GHGS":

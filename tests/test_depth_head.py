@@ -25,6 +25,10 @@ def make_tokens(batch, dim=64, seed=0):
     return Tokens(latent, semantic, image, row, column, grid, PATCH)
 
 
+def predict(head, batch):
+    return head(make_tokens(batch), batch, head.interval(batch))
+
+
 def make_head(**options):
     torch.manual_seed(1)
     return DepthHead(64, dpt={"features": 16, "out_channels": [16, 16, 16, 16]}, **options)
@@ -147,7 +151,7 @@ def test_parameterizations_stay_in_bounds_and_keep_their_gradient(name):
 @pytest.mark.parametrize("name", list(BOUNDED))
 def test_head_starts_at_a_share_of_its_bounds(name, bounds):
     batch = make_batch(2, 3)
-    maps = make_head(parameterization=name, bounds=bounds, start=0.4)(make_tokens(batch), batch)
+    maps = predict(make_head(parameterization=name, bounds=bounds, start=0.4), batch)
     torch.testing.assert_close(maps.depth, BOUNDED[name](torch.tensor(0.4), maps.near, maps.far))
     assert torch.equal(maps.valid, batch.masks)
     assert (maps.confidence >= 1).all()
@@ -158,9 +162,9 @@ def test_depth_is_wide_under_autocast():
     batch = make_batch()
     head, tokens = make_head(bounds="hull"), make_tokens(batch)
     torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
-    expected = head(tokens, batch)
+    expected = head(tokens, batch, head.interval(batch))
     with torch.autocast("cpu", torch.bfloat16):
-        found = head(tokens, batch)
+        found = head(tokens, batch, head.interval(batch))
         points = Unprojection()(expected, tokens, batch)
     assert found.depth.dtype == found.near.dtype == points.pixels.dtype == torch.float32
     assert torch.equal(found.near, expected.near)
@@ -173,14 +177,14 @@ def test_values_that_are_not_finite_are_invalid_and_finite():
     head = make_head()
     with torch.no_grad():
         head.dpt.scratch.output_conv2[-1].bias.fill_(float("nan"))
-    maps = head(make_tokens(batch), batch)
+    maps = predict(head, batch)
     assert maps.depth.isfinite().all()
     assert not maps.valid.any()
 
 
 def test_the_releases_parameterization_has_either_sign_and_no_bounds():
     batch = make_batch()
-    maps = make_head(parameterization="inverse_linear", bounds="none")(make_tokens(batch), batch)
+    maps = predict(make_head(parameterization="inverse_linear", bounds="none"), batch)
     assert maps.near is None
     values = torch.tensor([0.5, -0.5, 0.0])
     torch.testing.assert_close(inverse_linear(values), torch.tensor([2.0, -2.0, 1e8]))

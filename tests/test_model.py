@@ -16,6 +16,7 @@ import ghgs_lit
 from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.points import Unprojection
+from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.model import FORMAT_VERSION, GHGS, check_batch
@@ -389,3 +390,28 @@ def test_importing_the_package_does_not_import_torch():
     assert ghgs_lit.GHGS is GHGS
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = ghgs_lit.nothing
+
+
+@pytest.mark.parametrize("size", [(56, 56), (42, 70)])
+def test_windows_give_gaussians_of_the_same_pixels(size):
+    """The network sees less background, the geometry is that of the whole photographs."""
+    batch = make_batch(2, 3, *size, zoom=0.5)
+    whole, part = (make_model(f"skip={name}")(batch) for name in ("exact", "balanced"))
+    assert part.depth.shape == whole.depth.shape
+    assert torch.equal(part.depth_valid, batch.masks)
+    for name in ("image", "pixel", "colors"):
+        assert torch.equal(getattr(part.gaussians, name), getattr(whole.gaussians, name)), name
+    assert part.gaussians.splits == whole.gaussians.splits
+    for name in ("near", "far"):
+        near = (getattr(prediction.depth_maps, name)[batch.masks] for prediction in (part, whole))
+        assert torch.equal(*near)
+    # Points of the pasted maps lie on the rays of their pixels in the whole photograph.
+    camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
+    uv, _ = project(
+        part.points.pixels,
+        batch.cameras.intrinsics[:, :, None, None],
+        batch.cameras.extrinsics[:, :, None, None],
+    )
+    centers = pixel_centers(*size, camera).expand_as(uv)
+    assert torch.allclose(uv[batch.masks], centers[batch.masks], atol=1e-3)
+    assert torch.allclose(camera[..., 2][batch.masks], part.depth[batch.masks], atol=1e-4)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
-from ghgs_lit.geometry.visual_hull import SubjectBounds
+from ghgs_lit.geometry.visual_hull import Interval, SubjectBounds
 from ghgs_lit.heads.activations import CONFIDENCES
 from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Tokens
@@ -81,16 +81,22 @@ class DepthHead(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
-    def forward(self, tokens: Tokens, batch: Batch) -> DepthMaps:
-        """Depths of all pixels; those of the subject are valid. What is not finite becomes 1 m, invalid."""
+    def interval(self, batch: Batch) -> Interval | None:
+        """Near and far of each pixel, [B, V, H, W] in metres; ``None`` where depths are not bounded."""
+        return None if self.bounds is None else self.bounds(batch.masks, batch.cameras)
+
+    def forward(self, tokens: Tokens, batch: Batch, interval: Interval | None) -> DepthMaps:
+        """Depths within ``interval`` of all pixels; those of the subject are valid.
+
+        What is not finite becomes 1 m, invalid.
+        """
         wanted = batch.masks.flatten(2).any(-1) | (self.views == "all")
         raw = wide(decode_views(self.dpt, tokens, batch, wanted))
         value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
-        near = far = None
-        if self.bounds is None:
+        near, far = interval or (None, None)
+        if interval is None:
             depth = inverse_linear(value)
         else:
-            near, far = self.bounds(batch.masks, batch.cameras)
             depth = BOUNDED[self.parameterization]((value + self.start).sigmoid(), near, far)
         finite = depth.isfinite()
         return DepthMaps(
