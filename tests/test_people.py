@@ -83,7 +83,7 @@ def test_shapes_are_adults():
     for index in range(0, len(body.bodies), 8):
         rest, _ = body.rest(body.bodies[index])
         heights.append(np.ptp(rest[:BODY_VERTICES, 1]))
-    assert 1.5 < min(heights)
+    assert min(heights) > 1.5
     assert max(heights) < 1.9
     assert np.std(heights) > 0.04
 

@@ -1,7 +1,8 @@
 """The body model: shapes as principal components, a rig, linear blend skinning.
 
-The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), baked by ``scripts/bake_body.py``. Metres, y up,
-facing +z; the person's left is +x. At rest the feet stand on y = 0 and the arms hang 45 degrees off the body.
+The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), baked by ``scripts/bake_body.py``. Metres,
+y up, facing +z; the person's left is +x. At rest the feet stand on y = 0 and the arms hang 45 degrees off the
+body.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,8 @@ class BodyModel:
         bodies: [s, k] coefficients of plausible adults; female [s] bool, age [s] (0.67 young, 1 old).
         bone_names, bone_parents: b names; [b] int, -1 for the root; parents come before children.
         weights: [n, b] float64, rows sum to 1.
-        uv: [t, 2] float32, UV layout of the base mesh; head_uv [4] the island of the head (left bottom right top).
+        uv: [t, 2] float32, UV layout of the base mesh.
+        head_uv: [4] the island of the head in it: left, bottom, right, top.
         head_masks: [h, w, 4] uint8 over head_uv: lips, eyelids, ears, face.
         surfaces: body, eyes, tights, skirt.
     """

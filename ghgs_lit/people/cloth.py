@@ -140,7 +140,7 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
 
 
 def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
-    """Slanted or curved front pockets, patch pockets behind, the fly; stitched in a contrasting thread on jeans."""
+    """Front pockets, patch pockets behind, the fly; in a contrasting thread on jeans."""
     thread = np.array([0.72, 0.50, 0.25]) if bottom.kind == "jeans" else None
 
     def stitch(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:

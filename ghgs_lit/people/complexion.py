@@ -18,7 +18,7 @@ IRISES = ((0.28, 0.17, 0.08), (0.20, 0.12, 0.06), (0.35, 0.45, 0.55), (0.33, 0.4
 
 @dataclass(frozen=True)
 class Complexion:
-    """Colours [3] of skin, lips, hair and irises; beard (0 to 1), brow thickness, noise for freckles and pores."""
+    """Colours [3] of skin, lips, hair, irises; strength of beard, brows, make-up, freckles (about 0 to 1)."""
 
     skin: np.ndarray
     lips: np.ndarray
@@ -49,7 +49,7 @@ def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Com
     )
     shares = (0.72, 0.22, 0.06, 0, 0, 0) if dark else (0.2, 0.25, 0.22, 0.13, 0.13, 0.07)
     hair = np.array(hairs[rng.choice(6, p=shares)]) * rng.uniform(0.85, 1.15)
-    grey = rng.random() < (age - 0.68) * 2.4
+    grey = rng.random() < (age - 0.68) * 1.8
     if grey:
         hair = hair + (np.array([0.72, 0.71, 0.70]) - hair) * rng.uniform(0.4, 0.95)
     elif rng.random() < 0.06:
@@ -62,9 +62,18 @@ def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Com
     if not female and rng.random() < 0.55:
         beard, style = rng.uniform(0.25, 0.95), str(rng.choice(("stubble", "full", "goatee", "moustache")))
     return Complexion(
-        skin, rose + (lipstick - rose) * 0.75 * makeup, hair, iris, beard, style, rng.uniform(0.6, 1.3) * (0.8 if female else 1.1),
-        makeup, float(rng.random() < 0.2) * rng.uniform(0.3, 1.0), Noise(rng, 1.4, 2.0), Noise(rng, 0.3, 20.0),
-    )  # fmt: skip
+        skin=skin,
+        lips=rose + (lipstick - rose) * 0.75 * makeup,
+        hair=hair,
+        iris=iris,
+        beard=beard,
+        beard_style=style,
+        brows=rng.uniform(0.6, 1.3) * (0.8 if female else 1.1),
+        makeup=makeup,
+        freckles=float(rng.random() < 0.2) * rng.uniform(0.3, 1.0),
+        noise=Noise(rng, 1.4, 2.0),
+        fine=Noise(rng, 0.3, 20.0),
+    )
 
 
 def _blob(

@@ -8,8 +8,9 @@ import numpy as np
 from ghgs_lit.people.noise import Noise, smoothstep
 
 PATTERNS = {
-    "plain": 5.0, "melange": 2.0, "knit": 1.5, "stripes": 2.5, "pinstripes": 1.0, "checks": 2.0, "gingham": 1.0,
-    "dots": 1.2, "blobs": 1.5, "camouflage": 0.7, "block": 1.4, "gradient": 0.6, "zigzag": 0.7, "argyle": 0.7,
+    "plain": 5.0, "melange": 2.0, "knit": 1.5, "stripes": 2.5, "pinstripes": 1.0, "checks": 2.0,
+    "gingham": 1.0, "dots": 1.2, "blobs": 1.5, "camouflage": 0.7, "block": 1.4, "gradient": 0.6,
+    "zigzag": 0.7, "argyle": 0.7,
 }  # fmt: skip
 NEUTRALS = (
     (0.09, 0.09, 0.10), (0.20, 0.21, 0.23), (0.45, 0.46, 0.48), (0.72, 0.72, 0.70), (0.93, 0.93, 0.91),

@@ -1,4 +1,4 @@
-"""Cut and drape clothes: where a garment ends (fields on the average body) and how far it stands off the body."""
+"""Cut and drape clothes: where they end (fields on the average body), how far they stand off the body."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ SOLE = 0.013  # thickness of a sole, metres
 
 @dataclass(frozen=True)
 class Figure:
-    """A naked person: rest vertices [n, 3] and joints [b, 3], skin faces, transforms of the bones, posed skin."""
+    """A naked person: rest vertices [n, 3], joints [b, 3], faces of the skin, bone transforms, posed skin."""
 
     rest: np.ndarray
     joints: np.ndarray
@@ -27,7 +27,7 @@ class Figure:
     posed: np.ndarray
 
 
-# ---- where garments end: metres inside (positive) or outside (negative) ----------------------------------------
+# ---- where garments end: metres inside (positive) or outside (negative)
 
 
 def neckline(place: Place, kind: str) -> np.ndarray:
@@ -64,10 +64,8 @@ def top_field(place: Place, top: Top) -> np.ndarray:
 
 def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
     """Positive where trousers or a skirt are."""
-    field = np.minimum(
-        bottom.waist - place.y, place.y - max(bottom.hem, ANKLE if bottom.kind != "skirt" else 0.0)
-    )
-    return np.minimum(field, 0.5 - place.arm)
+    hem = bottom.hem if bottom.kind == "skirt" else max(bottom.hem, ANKLE)
+    return np.minimum(np.minimum(bottom.waist - place.y, place.y - hem), 0.5 - place.arm)
 
 
 def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
@@ -76,14 +74,14 @@ def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
     return shoes.top - place.y + 0.02 * instep + 0.008 * np.cos(place.leg_angle)
 
 
-# ---- how they stand off the body -------------------------------------------------------------------------------
+# ---- how they stand off the body
 
 
 def push_out(
     points: np.ndarray, vertices: np.ndarray, normals: np.ndarray, clearance: np.ndarray
 ) -> np.ndarray:
-    """Move points [g, 3] along the nearest vertex's normal until they are `clearance` [g] outside the body."""
-    _, index = cKDTree(vertices).query(points, workers=1)
+    """Move points [g, 3] along the nearest vertex's normal until `clearance` [g] outside the body."""
+    _, index = cKDTree(vertices).query(points)
     height = np.einsum("gi,gi->g", points - vertices[index], normals[index])
     lack = np.clip(clearance - height, 0.0, 0.04)
     return points + lack[:, None] * normals[index]
@@ -97,23 +95,20 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     sleeve_end = smoothstep(top.sleeve - 0.20, top.sleeve, place.sleeve) * (top.kind != "tank")
     flare = {"tee": 0.012, "shirt": 0.007, "jacket": 0.006}.get(top.kind, 0.0) if top.sleeve < 0.4 else -0.004
     ease = top.ease + flare * sleeve_end * place.arm
-    if top.tucked:
-        ease = np.where(
-            place.y < 1.02, np.maximum(0.002, ease - 0.012), ease + 0.008 * _bump(place.y, 1.05, 0.03)
-        )
+    folds = _wrinkles(place, noise, top)
+    if top.tucked:  # flat under the waistband, slack above it
+        out = smoothstep(0.985, 1.03, place.y)
+        ease, folds = out * (ease + 0.008 * _bump(place.y, 1.05, 0.03)) + 0.001 * (1 - out), out * folds
     else:  # over what is worn below
         low = max(1.02, top.hem + 0.03)
         ease = np.maximum(ease, 0.0145 * (1 - smoothstep(low, low + 0.06, place.y)))
-    points = points + (ease + _wrinkles(place, noise, top))[:, None] * vertex_normals(
-        points, piece.vertex_faces
-    )
-    if top.hang > 0:
-        points = _hang(points, place, top.hang)
-    return _pose(figure, piece, points, 0.4 * ease + 0.002)
+    points = points + (ease + folds)[:, None] * vertex_normals(points, piece.vertex_faces)
+    points = _hang(points, place, top.hang * smoothstep(0.985, 1.03, place.y) if top.tucked else top.hang)
+    return _pose(figure, piece, points, np.minimum(0.4 * ease + 0.002, ease + 0.001))
 
 
 def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
-    """The collar of a shirt that is turned down over it: posed points of the upper chart, and where it ends."""
+    """A collar turned down over its shirt: posed points of the upper chart, and where it ends."""
     piece = chart("upper")
     below = neckline(piece.place, top.neck)
     lift = 0.004 + 0.006 * smoothstep(0.0, 0.03, below)
@@ -143,7 +138,7 @@ def _bump(x: np.ndarray, centre: float, width: float) -> np.ndarray:
     return np.exp(-(((x - centre) / width) ** 2))
 
 
-def _hang(points: np.ndarray, place: Place, share: float) -> np.ndarray:
+def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.ndarray:
     """Let cloth fall from chest, shoulder blades and belly instead of following every hollow below them."""
     trunk = place.arm < 0.3
     axis = np.array([0.0, np.median(points[trunk, 2])])
@@ -193,15 +188,14 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
         points = _widen_legs(figure, points, place, bottom, folds)
     drop = max(ANKLE - bottom.hem, 0.0)  # the helper surface ends at the ankle; the hem falls on the shoe
     points[:, 1] -= drop * (1 - smoothstep(ANKLE, 0.24, place.y))
-    return _pose(
-        figure, piece, points, np.where(place.y < 0.15, -1.0, 0.002)
-    )  # the hem keeps off the foot itself
+    clearance = np.where(place.y < 0.15, -1.0, 0.002)  # the hem need not keep off the foot
+    return _pose(figure, piece, points, clearance)
 
 
 def _widen_legs(
     figure: Figure, points: np.ndarray, place: Place, bottom: Bottom, folds: np.ndarray
 ) -> np.ndarray:
-    """Give each leg the radius of the cut, where that is wider than the body: a straight tube from the thigh."""
+    """Give each leg the radius of the cut, where wider than the body: a straight tube from the thigh."""
     joints = [figure.joints[i] for i in _leg_bones()]
     moved = points.copy()
     for side in (1.0, -1.0):
@@ -236,7 +230,7 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
     count = int(rng.integers(7, 15))
     wander = 1.2 * noise(angle / (2 * np.pi), np.full_like(angle, 0.3))
     folds = np.cos(count * angle + wander) * rng.uniform(0.03, 0.11) * down
-    slim = 1 - 0.35 * (1 - bottom.width / 0.3) * smoothstep(0.0, 0.5, down)
+    slim = 1 - 0.35 * (1 - bottom.width / 0.55) * smoothstep(0.0, 0.5, down)
     grown = 1 + bottom.width * down + folds
     points[:, [0, 2]] = axis + offset * (slim * grown)[:, None]
     points = points + 0.010 * vertex_normals(points, piece.vertex_faces)

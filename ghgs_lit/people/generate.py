@@ -12,7 +12,7 @@ from ghgs_lit.people.body import BODY_VERTICES, BodyModel, load_body, skin
 from ghgs_lit.people.cloth import bottom_texture, shoe_texture, top_texture
 from ghgs_lit.people.complexion import Complexion, eye_texture, head_texture, sample_complexion, skin_texture
 from ghgs_lit.people.garments import Figure
-from ghgs_lit.people.hair import make_hair, sample_haircut
+from ghgs_lit.people.hair import make_beanie, make_hair, sample_haircut, under_hat
 from ghgs_lit.people.mesh import Person, TexturedMesh
 from ghgs_lit.people.meshing import triangles, vertex_normals
 from ghgs_lit.people.noise import Noise
@@ -45,10 +45,14 @@ def generate(seed: int, index: int) -> Person:
     outfit = sample_outfit(cloth_rng, female)
     look = sample_complexion(look_rng, female, age)
     cut = sample_haircut(look_rng, female)
+    if outfit.beanie:
+        cut = under_hat(cut)
     balls = spheres(figure)
     parts = [naked_part(figure, outfit, look, balls, scalp=0.25 if cut.style == "bald" else 1.0)]
     parts += dress(figure, outfit, balls, cloth_rng)
     parts += make_hair(figure, cut, look, look_rng)
+    if outfit.beanie:
+        parts.append(make_beanie(figure, outfit.beanie))
     parts = [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
     turn = Rotation.from_euler("y", pose_rng.uniform(-YAW, YAW), degrees=True).as_matrix()
     return _on_the_ground(f"person_{seed}_{index:04d}", parts, figure.posed, turn)
@@ -128,7 +132,7 @@ def dress(figure: Figure, outfit: Outfit, balls: Spheres, rng: np.random.Generat
 def naked_part(
     figure: Figure, outfit: Outfit, look: Complexion, balls: Spheres, scalp: float
 ) -> TexturedMesh:
-    """Head, eyes and the skin that the clothes leave bare: one mesh, so that normals agree across the neck."""
+    """Head, eyes and the skin that clothes leave bare: one mesh, so that normals agree across the neck."""
     textures = {
         "head": head_texture(look, scalp),
         "skin": skin_texture(look, outfit.shoes),

@@ -1,5 +1,6 @@
 """Hair: a shell over the scalp, a curtain that falls from it, a tail or a bun."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,14 +8,15 @@ from scipy.spatial import cKDTree
 
 from ghgs_lit.people.body import BODY_VERTICES, load_body, skin
 from ghgs_lit.people.complexion import Complexion
+from ghgs_lit.people.fabric import Fabric, paint
 from ghgs_lit.people.garments import Figure, push_out
 from ghgs_lit.people.mesh import TexturedMesh
 from ghgs_lit.people.meshing import triangles, vertex_normals
 from ghgs_lit.people.noise import smoothstep
-from ghgs_lit.people.surface import chart, hairline
+from ghgs_lit.people.surface import chart, face_frame, hairline
 
 STYLES = ("bald", "crop", "short", "quiff", "afro", "bob", "long", "tail", "bun")
-SHARES = {
+SHARES = {  # by sex (True: female), in the order of the styles
     True: (0.0, 0.03, 0.09, 0.03, 0.08, 0.22, 0.28, 0.16, 0.11),
     False: (0.07, 0.30, 0.28, 0.18, 0.08, 0.02, 0.04, 0.02, 0.01),
 }
@@ -23,7 +25,7 @@ ROWS, COLUMNS = 56, 80
 
 @dataclass(frozen=True)
 class Haircut:
-    """`style`, `thickness` of the shell (metres), height where a curtain ends on the average body, `wave` (0 to 1)."""
+    """`thickness` of the shell (metres), height where a curtain ends on the average body, `wave` (0 to 1)."""
 
     style: str
     thickness: float
@@ -47,7 +49,7 @@ def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Gen
     if cut.style == "bald":
         return []
     if cut.style in ("bob", "long"):
-        return [_curtain(figure, cut, look, rng)]
+        return [_curtain(figure, cut, look)]
     parts = [_shell(figure, cut, look)]
     if cut.style in ("tail", "bun"):
         parts.append(_tail(figure, cut, look, rng))
@@ -145,55 +147,81 @@ def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
     return np.rint(255 * np.clip(colour * root[:, None], 0, 1)).astype(np.uint8).reshape(512, 512, 3)
 
 
-def _curtain(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:
+def _curtain(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
     """Hair that leaves the crown in all directions, frames the face and falls behind and beside the neck."""
-    piece = chart("head")
-    head, mean = piece.operator @ figure.rest, piece.place.point
-    upper = mean[:, 1] > 1.50
-    scale = np.ptp(head[upper, 1]) / np.ptp(mean[upper, 1])
-    centre = head[upper].mean(0) + (np.array([0.0, 1.575, 0.100]) - mean[upper].mean(0)) * scale
-    tree = cKDTree((head[upper] - centre) / np.linalg.norm(head[upper] - centre, axis=1, keepdims=True))
-    radii = np.linalg.norm(head[upper] - centre, axis=1)
+    centre, scale, radius_at = _skull(figure)
     columns = np.linspace(-1, 1, COLUMNS)
-    dome = np.radians(np.linspace(2, 92, ROWS // 2))
+    half = ROWS // 2
     drop = scale * (1.575 - cut.end)
-    falls = np.linspace(0, drop, ROWS - ROWS // 2 + 1)[1:]
-    ragged = 1 + 0.05 * look.noise(columns * 0.8, 0.2 * np.ones(COLUMNS)) * (falls[:, None] / drop)
-    rows = []
-    for polar in dome:
-        height = 1.575 + 0.100 * np.cos(polar)
-        rows.append(_around(columns, height) + (np.full(COLUMNS, polar),) + (np.zeros(COLUMNS),))
-    for fall, wobble in zip(falls, ragged, strict=True):
-        rows.append(
-            _around(columns, 1.575 - fall / scale) + (np.full(COLUMNS, np.pi / 2 + 0.03), fall * wobble)
-        )
-    angle, _, polar, fall = (np.stack([row[i] for row in rows]) for i in range(4))
-    direction = np.stack([np.sin(angle) * np.sin(polar), np.cos(polar), np.cos(angle) * np.sin(polar)], -1)
-    distance, index = tree.query(direction.reshape(-1, 3), k=12, workers=1)
-    weight = 1 / (distance + 0.06) ** 2
-    radius = ((radii[index] * weight).sum(1) / weight.sum(1)).reshape(angle.shape)
-    part = 0.004 * np.exp(-((np.abs(columns)[None] - 1) ** 2) / 0.002)
-    volume = cut.thickness * smoothstep(0.02, 0.5, polar) + 0.005 - part
-    strands = look.noise(columns * 0.9, np.full(COLUMNS, 0.4))[None] * 0.003 * smoothstep(0.3, 1.2, polar)
-    points = centre + (radius + volume + strands)[..., None] * direction
-    points[..., 1] -= fall
-    swing = (
-        0.012
-        * cut.wave
-        * np.sin(2 * np.pi * (fall / 0.11 + 0.6 * look.noise(columns, 0.7 * np.ones(COLUMNS))[None]))
+    polar = np.concatenate([np.radians(np.linspace(2, 92, half)), np.full(ROWS - half, np.pi / 2 + 0.03)])
+    fall = np.concatenate([np.zeros(half), np.linspace(0, drop, ROWS - half + 1)[1:]])
+    height = 1.575 + np.where(fall > 0, -fall / scale, 0.100 * np.cos(polar))  # on the average head
+    angle = np.pi + np.radians(180 - _face(height))[:, None] * columns
+    polar = np.tile(polar[:, None], (1, COLUMNS))
+    fall = fall[:, None] * (
+        1 + 0.05 * look.noise(columns * 0.8, 0.2 * np.ones(COLUMNS)) * fall[:, None] / drop
     )
-    points += (swing * smoothstep(0.0, 0.06, fall))[..., None] * (direction * [1, 0, 1])
+    direction = np.stack([np.sin(angle) * np.sin(polar), np.cos(polar), np.cos(angle) * np.sin(polar)], -1)
+    part = 0.004 * np.exp(-((np.abs(columns) - 1) ** 2) / 0.002)
+    volume = cut.thickness * smoothstep(0.02, 0.5, polar) + 0.005 - part
+    strands = look.noise(columns * 0.9, np.full(COLUMNS, 0.4)) * 0.003 * smoothstep(0.3, 1.2, polar)
+    points = centre + (radius_at(direction) + volume + strands)[..., None] * direction
+    points[..., 1] -= fall
+    phase = fall / 0.11 + 0.6 * look.noise(columns, 0.7 * np.ones(COLUMNS))
+    swing = 0.012 * cut.wave * np.sin(2 * np.pi * phase) * smoothstep(0.0, 0.06, fall)
     inward = 0.25 * np.clip(fall - 0.02, 0, 0.12)
-    points -= inward[..., None] * (direction * [0.6, 0, 1])
+    points += swing[..., None] * (direction * [1, 0, 1]) - inward[..., None] * (direction * [0.6, 0, 1])
     neck = figure.joints[load_body().bone("neck01"), 1] + 0.03
     weights = _hanging_weights(points[..., 1].ravel(), neck)
     return _grid_mesh(figure, points, weights, 0.008, _texture(look, cut.wave, 0.3 + drop))
 
 
-def _around(columns: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Angles about the head (0 in front) of the columns at a height of the average head: hair frames the face."""
-    face = np.interp(height, [1.44, 1.552, 1.572, 1.600, 1.622, 1.634, 1.64], [98, 84, 74, 60, 42, 12, 0.5])
-    return np.pi + columns * np.radians(180 - face), np.full(len(columns), height)
+def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np.ndarray]]:
+    """Centre [3] of the cranium, its size against the average one, its radius along directions [..., 3]."""
+    piece = chart("head")
+    upper = piece.place.y > 1.50
+    head, mean = (piece.operator @ figure.rest)[upper], piece.place.point[upper]
+    scale = np.ptp(head[:, 1]) / np.ptp(mean[:, 1])
+    centre = head.mean(0) + (np.array([0.0, 1.575, 0.100]) - mean.mean(0)) * scale
+    radii = np.linalg.norm(head - centre, axis=1)
+    tree = cKDTree((head - centre) / radii[:, None])
+
+    def radius_at(direction: np.ndarray) -> np.ndarray:
+        distance, index = tree.query(direction.reshape(-1, 3), k=12)
+        weight = 1 / (distance + 0.06) ** 2
+        return ((radii[index] * weight).sum(1) / weight.sum(1)).reshape(direction.shape[:-1])
+
+    return centre, float(scale), radius_at
+
+
+def _face(height: np.ndarray) -> np.ndarray:
+    """Half of the angle, in degrees, that hair leaves to the face at heights of the average head."""
+    return np.interp(height, [1.44, 1.552, 1.572, 1.600, 1.622, 1.634, 1.64], [98, 84, 74, 60, 42, 12, 0.5])
+
+
+def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
+    """A knitted cap down to the ears, its brim turned up."""
+    piece = chart("scalp")
+    points = piece.operator @ figure.rest
+    for _ in range(12):
+        points = piece.smooth @ points
+    at = face_frame(piece.place.point)
+    above = at[:, 1] - 1.610 - 0.30 * (at[:, 2] - 0.2)
+    height = 0.019 + 0.006 * (1 - smoothstep(0.040, 0.046, above)) + 0.010 * smoothstep(0.03, 0.1, above)
+    points = points + height[:, None] * vertex_normals(points, piece.vertex_faces)
+    texel = face_frame(piece.texel_place.point)
+    azimuth = np.arctan2(texel[:, 0], texel[:, 2] - 0.105)
+    rise = texel[:, 1] - 1.610 - 0.30 * (texel[:, 2] - 0.2)
+    colour = (
+        paint(fabric, azimuth * 0.09, rise) * (1 - 0.35 * np.exp(-(((rise - 0.043) / 0.004) ** 2)))[:, None]
+    )
+    return piece.mesh(skin(points, piece.weights, figure.transforms), above, piece.image(colour))
+
+
+def under_hat(cut: Haircut) -> Haircut:
+    """The haircut as a hat leaves it: flat on the scalp."""
+    style = cut.style if cut.style in ("bald", "bob", "long") else "crop"
+    return Haircut(style, min(cut.thickness, 0.007), cut.end, cut.wave)
 
 
 def _tail(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:

@@ -38,16 +38,14 @@ def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndar
     return sparse.csr_matrix((values, (rows, columns)), (total, count)), fine
 
 
-def neighbour_mean(faces: np.ndarray, count: int, pin_border: bool = True) -> sparse.csr_matrix:
-    """Operator [count, count] to the mean of a vertex and its neighbours; border vertices stay where they are."""
+def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
+    """Operator [count, count] halfway to the mean of a vertex's neighbours; the border stays in place."""
     pairs = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
     graph = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count)).tocsr()
     both = graph + graph.T
+    links = both.tocoo()
     border = np.zeros(count, bool)
-    if pin_border:
-        lone = both.tocoo()
-        once = lone.data == 1
-        border[lone.row[once]] = True
+    border[links.row[links.data == 1]] = True
     linked = (both > 0).astype(np.float64)
     keep = sparse.diags(np.where(border, 0.0, 1.0))
     linked = keep @ linked
@@ -60,7 +58,7 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     """Cut a mesh along the zero line of a value per vertex; what is positive stays.
 
     Returns:
-        faces [k, 3] over new vertices, and for each new vertex two old ones `a`, `b` and the share `t` of `b`:
+        faces [k, 3] over new vertices, and for each of these two old ones `a`, `b` and the share `t` of `b`:
         an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
     """
     count = len(field)

@@ -1,7 +1,7 @@
 """What a person wears: drawn once, then cut (`garments`) and painted (`cloth`).
 
-Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0, neck 1.43),
-sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
+Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0, neck
+1.43), sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,9 @@ from ghgs_lit.people.fabric import Fabric, random_colour, sample_fabric
 SMOOTH_KNITS = ("plain", "melange", "stripes", "block", "dots", "blobs", "gradient", "camouflage", "zigzag")
 WOOLS = ("knit", "melange", "stripes", "zigzag", "argyle", "block", "gradient", "plain")
 WOVEN = ("plain", "checks", "gingham", "pinstripes", "dots", "stripes", "blobs")
+DENIMS = (
+    (0.17, 0.24, 0.38), (0.30, 0.42, 0.58), (0.12, 0.14, 0.20), (0.52, 0.62, 0.72), (0.30, 0.30, 0.32),
+)  # fmt: skip
 SKIRTINGS = ("plain", "dots", "blobs", "checks", "zigzag", "gradient", "gingham", "stripes")
 
 
@@ -20,9 +23,9 @@ SKIRTINGS = ("plain", "dots", "blobs", "checks", "zigzag", "gradient", "gingham"
 class Top:
     """A garment for the upper body.
 
-    `kind`: tee, sweater, shirt, tank or jacket. `neck` is the neckline: crew, scoop, vee, collar or straps. `sleeve` is its length, for a tank the
-    distance from the middle to the armhole. `ease` is the air
-    between cloth and body in metres, `hang` (0 to 1) how far it falls straight down from the chest, `opening` the
+    `kind`: tee, sweater, shirt, tank or jacket. `sleeve` is its length; of a tank, how far from the middle
+    the armhole is. `neck` is the neckline: crew, scoop, vee, collar or straps. `ease` is the air between
+    cloth and body in metres, `hang` (0 to 1) how far it falls straight down from the chest, `opening` the
     half width in metres of a jacket that is not closed.
     """
 
@@ -40,8 +43,11 @@ class Top:
 
 @dataclass(frozen=True)
 class Bottom:
-    """Trousers (jeans, chinos, joggers, leggings, shorts) or a skirt: `hem` height, `width` is the radius of a
-    leg's hem in metres (of shorts: what it has over the thigh; of a skirt: its flare)."""
+    """Trousers (jeans, chinos, joggers, leggings, shorts) or a skirt.
+
+    `waist` and `hem` are heights, `width` the radius of a leg's hem in metres; of shorts, what it has over
+    the thigh; of a skirt, its flare.
+    """
 
     kind: str
     waist: float
@@ -71,6 +77,7 @@ class Outfit:
     jacket: Top | None
     bottom: Bottom
     shoes: Shoes
+    beanie: Fabric | None
 
 
 def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
@@ -83,11 +90,12 @@ def sample_outfit(rng: np.random.Generator, female: bool) -> Outfit:
         bottom = Bottom("skirt", 0.97, bottom.hem, bottom.width, top.fabric, bottom.belt)
     jacket = None
     if not dress and top.kind in ("tee", "tank", "shirt") and rng.random() < 0.3:
-        jacket = Top(
-            "jacket", 0.478, rng.uniform(0.82, 0.95), "vee", 0.024, 0.5, False,
-            sample_fabric(rng, ("plain", "melange", "knit", "checks", "pinstripes")), None, rng.uniform(0.035, 0.09),
-        )  # fmt: skip
-    return Outfit(top, jacket, bottom, _sample_shoes(rng, bottom))
+        fabric = sample_fabric(rng, ("plain", "melange", "knit", "checks", "pinstripes"))
+        hem, opening = rng.uniform(0.82, 0.95), rng.uniform(0.035, 0.09)
+        jacket = Top("jacket", 0.478, hem, "vee", 0.024, 0.5, False, fabric, None, opening)
+    shoes = _sample_shoes(rng, bottom)
+    beanie = sample_fabric(rng, ("knit", "stripes", "melange")) if rng.random() < 0.09 else None
+    return Outfit(top, jacket, bottom, shoes, beanie)
 
 
 def _sample_top(rng: np.random.Generator, female: bool, tucked: bool) -> Top:
@@ -131,14 +139,8 @@ def _sample_trousers(rng: np.random.Generator, female: bool) -> Bottom:
         )
     fabric = sample_fabric(rng, patterns)
     if kind == "jeans":
-        shades = (
-            (0.17, 0.24, 0.38),
-            (0.30, 0.42, 0.58),
-            (0.12, 0.14, 0.20),
-            (0.52, 0.62, 0.72),
-            (0.30, 0.30, 0.32),
-        )
-        fabric.colours[0] = np.clip(np.array(shades[rng.integers(5)]) + rng.normal(0, 0.02, 3), 0.05, 0.9)
+        shade = np.array(DENIMS[rng.integers(len(DENIMS))])
+        fabric.colours[0] = np.clip(shade + rng.normal(0, 0.02, 3), 0.05, 0.9)
     elif rng.random() < 0.7:
         fabric.colours[0] = random_colour(rng, 0.9)
     hem = rng.uniform(0.40, 0.58) if kind == "shorts" else rng.uniform(0.045, 0.10)
@@ -152,7 +154,7 @@ def _sample_trousers(rng: np.random.Generator, female: bool) -> Bottom:
 def _sample_skirt(rng: np.random.Generator) -> Bottom:
     belt = random_colour(rng, 0.7) if rng.random() < 0.35 else None
     return Bottom(
-        "skirt", 0.985, rng.uniform(0.25, 0.62), rng.uniform(0.0, 0.30), sample_fabric(rng, SKIRTINGS), belt
+        "skirt", 0.985, rng.uniform(0.25, 0.62), rng.uniform(0.0, 0.55), sample_fabric(rng, SKIRTINGS), belt
     )
 
 

@@ -1,7 +1,7 @@
 """Standing poses within the limits of human joints: gestures for the arms, stances for the legs.
 
-Arms are posed forward: a direction of the upper arm, an elbow angle, and where the forearm heads. Legs are solved
-from the feet up: the soles are placed on the ground and the knees follow, so feet neither float nor slide.
+Arms are posed forward: a direction of the upper arm, an elbow angle, and where the forearm heads. Legs are
+solved from the feet up: the soles are placed on the ground and the knees follow, so feet do not float.
 Directions are in the person's frame: +x left, +y up, +z forward; for the right side x is mirrored.
 """
 
@@ -16,8 +16,8 @@ SPINE = ("spine05", "spine04", "spine03", "spine02", "spine01")
 NECK = ("neck01", "neck02", "neck03", "head")
 FINGERS = ("finger2", "finger3", "finger4", "finger5")
 
-# Upper arm (x outwards), where the forearm heads, elbow, forearm twist, curl of the fingers: mean and half range.
-# Angles in degrees; directions need no unit length.
+# Upper arm (x outwards), where the forearm heads; elbow, forearm twist, curl of the fingers: mean and half
+# range in degrees. Directions need no unit length.
 GESTURES = {
     "relaxed": ((0.20, -1.0, 0.00), (-0.25, 0.2, 1.0), (18, 9), (-35, 15), (28, 14)),
     "loose": ((0.34, -1.0, 0.10), (-0.35, 0.2, 1.0), (32, 14), (-25, 15), (30, 15)),
@@ -38,10 +38,9 @@ STANCES = ("stand", "contrapposto", "walk", "step", "crouch", "wide")
 
 @dataclass(frozen=True)
 class Pose:
-    """Transforms of the bones [b, 3, 4] from rest to pose, their rotations [b, 3, 3], and what was asked for."""
+    """Transforms of the bones [b, 3, 4] from rest to pose, and what was asked for."""
 
     transforms: np.ndarray
-    rotations: np.ndarray
     stance: str
     gestures: tuple[str, str]
 
@@ -60,7 +59,7 @@ def sample_pose(body: BodyModel, joints: np.ndarray, rng: np.random.Generator, w
         )
     hips = _pose_legs(body, joints, rotations, root, stance, swing, rng)
     transforms = bone_transforms(body.bone_parents, joints, rotations, hips)
-    return Pose(transforms, rotations, stance, gestures)
+    return Pose(transforms, stance, gestures)
 
 
 def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
@@ -204,7 +203,7 @@ def _pose_legs(
     swing: float,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Place the soles on the ground and solve hips and knees in place; return where the root joint goes [3]."""
+    """Place the soles on the ground, solve hips and knees in place; return where the root joint goes [3]."""
     root = joints[body.bone("root")]
     feet = _feet(stance, swing, joints, body, rng)
     ankles, hips, lengths = [], [], []
@@ -277,9 +276,7 @@ def _solve_leg(
     knee = hip + thigh * (np.cos(angle) * line + np.sin(angle) * out / np.linalg.norm(out))
     hinge = np.cross(toward, line)
     rest = [joints[body.bone(n + end)] for n in ("upperleg01", "lowerleg01", "foot")]
-    axis = (
-        np.array([-1.0, 0, 0]) if np.cross([0, 0, 1.0], rest[2] - rest[0])[0] < 0 else np.array([1.0, 0, 0])
-    )
+    axis = np.array([1.0, 0, 0])  # what knees turn about at rest
     upper = _frame(knee - hip, hinge) @ _frame(rest[1] - rest[0], axis).T
     lower = _frame(ankle - knee, hinge) @ _frame(rest[2] - rest[1], axis).T
     for name, rotation in (("upperleg", upper), ("lowerleg", lower)):

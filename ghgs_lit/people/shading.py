@@ -1,9 +1,9 @@
-"""Soft shadows that belong to the surface: how much of the surroundings a point sees past the person's own body.
+"""Soft shadows that belong to the surface: how much of its surroundings a point sees past the person's body.
 
-The body is a set of spheres inside trunk and limbs; what a sphere hides from a surface element is known in closed
-form (the cosine-weighted share of the hemisphere is about cos(angle) (radius / distance)^2). Folds and hollows
-finer than the spheres come from the distance between the surface and its smoothed self. Both are smooth functions
-of the points, unlike an estimate from random rays.
+The body is a set of spheres inside trunk and limbs; what a sphere hides from a surface element is known in
+closed form (about cos(angle) (radius / distance)^2 of its light). Folds and hollows finer than the spheres
+come from the distance between the surface and its smoothed self. Both are smooth functions of the points,
+unlike an estimate from random rays.
 """
 
 import numpy as np

@@ -1,18 +1,20 @@
 """Where a point of the body or of a garment lies: charts of the base mesh, in the average body at rest.
 
-A chart is the part of a surface that shares one texture. Its texels and vertices know their place on the average
-body (`Place`), so that patterns, seams, hems and necklines are functions of the place, the same for every shape.
+A chart is the part of a surface that shares one texture. Its texels and vertices know their place on the
+average body (`Place`), so that patterns, seams, hems and necklines are functions of the place, the same for
+every shape.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
 
 from ghgs_lit.people.body import BodyModel, load_body
-from ghgs_lit.people.meshing import clip, neighbour_mean, rasterise, subdivide, triangles
 from ghgs_lit.people.mesh import TexturedMesh
+from ghgs_lit.people.meshing import clip, neighbour_mean, rasterise, subdivide, triangles
 from ghgs_lit.people.noise import smoothstep
 
 CROTCH = 0.766  # height of the average body's crotch, metres
@@ -28,15 +30,13 @@ class Place:
         point: [n, 3] metres.
         arm: [n] 0 on the trunk, 1 on an arm.
         sleeve: [n] metres from the shoulder joint along the arm; at most 0 on the trunk.
-        leg: [n] metres below the hip joint along the leg.
         side: [n] +1 left, -1 right.
-        trunk_angle, arm_angle, leg_angle: [n] around the axis, 0 in front, positive outwards (trunk: leftwards).
+        trunk_angle, arm_angle, leg_angle: [n] around the axis, 0 in front, positive outwards (trunk: left).
     """
 
     point: np.ndarray
     arm: np.ndarray
     sleeve: np.ndarray
-    leg: np.ndarray
     side: np.ndarray
     trunk_angle: np.ndarray
     arm_angle: np.ndarray
@@ -75,14 +75,14 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
     centre[:, 0] += smoothstep(CROTCH - 0.1, 0.95, folded[:, 1]) * (0.09 - centre[:, 0])
     leg_angle = np.arctan2(folded[:, 0] - centre[:, 0], folded[:, 2] - centre[:, 1])
     trunk_angle = np.arctan2(point[:, 0] / 1.45, point[:, 2] - 0.09)
-    values = (point, arm, sleeve, legs[0][1] - point[:, 1], side, trunk_angle, arm_angle, leg_angle)
+    values = (point, arm, sleeve, side, trunk_angle, arm_angle, leg_angle)
     return Place(*(value.astype(np.float32) for value in values))
 
 
 def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Length along a line of joints and offset from it, for points [n, 3]; beyond its ends it goes on straight."""
+    """Length along a line of joints, and offset from it, of points [n, 3]; its ends go on straight."""
     best, start = None, 0.0
-    for index, (a, b) in enumerate(zip(line[:-1], line[1:], strict=True)):
+    for index, (a, b) in enumerate(pairwise(line)):
         length = np.linalg.norm(b - a)
         direction = (b - a) / length
         t = (points - a) @ direction
@@ -145,7 +145,7 @@ class Chart:
         corner: [c] the point of each textured vertex; faces: [m, 3] and uv: [c, 2] over those.
         place: of the g points; shape: height and width of the texture.
         texels, nearest: covered texels [k], nearest covered one of each texel; texel_place: of the k texels.
-        texel_points, texel_shares: the three points [k, 3] that a texel lies between, and their shares [k, 3].
+        texel_points, texel_shares: the points [k, 3] that a texel lies between, their shares [k, 3].
     """
 
     operator: sparse.csr_matrix
@@ -194,7 +194,7 @@ def _chart(
 ) -> Chart:
     """Build a chart of base-mesh quads [m, 4] with UV numbers [m, 4] into `uv` [t, 2].
 
-    The quads are split `levels` times, the points smoothed `smoothing` times, the skinning weights `blending` times.
+    The quads are split `levels` times, the points smoothed `smoothing`, the weights `blending` times.
     """
     body = load_body()
     used, local = np.unique(quads, return_inverse=True)
@@ -252,17 +252,15 @@ def _cropped(uv: np.ndarray, box: tuple[float, float, float, float]) -> np.ndarr
     return (uv - [left, bottom]) / [right - left, top - bottom]
 
 
-@lru_cache(maxsize=None)
+@cache
 def chart(name: str) -> Chart:
-    """The charts: `head`, `scalp`, `skin`, `eyes`, `upper`, `lower`, `shoes`, `skirt` (built once a process)."""
+    """The charts, built once a process: head, scalp, skin, eyes, upper, lower, skirt, shoes."""
     body = load_body()
     if name in ("head", "skin"):
         surface = body.surfaces["body"]
         uv = _cropped(body.uv, tuple(body.head_uv))
         inside = ((uv > 0) & (uv < 1)).all(1)[surface.uv_quads].all(1)
-        inside &= (
-            body.mean[surface.quads][..., 1].min(1) > 1.38
-        )  # not the fingers, whose island lies close by
+        inside &= body.mean[surface.quads][..., 1].min(1) > 1.38  # the fingers' island lies close by
         if name == "head":
             return _chart(surface.quads[inside], surface.uv_quads[inside], uv, (968, 512))
         return _chart(surface.quads[~inside], surface.uv_quads[~inside], body.uv, (640, 640))
