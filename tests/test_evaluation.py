@@ -26,6 +26,15 @@ from ghgs_lit.types import Gaussians
 OFF = ImageMetrics(lpips="off")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Images this small gain nothing from threads, and lose much where the cores are shared."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
     batch = example_batch(subjects=2, views=3, targets=2)
     rows = measure(ModelMethod(Standin(), flat_renderer), "model", [batch], "midway", OFF, "cpu", tmp_path, 1)
@@ -133,6 +142,8 @@ def ghgs(*arguments: str) -> int:
     os.environ.pop("HYDRA_FULL_ERROR", None)
     try:
         return main()
+    except SystemExit as exit:
+        return exit.code
     finally:
         sys.argv = before
 
@@ -239,7 +250,8 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
         sys.executable, "-m", "ghgs_lit", "train", *data_of(boxes), "trainer=ddp_cpu", "trainer.max_steps=2",
         "evaluation.pictures=0", "evaluation.targets=[release]", f"hydra.run.dir={directory}",
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("wrote ") == 1
     assert [p.name for p in directory.rglob("events*")].__len__() == 1
