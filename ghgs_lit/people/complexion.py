@@ -11,7 +11,7 @@ from ghgs_lit.people.surface import EYE, Chart, chart, face_frame, hairline
 
 SKINS = (
     (0.92, 0.75, 0.65), (0.88, 0.69, 0.57), (0.83, 0.64, 0.50), (0.72, 0.52, 0.38), (0.56, 0.38, 0.27),
-    (0.42, 0.27, 0.19), (0.29, 0.18, 0.13),
+    (0.43, 0.28, 0.20), (0.33, 0.21, 0.155),
 )  # fmt: skip
 IRISES = ((0.28, 0.17, 0.08), (0.20, 0.12, 0.06), (0.35, 0.45, 0.55), (0.33, 0.40, 0.25), (0.45, 0.33, 0.15))
 
@@ -166,7 +166,7 @@ def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.nda
         * (x < 0.030 - 0.6 * np.abs(y - 1.508))
         * (z > 0.19)
     )
-    chin = jaw * smoothstep(0.036, 0.028, x)
+    chin = jaw * (1 - smoothstep(0.8, 1.15, np.hypot(x / 0.032, (y - 1.475) / 0.042)))
     area = {"stubble": jaw, "full": jaw, "goatee": chin, "moustache": 0 * jaw}[look.beard_style]
     area = np.maximum(area, moustache) * (1 - lips)
     density = (0.30 + 0.25 * look.beard if look.beard_style == "stubble" else 0.55 + 0.4 * look.beard) * area

@@ -66,7 +66,7 @@ def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
     """Choose what the left and the right arm do: half the time the same thing."""
     if stance == "walk" and rng.random() < 0.7:
         return "loose", "loose"
-    first = str(rng.choice(EVERYDAY if rng.random() < 0.62 else STRIKING))
+    first = str(rng.choice(EVERYDAY if rng.random() < 0.7 else STRIKING))
     second = first if rng.random() < 0.5 else str(rng.choice(EVERYDAY))
     return (first, second) if rng.random() < 0.5 else (second, first)
 
@@ -187,11 +187,21 @@ def _pose_hand(
     hand = hand @ Rotation.from_rotvec(across * bend).as_matrix()
     for bone in _subtree(body, body.bone("wrist" + end)):
         rotations[bone] = hand
+    along = {
+        f: joints[body.bone(f"{f}-2{end}")] - joints[body.bone(f"{f}-1{end}")] for f in (*FINGERS, "finger1")
+    }
+    along = {finger: way / np.linalg.norm(way) for finger, way in along.items()}
+    middle = np.mean([along[finger] for finger in FINGERS], 0)
+    close = rng.uniform(0.2, 0.9)  # the hand at rest is spread
     for number, finger in enumerate(FINGERS):
         amount = curl * (0.75 + 0.14 * number) + rng.uniform(-0.06, 0.06)
+        sideways = _minimal(along[finger], (1 - close) * along[finger] + close * middle)
         for joint, share in enumerate((0.55, 1.35, 1.7), start=1):
             turn = Rotation.from_rotvec(across * amount * share).as_matrix()
-            rotations[body.bone(f"{finger}-{joint}{end}")] = hand @ turn
+            rotations[body.bone(f"{finger}-{joint}{end}")] = hand @ turn @ sideways
+    thumb = hand @ _minimal(along["finger1"], along["finger1"] + 0.5 * close * middle)
+    for joint in (1, 2, 3):
+        rotations[body.bone(f"finger1-{joint}{end}")] = thumb
 
 
 def _pose_legs(
