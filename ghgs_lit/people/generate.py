@@ -24,13 +24,14 @@ from ghgs_lit.people.surface import Chart, Place, chart
 Spheres = tuple[np.ndarray, np.ndarray]
 HIDDEN = 0.03  # skin and inner layers this far inside an outer garment are left out, metres
 YAW = 30.0  # degrees to either side
-TRIES = 6  # poses drawn before the arms are simply spread
+TRIES = 6  # poses drawn until the arms are clear of the trunk, each with the arms spread further
 
 
 def generate(seed: int, index: int) -> Person:
     """Make person `index` of the family `seed`: the same person on every machine, up to rounding.
 
-    Stands on y = 0 with the feet's centre near the origin, facing +z up to 30 degrees of yaw; metres.
+    Stands on y = 0, the box around the body centred over the origin, facing +z up to 30 degrees of yaw.
+    Metres; adults of 1.52 to 1.87 m, barefoot and upright. Part 0 is the skin; clothes, hair and a cap follow.
 
     Raises:
         InputError: a number is negative.
