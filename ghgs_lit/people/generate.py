@@ -31,7 +31,7 @@ def generate(seed: int, index: int) -> Person:
     """Make person `index` of the family `seed`: the same person on every machine, up to rounding.
 
     Stands on y = 0, the box around the body centred over the origin, facing +z up to 30 degrees of yaw.
-    Metres; adults of 1.52 to 1.87 m, barefoot and upright. Part 0 is the skin; clothes, hair and a cap follow.
+    Metres; adults of 1.52 to 1.87 m, barefoot and upright. Part 0 is the skin; clothes, hair, a cap follow.
 
     Raises:
         InputError: a number is negative.
