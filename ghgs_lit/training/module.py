@@ -87,7 +87,7 @@ class GHGSModule(L.LightningModule):
         return min(max(shares), 1.0)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = self.optimization.build(self.model.parameters())
+        optimizer = self.optimization.build(self.model)
 
         def factor(_: int) -> float:
             self.used_budget = self.progress()
@@ -98,6 +98,7 @@ class GHGSModule(L.LightningModule):
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip to ``optimizer.clip``, log the norm before it, refuse one that is not a number."""
+        self.optimization.drop_held(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip)
         if not torch.isfinite(norm):
             broken = [

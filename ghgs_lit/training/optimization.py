@@ -1,7 +1,7 @@
 """How the weights move: AdamW, a linear schedule over the run's budget, a bound on the gradient."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import nn
@@ -15,7 +15,9 @@ class Optimization:
 
     ``warmup`` is the rise's share of the run; ``start_factor`` and ``end_factor`` are the first and the
     last learning rate as parts of ``lr``; ``clip`` bounds the norm of the gradient. The schedule runs on
-    the share of the budget that is used up, in steps or in time, whichever is further.
+    the share of the budget that is used up, in steps or in time, whichever is further. ``hold`` maps the
+    beginning of parameters' names to the share of the run in which they stay as they are: splats whose
+    depth is still wrong are worth most when they are transparent, and do not come back from there.
     """
 
     lr: float
@@ -26,6 +28,7 @@ class Optimization:
     start_factor: float = 0.04
     end_factor: float = 0.0
     clip: float = 1.0
+    hold: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
         require(self.lr > 0, "optimizer.lr", "a positive number", self.lr)
@@ -38,16 +41,29 @@ class Optimization:
             value = getattr(self, name)
             require(0 <= value <= 1, f"optimizer.{name}", "a share in [0, 1]", value)
         require(self.clip > 0, "optimizer.clip", "a positive gradient norm", self.clip)
+        for prefix, share in self.hold.items():
+            require(0 <= share <= 1, f"optimizer.hold.{prefix}", "a share in [0, 1]", share)
 
-    def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.AdamW:
-        """The optimizer of those parameters that are trained."""
+    def build(self, model: nn.Module) -> torch.optim.AdamW:
+        """The optimizer of those parameters of ``model`` that are trained."""
+        names = [name for name, _ in model.named_parameters()]
+        for prefix in self.hold:
+            known = any(name.startswith(prefix) for name in names)
+            require(known, f"optimizer.hold.{prefix}", "the beginning of a parameter's name", prefix)
         return torch.optim.AdamW(
-            [p for p in parameters if p.requires_grad],
+            [p for p in model.parameters() if p.requires_grad],
             lr=self.lr,
             betas=tuple(self.betas),
             eps=self.eps,
             weight_decay=self.weight_decay,
         )
+
+    def drop_held(self, model: nn.Module, progress: float) -> None:
+        """Take away the gradients of what is held at this share of the run; the optimizer skips those."""
+        held = tuple(prefix for prefix, share in self.hold.items() if progress < share)
+        for name, parameter in model.named_parameters():
+            if held and name.startswith(held):
+                parameter.grad = None
 
     def factor(self, progress: float) -> float:
         """Learning rate as a part of ``lr`` when the share ``progress`` in [0, 1] of the budget is used."""
