@@ -107,6 +107,29 @@ def _summary(found: list[tuple[float, float]]) -> dict:
     }
 
 
+def repeats(count: int, quick: bool) -> dict[str, int]:
+    """Runs of each contender; pure PyTorch takes minutes at 200 000 splats and has no turn there."""
+    slow = 0 if count > 50_000 else 1 if quick else 3
+    return {"ours": 12 if quick else 40, "box": 5 if quick else 12, "torch": slow}
+
+
+def rows_of(count: int, size: int, found: dict[tuple[str, int], dict]) -> list[dict]:
+    """One row for ours with one and with two threads against each peer."""
+    rows = []
+    for threads in (1, 2):
+        own = found["ours", threads]
+        for (peer, peer_threads), other in found.items():
+            if peer == "ours":
+                continue
+            rows.append({
+                "splats": count, "size": size, "threads": threads, "peer": peer, "peer_threads": peer_threads,
+                "forward_ms": own["forward"], "backward_ms": own["backward"], "median_ms": own["median"],
+                "peer_forward_ms": other["forward"], "peer_backward_ms": other["backward"],
+                "ratio": other["total"] / own["total"],
+            })  # fmt: skip
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -114,31 +137,30 @@ def main() -> None:
     )
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     options = parser.parse_args()
-    sizes = (512,) if options.quick else (256, 512, 1024)
     rows = []
-    print("| splats | size | threads | forward ms | backward ms | median ms | peer | peer ms | peer / ours |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for size in sizes:
+    columns = (
+        "splats",
+        "size",
+        "threads",
+        "forward ms",
+        "backward ms",
+        "median ms",
+        "peer (threads)",
+        "peer ms",
+    )
+    print(f"| {' | '.join(columns)} | peer / ours |\n{'|---' * 9}|")
+    for size in (512,) if options.quick else (256, 512, 1024):
         for count in (5_000, 50_000, 200_000):
-            slow = 2 if options.quick or count > 50_000 else 5
-            repeats = {"ours": 10 if options.quick else 30, "box": 4 if options.quick else 10, "torch": slow}
-            found = measure(count, size, repeats)
-            for threads in (1, 2):
-                own = found["ours", threads]
-                for peer, peer_threads in (("box", 1), ("torch", 2)):
-                    other = found[peer, peer_threads]
-                    rows.append({
-                        "splats": count, "size": size, "threads": threads, "peer": peer,
-                        "forward_ms": own["forward"], "backward_ms": own["backward"], "median_ms": own["median"],
-                        "peer_forward_ms": other["forward"], "peer_backward_ms": other["backward"],
-                        "ratio": other["total"] / own["total"],
-                    })  # fmt: skip
-                    print(
-                        f"| {count} | {size} | {threads} | {own['forward']:.2f} | {own['backward']:.2f} | "
-                        f"{own['median']:.2f} | {peer} ({peer_threads} thr.) | {other['total']:.1f} | "
-                        f"{rows[-1]['ratio']:.1f} |",
-                        flush=True,
-                    )
+            found = measure(count, size, repeats(count, options.quick))
+            for row in rows_of(count, size, found):
+                peer_ms = row["peer_forward_ms"] + row["peer_backward_ms"]
+                print(
+                    f"| {count} | {size} | {row['threads']} | {row['forward_ms']:.2f} | {row['backward_ms']:.2f} "
+                    f"| {row['median_ms']:.2f} | {row['peer']} ({row['peer_threads']}) | {peer_ms:.1f} "
+                    f"| {row['ratio']:.1f} |",
+                    flush=True,
+                )
+            rows += rows_of(count, size, found)
     if options.json:
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
         print(f"rows: {options.json}")

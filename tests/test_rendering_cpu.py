@@ -68,7 +68,8 @@ def test_other_constants():
 def test_scenes_of_any_kind(seed, count, size, distance, height, width):
     gaussians = cloud(count, seed, size)
     views = cameras(1, height, width, distance=distance)
-    compare(gaussians, views, image_budget=5e-5, gradient_budget=2e-4, ambiguous_budget=0.1, near=0.05)
+    # Behind alpha = 0.999 the gradient's rounding is divided by 1 - alpha: a thousand times 1e-7 and more.
+    compare(gaussians, views, image_budget=5e-5, gradient_budget=2e-3, ambiguous_budget=0.1, near=0.05)
 
 
 @pytest.mark.parametrize("ratio", [10, 100, 1000, 10000])

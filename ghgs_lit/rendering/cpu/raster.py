@@ -22,15 +22,26 @@ _LEAST_ALPHA = np.float32(1e-10)
 
 
 @helper
-def _inside(transmittance, rows, columns):
+def _grid():
+    """Columns, then rows, of a tile's pixels, block by block."""
+    grid = simd.aligned(2 * layout.PIXELS)
+    for pixel in range(layout.PIXELS):
+        block, lane = pixel // _LANES, pixel % _LANES
+        grid[pixel] = block % 4 * 4 + lane % 4
+        grid[layout.PIXELS + pixel] = block // 4 * 4 + lane // 4
+    return grid
+
+
+@helper
+def _inside(grid, transmittance, rows, columns):
     """Set T to 1 in the first ``rows`` x ``columns`` pixels of the tile, else 0; returns their blocks."""
-    live = 0
+    live, zero, one = 0, simd.full(_ZERO), simd.full(_ONE)
+    bottom, right = simd.full(np.float32(rows)), simd.full(np.float32(columns))
     for block in range(_BLOCKS):
-        y, x = block // 4 * 4, block % 4 * 4
-        for lane in range(_LANES):
-            is_inside = y + lane // 4 < rows and x + lane % 4 < columns
-            transmittance[block * _LANES + lane] = _ONE if is_inside else _ZERO
-        if y < rows and x < columns:
+        at = block * _LANES
+        within = (simd.load(grid, at) < right) & (simd.load(grid, layout.PIXELS + at) < bottom)
+        simd.store(transmittance, at, simd.select(within, one, zero))
+        if simd.bits(within) != 0:
             live |= 1 << block
     return live
 
@@ -60,17 +71,6 @@ def _write(image, first, width, rows, columns, block, value):
     for i in range(y, min(y + 4, rows)):
         for j in range(x, min(x + 4, columns)):
             image[first + i * width + j] = edge[(i - y) * 4 + j - x]
-
-
-@helper
-def _grid():
-    """Columns, then rows, of a tile's pixels, block by block."""
-    grid = simd.aligned(2 * layout.PIXELS)
-    for pixel in range(layout.PIXELS):
-        block, lane = pixel // _LANES, pixel % _LANES
-        grid[pixel] = block % 4 * 4 + lane % 4
-        grid[layout.PIXELS + pixel] = block // 4 * 4 + lane // 4
-    return grid
 
 
 @helper
@@ -126,27 +126,25 @@ def _touched(splat, slope_x, slope_y):
 def _blend(splat, p, q, before, alpha_max, stop):
     """One splat over one block of pixels.
 
-    Returns the unclamped and the clamped alpha, the lanes where the splat is meant to be seen, those
-    where it is, and T behind it. Where T would fall to ``stop`` the splat is left out and T becomes 0,
-    which stops all that follow.
+    Returns the unclamped and the clamped alpha, the lanes that the splat reaches, those where it is
+    seen, those that stay open, and T behind it. Where T would fall to ``stop`` the splat is left out
+    and T becomes 0, which stops all that follow. Lanes are masked by zeros and stored whole: what was
+    written under a mask cannot be forwarded to the next splat's load.
     """
     zero = simd.full(_ZERO)
     squared = simd.fma(p, p, q * q)
-    reached = (squared <= splat[6]) & (before > zero)
+    reached = squared <= splat[6]
     # Lanes out of reach are held at the cutoff: denormals there would be slow.
-    raw = splat[5] * simd.exp2(zero - simd.minimum(squared, splat[6]))
-    alpha = simd.minimum(raw, alpha_max)
+    raw = splat[5] * simd.exp2_minus(simd.minimum(squared, splat[6]))
+    alpha = simd.select(reached, simd.minimum(raw, alpha_max), zero)
     behind = before - before * alpha
-    seen = reached & (behind > stop)
-    left = simd.select(reached, simd.select(seen, behind, zero), before)
-    return raw, alpha, reached, seen, left
+    is_open = behind > stop
+    return raw, alpha, reached, reached & is_open, is_open, simd.select(is_open, behind, zero)
 
 
 @helper
-def _add(planes, position, seen, weight, value):
-    """Add ``weight * value`` in the lanes that see the splat; a value that is not finite stays there."""
-    old = simd.load(planes, position)
-    simd.store(planes, position, simd.select(seen, simd.fma(weight, simd.full(value), old), old))
+def _add(planes, position, value):
+    simd.store(planes, position, simd.load(planes, position) + value)
 
 
 @helper
@@ -154,7 +152,7 @@ def _forward_splat(records, s, colors, n, count, x0, y0, live, grid, planes, tra
     """Add one splat to a tile; returns the blocks it reached and the blocks that are still open."""
     splat, hit = _splat(records, s, x0, y0), 0
     todo = _touched(splat, records[s, layout.SLOPE_X], records[s, layout.SLOPE_Y]) & live
-    depth = records[s, layout.DEPTH]
+    zero, depth = simd.full(_ZERO), simd.full(records[s, layout.DEPTH])
     while todo != 0:
         block = simd.trailing_zeros(todo)
         todo &= todo - 1
@@ -162,18 +160,19 @@ def _forward_splat(records, s, colors, n, count, x0, y0, live, grid, planes, tra
         dx, dy = splat[0] + simd.load(grid, at), splat[1] + simd.load(grid, layout.PIXELS + at)
         p, q = _whiten(splat, dx, dy)
         before = simd.load(transmittance, at)
-        _, alpha, reached, seen, left = _blend(splat, p, q, before, alpha_max, stop)
-        if simd.bits(reached) == 0:
+        _, alpha, reached, seen, is_open, left = _blend(splat, p, q, before, alpha_max, stop)
+        if simd.bits(reached & (before > zero)) == 0:
             continue
         hit |= 1 << block
         simd.store(transmittance, at, left)
-        if simd.bits(left > simd.full(_ZERO)) == 0:
+        if simd.bits(is_open) == 0:
             live &= ~(1 << block)
-        weight = before * alpha
+        weight = simd.select(seen, before * alpha, zero)
         for c in range(simd.length(count)):
-            _add(planes, c * layout.PIXELS + at, seen, weight, colors[n, c])
-        _add(planes, simd.length(count) * layout.PIXELS + at, seen, weight, depth)
-        _add(planes, (simd.length(count) + 1) * layout.PIXELS + at, seen, weight, _ONE)
+            # Where the splat is not seen, a colour that is not finite must not be multiplied by zero.
+            _add(planes, c * layout.PIXELS + at, simd.select(seen, weight * simd.full(colors[n, c]), zero))
+        _add(planes, simd.length(count) * layout.PIXELS + at, weight * depth)
+        _add(planes, (simd.length(count) + 1) * layout.PIXELS + at, weight)
     return hit, live
 
 
@@ -202,7 +201,7 @@ def forward(
     for tile in tiles:
         view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
         planes[:] = _ZERO
-        live = _inside(transmittance, rows, columns)
+        live = _inside(grid, transmittance, rows, columns)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
             hit = 0
             if live != 0:
@@ -279,7 +278,7 @@ def _backward_splat(
         dx, dy = splat[0] + simd.load(grid, at), splat[1] + simd.load(grid, layout.PIXELS + at)
         p, q = _whiten(splat, dx, dy)
         before = simd.load(transmittance, at)
-        raw, alpha, _, seen, left = _blend(splat, p, q, before, alpha_max, stop)
+        raw, alpha, _, seen, _, left = _blend(splat, p, q, before, alpha_max, stop)
         simd.store(transmittance, at, left)
         weight = simd.select(seen, before * alpha, zero)
         d_sum = simd.load(upstream, channels * layout.PIXELS + at)
@@ -290,8 +289,7 @@ def _backward_splat(
             value = simd.fma(slope, simd.full(colors[n, c]), value)
             row = (layout.COLOR + c) * _LANES
             simd.store(sums, row, simd.fma(weight, slope, simd.load(sums, row)))
-        rest = simd.load(suffix, at)
-        rest = simd.select(seen, rest - weight * value, rest)
+        rest = simd.load(suffix, at) - simd.select(seen, weight * value, zero)
         simd.store(suffix, at, rest)
         # dL / d ln(alpha), where alpha is not clamped.
         slope = alpha * (before * value - rest / (one - alpha))
@@ -331,7 +329,7 @@ def backward(
             view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha,
             d_depth, upstream, suffix,
         )  # fmt: skip
-        _inside(transmittance, rows, columns)
+        _inside(grid, transmittance, rows, columns)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
             s, hit, slot = splats[entry], np.int64(hits[entry]), slots[entry] * stride
             if hit == 0:

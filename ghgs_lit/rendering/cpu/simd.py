@@ -229,18 +229,18 @@ _EXP2 = (1.0, 0.69314660, 0.24022166, 0.055510474, 0.0096749520, 0.0013202982)
 
 
 @intrinsic
-def exp2(typing_context, x):
-    """``2^x`` of floats for ``-126 <= x <= 127``, within 2 ulp."""
+def exp2_minus(typing_context, x):
+    """``2^-x`` of floats for ``0 <= x <= 126``, within 2 ulp."""
 
     def emit(context, builder, sig, args):
         whole = _call(builder, "rint", floats, args[0])
-        part = builder.fsub(args[0], whole)
+        part = builder.fsub(whole, args[0])
         result = _constant(floats, _EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
             result = _call(builder, "fmuladd", floats, result, part, _constant(floats, coefficient))
         integers = ir.VectorType(_I32, LANES)
         shift = builder.shl(builder.fptosi(whole, integers), _indices([23] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(result, integers), shift), floats.llvm)
+        return builder.bitcast(builder.sub(builder.bitcast(result, integers), shift), floats.llvm)
 
     return floats(floats), emit
 
