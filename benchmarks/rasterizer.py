@@ -154,12 +154,10 @@ def main() -> None:
             found = measure(count, size, repeats(count, options.quick))
             for row in rows_of(count, size, found):
                 peer_ms = row["peer_forward_ms"] + row["peer_backward_ms"]
-                print(
-                    f"| {count} | {size} | {row['threads']} | {row['forward_ms']:.2f} | {row['backward_ms']:.2f} "
-                    f"| {row['median_ms']:.2f} | {row['peer']} ({row['peer_threads']}) | {peer_ms:.1f} "
-                    f"| {row['ratio']:.1f} |",
-                    flush=True,
-                )
+                numbers = (row["forward_ms"], row["backward_ms"], row["median_ms"])
+                cells = [f"{count}", f"{size}", f"{row['threads']}", *(f"{number:.2f}" for number in numbers)]
+                cells += [f"{row['peer']} ({row['peer_threads']})", f"{peer_ms:.1f}", f"{row['ratio']:.1f}"]
+                print(f"| {' | '.join(cells)} |", flush=True)
             rows += rows_of(count, size, found)
     if options.json:
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")

@@ -94,6 +94,12 @@ def test_inputs_that_do_not_fit():
         render(gaussians, type(views)(skewed, views.extrinsics, 20, 30), "cpu")
 
 
+@pytest.mark.parametrize("region", [(0, 0, 21, 30), (-1, 0, 5, 5), (0, 0, 5), (0.0, 0.0, 5.0, 5.0)])
+def test_regions_that_do_not_fit(region):
+    with pytest.raises(InputError, match="region"):
+        render(cloud(5), cameras(2, 20, 30), "cpu", region=region)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gsplat_draws_the_same_image(antialiased):

@@ -1,7 +1,9 @@
 """The CPU backend against the reference in float64: images, alphas, depths and every gradient."""
 
 import dataclasses
+import importlib.util
 import multiprocessing
+import sys
 import threading
 
 import pytest
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 from rendering_scenes import FIELDS, body, cameras, cloud, compare, error, leaves, one
 
 from ghgs_lit.rendering import RasterSettings, render
+from ghgs_lit.rendering.cpu import compile
 
 NAN, INF = float("nan"), float("inf")
 
@@ -288,6 +291,29 @@ def test_antialiased_splats_without_area_vanish():
     assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
 
 
+@pytest.mark.parametrize(
+    "region", [(5, 9, 20, 30), (0, 0, 45, 70), (16, 16, 16, 16), (44, 3, 1, 2), (4, 4, 0, 9)]
+)
+def test_a_region_is_the_same_image_cut_out(region):
+    gaussians, views = cloud(150, size=0.1), cameras(2, 45, 70)
+    compare(gaussians, views, region=region, background=(0.1, 0.2, 0.7))
+    top, left, height, width = region
+    whole, part = (render(gaussians, views, "cpu", region=box) for box in (None, region))
+    box = (..., slice(top, top + height), slice(left, left + width))
+    for name in ("image", "alpha", "depth"):
+        wanted = torch.zeros_like(getattr(whole, name))
+        wanted[box] = getattr(whole, name)[box]
+        assert torch.equal(getattr(part, name), wanted)
+
+
+def test_a_region_for_each_view():
+    gaussians, views = cloud(100, size=0.1, splits=(60, 40)), cameras(2, 30, 40, batch=2)
+    boxes = torch.tensor([[[0, 0, 10, 10], [5, 5, 20, 30]], [[1, 2, 0, 0], [0, 0, 30, 40]]])
+    compare(gaussians, views, region=boxes)
+    alone = render(gaussians[1], views[1:, 1:], "cpu")
+    assert torch.equal(render(gaussians, views, "cpu", region=boxes).image[1, 1], alone.image[0, 0])
+
+
 def test_inputs_of_any_layout_and_dtype():
     plain, views = cloud(40), cameras(1, 24, 24)
     wanted = render(plain, views, "cpu").image
@@ -366,3 +392,48 @@ def test_after_a_fork():
     found = [queue.get(timeout=60) for _ in children]
     [child.join(timeout=60) for child in children]
     assert found == [wanted, wanted]
+
+
+class _Renderings(torch.utils.data.Dataset):
+    def __len__(self):
+        return 8
+
+    def __getitem__(self, index):
+        gaussians = leaves(body(500, 32, seed=index))
+        image = render(gaussians, cameras(1, 32, 32), "cpu").image
+        image.square().sum().backward()
+        return image.detach(), gaussians.means.grad
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+def test_training_in_four_workers_of_a_data_loader():
+    torch.set_num_threads(2)
+    wanted = [_Renderings()[index] for index in range(8)]
+    loader = torch.utils.data.DataLoader(
+        _Renderings(), batch_size=None, num_workers=4, multiprocessing_context="fork", timeout=60
+    )
+    for found, (image, gradient) in zip(loader, wanted, strict=True):
+        assert torch.equal(found[0], image)
+        assert torch.equal(found[1], gradient)
+
+
+def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
+    """A kernel cached under one digest is compiled anew under another, and found again under its own."""
+    source = tmp_path / "scaled.py"
+    source.write_text(
+        "from ghgs_lit.rendering.cpu import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
+    )
+
+    def hits(digest):
+        original, compile._DIGEST = compile._DIGEST, digest
+        try:
+            spec = importlib.util.spec_from_file_location("scaled", source)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules["scaled"] = module
+            spec.loader.exec_module(module)
+            assert module.double(2) == 4
+            return sum(module.double.stats.cache_hits.values())
+        finally:
+            compile._DIGEST = original
+
+    assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
@@ -29,6 +29,7 @@ def render(
     near: float = 0.01,
     far: float = 1e10,
     settings: RasterSettings | None = None,
+    region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
 ) -> Rendering:
     """Images [B, T, C, h, w], alphas and depths of ``B`` sets of Gaussians from cameras [B, T].
 
@@ -39,6 +40,8 @@ def render(
     means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
     ``background``: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
     ``near`` and ``far`` in metres: only Gaussians whose centre has ``near <= z <= far`` are seen.
+    ``region``: the box (top, left, height, width) in pixels that is wanted, one for all or one for each
+    view; what lies outside is background, has no gradient, and costs the CPU backend nothing.
     ``depth`` is the expectation ``sum(w z) / max(sum(w), 1e-10)``, 0 where nothing is seen.
 
     Zero quaternions are identity; a Gaussian with a NaN in its geometry or opacity is not seen.
@@ -52,7 +55,13 @@ def render(
     gaussians = _wide_gaussians(gaussians)
     cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        rendering = module.rasterize(gaussians, cameras, settings, float(near), float(far))
+        options = (settings, float(near), float(far))
+        regions = None if region is None else _regions(region, cameras)
+        if backend == "cpu":
+            rendering = module.rasterize(gaussians, cameras, *options, regions)
+        else:
+            rendering = module.rasterize(gaussians, cameras, *options)
+            rendering = rendering if regions is None else _cut(rendering, regions)
         if _is_finite(background) and background == 0:
             return rendering
         behind = (1 - rendering.alpha) * _background(background, rendering.image)
@@ -107,11 +116,17 @@ class Renderer:
         self.settings = RasterSettings(**settings)
 
     def __call__(
-        self, gaussians: Gaussians, cameras: Cameras, background: Background | None = None
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        background: Background | None = None,
+        region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
     ) -> Rendering:
         """Render; ``background`` replaces the configured one. See :func:`render`."""
         background = self.background if background is None else background
-        return render(gaussians, cameras, self.backend, background, self.near, self.far, self.settings)
+        return render(
+            gaussians, cameras, self.backend, background, self.near, self.far, self.settings, region
+        )
 
 
 def _is_finite(value: object) -> bool:
@@ -179,3 +194,28 @@ def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Te
         )
         return tensor[:, None, None]
     return tensor
+
+
+def _regions(region: Sequence[int] | Tensor, cameras: Cameras) -> Int[Tensor, "B T 4"]:
+    """One box (top, left, height, width) inside the image for each view."""
+    expected = "(top, left, height, width) inside the image, one box or [B, T, 4]"
+    boxes = torch.as_tensor(region)
+    is_whole = not boxes.is_floating_point() and not boxes.is_complex()
+    require(is_whole and boxes.shape in ((4,), (*cameras.shape, 4)), "region", expected, region)
+    top, left, height, width = boxes.unbind(-1)
+    fits = (top >= 0) & (left >= 0) & (height >= 0) & (width >= 0)
+    fits &= (top + height <= cameras.height) & (left + width <= cameras.width)
+    require(bool(fits.all()), "region", expected, region)
+    return boxes.expand(*cameras.shape, 4)
+
+
+def _cut(rendering: Rendering, regions: Int[Tensor, "B T 4"]) -> Rendering:
+    """Nothing but the regions of a rendering on black."""
+    device = rendering.image.device
+    rows = torch.arange(rendering.image.shape[-2], device=device)[:, None]
+    columns = torch.arange(rendering.image.shape[-1], device=device)
+    top, left, height, width = regions.to(device)[..., None, None].unbind(2)
+    inside = (rows >= top) & (rows < top + height) & (columns >= left) & (columns < left + width)
+    inside = inside[:, :, None]
+    values = {f.name: getattr(rendering, f.name) for f in dataclasses.fields(rendering)}
+    return Rendering(**{name: torch.where(inside, value, 0) for name, value in values.items()})

@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from ghgs_lit.rendering.cpu import binning, gradients, layout, pool, projection, raster, simd
@@ -18,14 +19,21 @@ _COLORS = 3
 
 
 def rasterize(
-    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
+    gaussians: Gaussians,
+    cameras: Cameras,
+    settings: RasterSettings,
+    near: float,
+    far: float,
+    regions: Int[Tensor, "B T 4"] | None = None,
 ) -> Rendering:
     """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
+
+    Outside of ``regions`` (top, left, height, width) nothing is drawn, nor computed.
 
     Differentiable in the Gaussians, not in the cameras. The same bits with any number of threads.
     """
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-    plan = _Plan.of(gaussians, cameras, settings, near, far)
+    plan = _Plan.of(gaussians, cameras, settings, near, far, regions)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
 
 
@@ -44,10 +52,10 @@ class _Plan:
     far: float
 
     @classmethod
-    def of(cls, gaussians, cameras, settings, near, far) -> "_Plan":
+    def of(cls, gaussians, cameras, settings, near, far, regions) -> "_Plan":
         splits, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
         return cls(
-            views=_view_rows(cameras, settings),
+            views=_view_rows(cameras, settings, regions),
             first_gaussians=np.repeat(np.cumsum(splits) - splits, views_each),
             counts=np.repeat(splits, views_each),
             shape=tuple(cameras.shape),
@@ -68,7 +76,7 @@ class _Plan:
         return np.float32(self.settings.alpha_max), np.float32(self.settings.stop)
 
 
-def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
+def _view_rows(cameras: Cameras, settings: RasterSettings, regions: Tensor | None) -> np.ndarray:
     """The cameras as rows of ``layout.VIEW`` doubles."""
     intrinsics = cameras.intrinsics.detach().double().flatten(0, -3).numpy()
     extrinsics = cameras.extrinsics.detach().double().flatten(0, -3).numpy()
@@ -79,6 +87,11 @@ def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
         margin = settings.frustum_margin * 0.5 * size / focal
         rows[:, layout.FX + axis], rows[:, layout.CX + axis] = focal, center
         rows[:, low], rows[:, low + 1] = -center / focal - margin, (size - center) / focal + margin
+    rows[:, layout.RIGHT], rows[:, layout.BOTTOM] = cameras.width - 1, cameras.height - 1
+    if regions is not None:
+        top, left, height, width = regions.cpu().double().flatten(0, -2).numpy().T
+        rows[:, layout.LEFT], rows[:, layout.RIGHT] = left, left + width - 1
+        rows[:, layout.TOP], rows[:, layout.BOTTOM] = top, top + height - 1
     rows[:, layout.ROTATION : layout.ROTATION + 9] = extrinsics[:, :3, :3].reshape(-1, 9)
     rows[:, layout.TRANSLATION : layout.TRANSLATION + 3] = extrinsics[:, :3, 3]
     return rows
@@ -121,7 +134,7 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
     def project(v: int) -> None:
         seen[v] = projection.project(
             plan.views[v], shared, stride, starts[v], plan.counts[v], shifts[v], plan.near, plan.far,
-            settings.low_pass, settings.extent, settings.antialiased, plan.height, plan.width, records,
+            settings.low_pass, settings.extent, settings.antialiased, tiles_x, records,
             depths, rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
         )  # fmt: skip
 
@@ -172,7 +185,8 @@ class _Rasterize(torch.autograd.Function):
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
             partial(
-                raster.forward, tiles, *plan.tiles, *size, found.tile_starts, found.splats, found.shifts,
+                raster.forward, tiles, *plan.tiles, *size, plan.views,
+                found.tile_starts, found.splats, found.shifts,
                 found.records, arrays[4], _channels(channels), *plan.constants, found.hits, *outputs,
             )
             for tiles in _tile_runs(found.tile_starts)
@@ -195,7 +209,8 @@ class _Rasterize(torch.autograd.Function):
         arrays = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
         pool.run([
             partial(
-                raster.backward, tiles, *plan.tiles, plan.height, plan.width, found.tile_starts, found.splats,
+                raster.backward, tiles, *plan.tiles, plan.height, plan.width, plan.views,
+                found.tile_starts, found.splats,
                 found.slots, found.shifts, found.records, colors, _channels(colors.shape[1]), *plan.constants,
                 found.hits, *arrays, entries,
             )

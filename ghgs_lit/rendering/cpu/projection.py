@@ -47,8 +47,8 @@ def share(means, quaternions, scales, opacities, first, last, alpha_min, stride,
 
 
 @helper
-def _project_vector(view, shared, stride, n, near, far, low_pass, extent, antialiased, height, width, rows):
-    """Project Gaussians ``n`` to ``n + 8`` into ``rows``; returns those that touch the image, as bits."""
+def _project_vector(view, shared, stride, n, near, far, low_pass, extent, antialiased, rows):
+    """Project Gaussians ``n`` to ``n + 8`` into ``rows``; returns those that touch wanted pixels, as bits."""
     one, half, zero = simd.full(1.0), simd.full(0.5), simd.full(0.0)
     low_pass, limit = simd.full(low_pass), simd.full(_FAR)
     x, y, z, inverse = geometry.camera_points(view, shared, stride, n)
@@ -79,11 +79,11 @@ def _project_vector(view, shared, stride, n, near, far, low_pass, extent, antial
     reach = simd.full(2.0 / geometry.TO_LOG2) * cutoff
     half_width = simd.minimum(simd.root(reach * a), limit)
     half_height = simd.minimum(simd.root(reach * c), limit)
-    # Pixels whose centres lie in the box, clamped before they become integers.
-    left = simd.maximum(zero - simd.floor(half - (u - half_width)), zero)
-    right = simd.minimum(simd.floor(u + half_width - half), simd.full(width - 1.0))
-    top = simd.maximum(zero - simd.floor(half - (v - half_height)), zero)
-    bottom = simd.minimum(simd.floor(v + half_height - half), simd.full(height - 1.0))
+    # Wanted pixels whose centres lie in the box, clamped before they become integers.
+    left = simd.maximum(zero - simd.floor(half - (u - half_width)), simd.full(view[layout.LEFT]))
+    right = simd.minimum(simd.floor(u + half_width - half), simd.full(view[layout.RIGHT]))
+    top = simd.maximum(zero - simd.floor(half - (v - half_height)), simd.full(view[layout.TOP]))
+    bottom = simd.minimum(simd.floor(v + half_height - half), simd.full(view[layout.BOTTOM]))
     visible = visible & (left <= right) & (top <= bottom)
     k_yy = simd.full(geometry.K_SCALE) * simd.root(a / determinant)
     inverse_a = one / a
@@ -109,20 +109,19 @@ def _project_vector(view, shared, stride, n, near, far, low_pass, extent, antial
 
 @kernel
 def project(
-    view, shared, stride, start, count, shift, near, far, low_pass, extent, antialiased, height, width,
-    records, depths, rects, tile_counts,
+    view, shared, stride, start, count, shift, near, far, low_pass, extent, antialiased, tiles_x, records,
+    depths, rects, tile_counts,
 ):  # fmt: skip
     """Splats ``start`` to ``start + count`` of one view; returns how many are seen.
 
     Fills ``records``; ``rects`` [M, 4] with the tiles touched (left, right, top, bottom; empty if unseen);
     ``depths`` with their float32 depth; adds to ``tile_counts`` [tiles] of this view.
     """
-    tiles_x = (width + layout.TILE - 1) // layout.TILE
     rows = np.empty(_ROWS * _WIDE)
     seen = 0
     for s in range(start, start + count, _WIDE):
         visible = _project_vector(
-            view, shared, stride, s + shift, near, far, low_pass, extent, antialiased, height, width, rows
+            view, shared, stride, s + shift, near, far, low_pass, extent, antialiased, rows
         )
         for lane in range(min(_WIDE, start + count - s)):
             m = s + lane

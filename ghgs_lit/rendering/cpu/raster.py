@@ -33,13 +33,17 @@ def _grid():
 
 
 @helper
-def _inside(grid, transmittance, rows, columns):
-    """Set T to 1 in the first ``rows`` x ``columns`` pixels of the tile, else 0; returns their blocks."""
+def _open(views, view, x0, y0, grid, transmittance):
+    """Set T to 1 in the pixels of a tile that are wanted, else 0; returns their blocks."""
     live, zero, one = 0, simd.full(_ZERO), simd.full(_ONE)
-    bottom, right = simd.full(np.float32(rows)), simd.full(np.float32(columns))
+    left, right = views[view, layout.LEFT] - x0, views[view, layout.RIGHT] - x0
+    top, bottom = views[view, layout.TOP] - y0, views[view, layout.BOTTOM] - y0
+    left, right = simd.full(np.float32(left)), simd.full(np.float32(right))
+    top, bottom = simd.full(np.float32(top)), simd.full(np.float32(bottom))
     for block in range(_BLOCKS):
         at = block * _LANES
-        within = (simd.load(grid, at) < right) & (simd.load(grid, layout.PIXELS + at) < bottom)
+        x, y = simd.load(grid, at), simd.load(grid, layout.PIXELS + at)
+        within = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
         simd.store(transmittance, at, simd.select(within, one, zero))
         if simd.bits(within) != 0:
             live |= 1 << block
@@ -187,8 +191,8 @@ def _place(tile, tiles_x, tiles_y, height, width):
 
 @kernel
 def forward(
-    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, shifts, records, colors, count, alpha_max,
-    stop, hits, image, alpha, depth,
+    tiles, tiles_x, tiles_y, height, width, views, tile_starts, splats, shifts, records, colors, count,
+    alpha_max, stop, hits, image, alpha, depth,
 ):  # fmt: skip
     """Blend the given ``tiles`` into flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
 
@@ -201,7 +205,7 @@ def forward(
     for tile in tiles:
         view, x0, y0, rows, columns, first = _place(tile, tiles_x, tiles_y, height, width)
         planes[:] = _ZERO
-        live = _inside(grid, transmittance, rows, columns)
+        live = _open(views, view, x0, y0, grid, transmittance)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
             hit = 0
             if live != 0:
@@ -308,7 +312,8 @@ def _backward_splat(
 
 @kernel
 def backward(
-    tiles, tiles_x, tiles_y, height, width, tile_starts, splats, slots, shifts, records, colors, count,
+    tiles, tiles_x, tiles_y, height, width, views, tile_starts, splats, slots, shifts,
+    records, colors, count,
     alpha_max, stop, hits, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
     """Gradients of every entry of the given ``tiles`` into ``gradients`` [entries x gradient_width].
@@ -329,7 +334,7 @@ def backward(
             view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha,
             d_depth, upstream, suffix,
         )  # fmt: skip
-        _inside(grid, transmittance, rows, columns)
+        _open(views, view, x0, y0, grid, transmittance)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
             s, hit, slot = splats[entry], np.int64(hits[entry]), slots[entry] * stride
             if hit == 0:
