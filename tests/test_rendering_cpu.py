@@ -406,6 +406,7 @@ class _Renderings(torch.utils.data.Dataset):
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
 def test_training_in_four_workers_of_a_data_loader():
     torch.set_num_threads(2)
     wanted = [_Renderings()[index] for index in range(8)]

@@ -64,12 +64,13 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
         return nothing.float() * torch.zeros(
             cameras.shape[0], channels + 2, cameras.height, cameras.width, device=gaussians.means.device
         )
+    safe = _safe(gaussians)
     values, alpha, _ = rasterization(
-        means=gaussians.means.float(),
-        quats=_safe_quaternions(gaussians.quaternions.float()),
-        scales=gaussians.scales.float(),
-        opacities=gaussians.opacities.float(),
-        colors=gaussians.colors.float(),
+        means=safe.means,
+        quats=safe.quaternions,
+        scales=safe.scales,
+        opacities=safe.opacities,
+        colors=safe.colors,
         viewmats=cameras.extrinsics.float(),
         Ks=cameras.intrinsics.float(),
         width=cameras.width,
@@ -84,11 +85,25 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
     return torch.cat((values, alpha), dim=-1).permute(0, 3, 1, 2)
 
 
-def _safe_quaternions(quaternions: Tensor) -> Tensor:
-    """Unit quaternions of any non-zero norm, identity for zero: gsplat squares components in float32."""
+def _safe(gaussians: Gaussians) -> Gaussians:
+    """Float32 Gaussians that gsplat draws as this project defines them.
+
+    Its kernels square quaternions in float32 and do not expect what is not a number: norms become one,
+    the zero quaternion identity, and a Gaussian with a geometry or opacity that is not finite invisible.
+    """
+    means, scales, opacities = gaussians.means.float(), gaussians.scales.float(), gaussians.opacities.float()
+    quaternions = gaussians.quaternions.float()
+    geometry = torch.cat((means, quaternions, scales, opacities[:, None]), dim=-1)
+    is_sound = geometry.isfinite().all(-1)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], device=means.device)
     largest = quaternions.abs().amax(-1, keepdim=True).detach()
-    is_zero = largest == 0
-    scaled = quaternions / torch.where(is_zero, torch.ones_like(largest), largest)
-    identity = torch.zeros_like(scaled)
-    identity[:, 0] = 1
-    return torch.nn.functional.normalize(torch.where(is_zero, identity, scaled), dim=-1)
+    is_turned = is_sound[:, None] & (largest > 0)
+    scaled = torch.where(is_turned, quaternions, identity) / torch.where(is_turned, largest, 1)
+    return Gaussians(
+        means=torch.where(is_sound[:, None], means, 0),
+        quaternions=torch.nn.functional.normalize(scaled, dim=-1),
+        scales=torch.where(is_sound[:, None], scales, 1),
+        opacities=torch.where(is_sound, opacities, 0),
+        colors=gaussians.colors.float(),
+        splits=gaussians.splits,
+    )

@@ -138,8 +138,8 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
             depths, rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
         )  # fmt: skip
 
-    pool.run([partial(share, *part) for part in _parts(0, len(means))])
-    pool.run([partial(project, v) for v in range(views)])
+    pool.run([partial(share, *part) for part in _parts(0, len(means))], len(means) // 8)
+    pool.run([partial(project, v) for v in range(views)], total)
     tile_starts = np.cumsum(tile_counts)
     entry_starts = np.zeros(total + 1, np.int64)
     np.cumsum((rects[:, 1] - rects[:, 0]) * (rects[:, 3] - rects[:, 2]), out=entry_starts[1:])
@@ -151,7 +151,7 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
             splats, slots,
         )  # fmt: skip
 
-    pool.run([partial(scatter, v) for v in range(views)])
+    pool.run([partial(scatter, v) for v in range(views)], len(splats))
     hits = np.empty(len(splats), np.uint16)
     return _Splats(shifts, shared, stride, records, rects, entry_starts, tile_starts, splats, slots, hits)
 
@@ -190,7 +190,7 @@ class _Rasterize(torch.autograd.Function):
                 found.records, arrays[4], _channels(channels), *plan.constants, found.hits, *outputs,
             )
             for tiles in _tile_runs(found.tile_starts)
-        ])  # fmt: skip
+        ], len(found.splats))  # fmt: skip
         ctx.save_for_backward(means, quaternions, scales, opacities, colors, image, alpha, depth)
         ctx.set_materialize_grads(False)
         ctx.plan, ctx.found = plan, found
@@ -215,7 +215,7 @@ class _Rasterize(torch.autograd.Function):
                 found.hits, *arrays, entries,
             )
             for tiles in _tile_runs(found.tile_starts)
-        ])  # fmt: skip
+        ], len(found.splats))  # fmt: skip
         results = [torch.zeros_like(t) for t in inputs]
         views_each = plan.shape[1]
         tasks = [
@@ -227,7 +227,7 @@ class _Rasterize(torch.autograd.Function):
             for first_view in range(0, len(plan.views), max(1, views_each))
             for part in _parts(int(plan.first_gaussians[first_view]), int(plan.counts[first_view]))
         ]  # fmt: skip
-        pool.run(tasks)
+        pool.run(tasks, len(found.splats) // 2)
         return *results, None
 
 

@@ -7,6 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
+# Splats or entries that are worth another thread: about a millisecond's.
+_GRAIN = 8192
+
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
 _owner: tuple[int, int] | None = None
@@ -32,9 +35,12 @@ def _workers(count: int) -> ThreadPoolExecutor:
         return _pool
 
 
-def run(tasks: list) -> None:
-    """Call every task, on at most ``torch.get_num_threads()`` threads, the caller's among them."""
-    helpers = min(torch.get_num_threads(), len(tasks)) - 1
+def run(tasks: list, work: int) -> None:
+    """Call every task, on at most ``torch.get_num_threads()`` threads, the caller's among them.
+
+    ``work`` counts the splats or entries that the tasks handle: for a few, no thread is woken.
+    """
+    helpers = min(torch.get_num_threads(), len(tasks), 1 + work // _GRAIN) - 1
     queue = deque(tasks)
 
     def drain() -> None:
