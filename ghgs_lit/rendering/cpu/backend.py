@@ -180,8 +180,7 @@ class _Rasterize(torch.autograd.Function):
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities, colors)]
         found = _prepare(plan, *arrays[:4])
         channels, size = colors.shape[1], (plan.height, plan.width)
-        image = torch.zeros(*plan.shape, channels, *size)
-        alpha, depth = torch.zeros(*plan.shape, 1, *size), torch.zeros(*plan.shape, 1, *size)
+        image, alpha, depth = (_zeros(*plan.shape, planes, *size) for planes in (channels, 1, 1))
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
             partial(
@@ -205,7 +204,7 @@ class _Rasterize(torch.autograd.Function):
         width = layout.gradient_width(colors.shape[1])
         # PyTorch's memory starts on a cache line, as the kernels need it.
         entries = torch.empty(len(found.splats) * width).numpy()
-        d_image = torch.zeros_like(image) if d_image is None else d_image
+        d_image = _zeros(*image.shape) if d_image is None else d_image
         arrays = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
         pool.run([
             partial(
@@ -216,7 +215,7 @@ class _Rasterize(torch.autograd.Function):
             )
             for tiles in _tile_runs(found.tile_starts)
         ], len(found.splats))  # fmt: skip
-        results = [torch.zeros_like(t) for t in inputs]
+        results = [_zeros(*t.shape) for t in inputs]
         views_each = plan.shape[1]
         tasks = [
             partial(
@@ -229,6 +228,11 @@ class _Rasterize(torch.autograd.Function):
         ]  # fmt: skip
         pool.run(tasks, len(found.splats) // 2)
         return *results, None
+
+
+def _zeros(*shape: int) -> Tensor:
+    """Zeros by NumPy: the operating system's own, where PyTorch would wake its threads to write them."""
+    return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def _flat(tensor: Tensor | None) -> np.ndarray:
