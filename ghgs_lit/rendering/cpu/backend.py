@@ -184,9 +184,9 @@ class _Rasterize(torch.autograd.Function):
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
             partial(
-                raster.forward, tiles, *plan.tiles, *size, plan.views,
-                found.tile_starts, found.splats, found.shifts,
-                found.records, arrays[4], _channels(channels), *plan.constants, found.hits, *outputs,
+                raster.forward, tiles, *plan.tiles, *size, plan.views, found.tile_starts, found.splats,
+                found.shifts, found.records, arrays[4], _channels(channels), *plan.constants, found.hits,
+                *outputs,
             )
             for tiles in _tile_runs(found.tile_starts)
         ], len(found.splats))  # fmt: skip
@@ -208,10 +208,9 @@ class _Rasterize(torch.autograd.Function):
         arrays = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
         pool.run([
             partial(
-                raster.backward, tiles, *plan.tiles, plan.height, plan.width, plan.views,
-                found.tile_starts, found.splats,
-                found.slots, found.shifts, found.records, colors, _channels(colors.shape[1]), *plan.constants,
-                found.hits, *arrays, entries,
+                raster.backward, tiles, *plan.tiles, plan.height, plan.width, plan.views, found.tile_starts,
+                found.splats, found.slots, found.shifts, found.records, colors, _channels(colors.shape[1]),
+                *plan.constants, found.hits, *arrays, entries,
             )
             for tiles in _tile_runs(found.tile_starts)
         ], len(found.splats))  # fmt: skip

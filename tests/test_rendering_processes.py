@@ -1,0 +1,117 @@
+"""The CPU backend among threads, processes and cached machine code."""
+
+import importlib.util
+import multiprocessing
+import sys
+import threading
+
+import pytest
+import torch
+from rendering_scenes import FIELDS, body, cameras, leaves
+
+from ghgs_lit.rendering import render
+from ghgs_lit.rendering.cpu import compile
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_the_same_bits_with_one_and_two_threads():
+    def run():
+        gaussians = leaves(body(3000, 64))
+        rendering = render(gaussians, cameras(3, 64, 64), "cpu")
+        (rendering.image.square().sum() + rendering.depth.sum()).backward()
+        return [rendering.image.detach(), *(getattr(gaussians, name).grad for name in FIELDS)]
+
+    first = run()
+    torch.set_num_threads(2)
+    assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
+
+
+def test_two_threads_of_the_caller_at_once():
+    torch.set_num_threads(2)
+    gaussians, views = body(2000, 48), cameras(2, 48, 48)
+    wanted = render(gaussians, views, "cpu").image
+    found = []
+
+    def work():
+        for _ in range(5):
+            leaf = leaves(gaussians)
+            rendering = render(leaf, views, "cpu")
+            rendering.image.sum().backward()
+            found.append(rendering.image.detach())
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    [thread.start() for thread in threads]
+    [thread.join(timeout=60) for thread in threads]
+    assert len(found) == 10
+    assert all(torch.equal(image, wanted) for image in found)
+
+
+def _render_in_child(queue):
+    torch.set_num_threads(2)
+    queue.put(float(render(body(500, 32), cameras(2, 32, 32), "cpu").image.sum()))
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+def test_after_a_fork():
+    torch.set_num_threads(2)
+    wanted = float(render(body(500, 32), cameras(2, 32, 32), "cpu").image.sum())
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    children = [context.Process(target=_render_in_child, args=(queue,)) for _ in range(2)]
+    [child.start() for child in children]
+    found = [queue.get(timeout=60) for _ in children]
+    [child.join(timeout=60) for child in children]
+    assert found == [wanted, wanted]
+
+
+class _Renderings(torch.utils.data.Dataset):
+    def __len__(self):
+        return 8
+
+    def __getitem__(self, index):
+        gaussians = leaves(body(500, 32, seed=index))
+        image = render(gaussians, cameras(1, 32, 32), "cpu").image
+        image.square().sum().backward()
+        return image.detach(), gaussians.means.grad
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
+def test_training_in_four_workers_of_a_data_loader():
+    torch.set_num_threads(2)
+    wanted = [_Renderings()[index] for index in range(8)]
+    loader = torch.utils.data.DataLoader(
+        _Renderings(), batch_size=None, num_workers=4, multiprocessing_context="fork", timeout=60
+    )
+    for found, (image, gradient) in zip(loader, wanted, strict=True):
+        assert torch.equal(found[0], image)
+        assert torch.equal(found[1], gradient)
+
+
+def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
+    """A kernel cached under one digest is compiled anew under another, and found again under its own."""
+    source = tmp_path / "scaled.py"
+    source.write_text(
+        "from ghgs_lit.rendering.cpu import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
+    )
+
+    def hits(digest):
+        original, compile._DIGEST = compile._DIGEST, digest
+        try:
+            spec = importlib.util.spec_from_file_location("scaled", source)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules["scaled"] = module
+            spec.loader.exec_module(module)
+            assert module.double(2) == 4
+            return sum(module.double.stats.cache_hits.values())
+        finally:
+            compile._DIGEST = original
+
+    assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]
