@@ -2,10 +2,13 @@
 
 import numpy as np
 
+from ghgs_lit.rendering.cpu import simd
 from ghgs_lit.rendering.cpu.compile import helper, kernel
 
 _DIGIT = 11
 _BUCKETS = 1 << _DIGIT
+# Splats between asking for one's rectangle and reading it: in depth order they lie anywhere.
+_AHEAD = 16
 
 
 @helper
@@ -59,7 +62,11 @@ def scatter(depths, rects, start, count, seen, tiles_x, tile_starts, first_tile,
     for s in range(start, start + count):
         tiles = max(tiles, rects[s, 3])
     next_free = tile_starts[first_tile : first_tile + tiles * tiles_x].copy()
-    for s in order:
+    for i in range(len(order)):
+        later = order[min(i + _AHEAD, len(order) - 1)]
+        simd.prefetch(rects, later * 4)
+        simd.prefetch(entry_starts, later)
+        s = order[i]
         slot = entry_starts[s]
         for y in range(rects[s, 2], rects[s, 3]):
             for x in range(rects[s, 0], rects[s, 1]):

@@ -16,6 +16,8 @@ from ghgs_lit.rendering.cpu.compile import helper, kernel
 
 _LANES = simd.LANES
 _BLOCKS = layout.PIXELS // _LANES
+# Entries between asking for a splat and drawing it.
+_AHEAD = 8
 _ZERO, _ONE = np.float32(0), np.float32(1)
 # Gradients of the expected depth end where alpha does: its denominator is held at this.
 _LEAST_ALPHA = np.float32(1e-10)
@@ -189,6 +191,14 @@ def _place(tile, tiles_x, tiles_y, height, width):
     return view, x0, y0, rows, columns, y0 * width + x0
 
 
+@helper
+def _prefetch(splats, entry, end, shift, records, colors):
+    """Ask for what a later entry needs: a tile's splats may lie anywhere in memory."""
+    s = splats[min(entry + _AHEAD, end - 1)]
+    simd.prefetch(records, s * layout.RECORD)
+    simd.prefetch(colors, (s + shift) * colors.shape[1])
+
+
 @kernel
 def forward(
     tiles, tiles_x, tiles_y, height, width, views, tile_starts, splats, shifts, records, colors, count,
@@ -209,6 +219,7 @@ def forward(
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
             hit = 0
             if live != 0:
+                _prefetch(splats, entry, tile_starts[tile + 1], shifts[view], records, colors)
                 s = splats[entry]
                 hit, live = _forward_splat(
                     records, s, colors, s + shifts[view], count, x0, y0, live, grid, planes, transmittance,
@@ -336,6 +347,8 @@ def backward(
         )  # fmt: skip
         _open(views, view, x0, y0, grid, transmittance)
         for entry in range(tile_starts[tile], tile_starts[tile + 1]):
+            _prefetch(splats, entry, tile_starts[tile + 1], shifts[view], records, colors)
+            simd.prefetch(gradients, slots[min(entry + _AHEAD, tile_starts[tile + 1] - 1)] * stride)
             s, hit, slot = splats[entry], np.int64(hits[entry]), slots[entry] * stride
             if hit == 0:
                 for k in range(0, stride, _LANES):

@@ -161,6 +161,23 @@ def store(typing_context, array, index, value):
 
 
 @intrinsic
+def prefetch(typing_context, array, index):
+    """Ask for the cache line of element ``index`` of a contiguous array, counted in its flat order."""
+
+    def emit(context, builder, sig, args):
+        data = context.make_array(array)(context, builder, args[0]).data
+        position = context.cast(builder, args[1], index, types.intp)
+        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), _I32, _I32, _I32])
+        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        address = builder.bitcast(builder.gep(data, [position]), ir.IntType(8).as_pointer())
+        # For reading, into all levels, as data.
+        builder.call(callee, [address, ir.Constant(_I32, 0), ir.Constant(_I32, 3), ir.Constant(_I32, 1)])
+        return context.get_dummy_value()
+
+    return types.void(array, index), emit
+
+
+@intrinsic
 def fma(typing_context, a, b, c):
     """``a * b + c``, fused where the machine can."""
     return a(a, a, a), lambda context, builder, sig, args: _call(builder, "fmuladd", a, *args)
