@@ -44,6 +44,12 @@ class GHGS(nn.Module):
         crop: bool = False,
     ):
         super().__init__()
+        require(
+            depth_head.bounds is not None or not getattr(encoder, "interval_input", False),
+            "encoder.interval_input",
+            "false where depth_head.bounds is none",
+            True,
+        )
         self.encoder = encoder
         self.depth_head = depth_head
         self.unproject = unprojection or Unprojection()
@@ -63,16 +69,12 @@ class GHGS(nn.Module):
         return windows.paste_prediction(self._predict(windows.cut_batch(batch), interval))
 
     def _predict(self, batch: Batch, interval: Interval | None) -> Prediction:
-        tokens = self.encoder(batch.images, batch.masks)
+        tokens = self.encoder(batch.images, batch.masks, interval)
         depth_maps = self.depth_head(tokens, batch, interval)
         points = self.unproject(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points, batch)
         gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
         return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps)
-
-    def set_progress(self, share: float) -> None:
-        """Say how much of the training is over, from 0 to 1; stages that change on the way ask for it."""
-        self.gaussian_head.set_progress(share)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> "GHGS":

@@ -107,7 +107,7 @@ class Batch(_TensorStruct):
     masks: Bool[Tensor, "B V H W"]
     cameras: Cameras
     targets: Targets | None = None
-    body_vertices: list[Float[Tensor, "n 3"]] | None = None
+    body_vertices: list[Float[Tensor, "_ 3"]] | None = None
     depths: Float[Tensor, "B V H W"] | None = None
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()

@@ -5,13 +5,14 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 out="${GHGS_DEMO_DIR:-runs/demo_$(date +%Y-%m-%d_%H-%M-%S)}"
 
-ghgs prepare experiment=demo
 ghgs train -m experiment=demo ablation=full,no_unprojection,no_semantic,neither "hydra.sweep.dir=$out"
-ghgs table sweep="$out" illustration=true
+ghgs table sweep="$out" illustration=true "hydra.run.dir=$out/table"
 
 cat <<TEXT
 
-Pictures:     $out/*/pictures
-TensorBoard:  $(command -v tensorboard || echo tensorboard) --logdir $out
-Table:        the path above, as Markdown and CSV
+Table:        $out/table/table.md
+Pictures:     $out/[0-3]/pictures
+Splat:        ghgs predict checkpoint=$out/0/checkpoints/last.ckpt
+TensorBoard:  tensorboard --logdir $out
+(the commands are in .venv/bin: source .venv/bin/activate)
 TEXT

@@ -87,25 +87,19 @@ def test_pointwise_is_the_convolution():
         torch.testing.assert_close(_pointwise(conv, x), conv(x))
 
 
-def test_image_skip_reads_picture_and_mask():
-    head = _head(image_skip=True)
+def test_a_guide_keeps_images_apart_and_is_local():
+    head = _head(guide_channels=4)
     tokens = _tokens(b=1, v=2, h=2, w=3)
-    images, masks = torch.rand(1, 2, 3, 28, 42), torch.rand(1, 2, 28, 42) > 0.5
-    raw = head(tokens, images, masks)
-    for other in (head(tokens, 1 - images, masks), head(tokens, images, ~masks)):
-        assert (other - raw).abs().max() > 1e-4
-    moved = images.clone()
-    moved[0, 1, :, 20, 30] += 1
-    changed = (head(tokens, moved, masks) - raw).abs().amax(1) > 0
+    guide = torch.rand(1, 2, 4, 28, 42)
+    raw = head(tokens, guide)
+    moved = guide.clone()
+    moved[0, 1, :, 4, 6] += 1
+    changed = (head(tokens, moved) - raw).abs().amax(1) > 0
     assert not changed[0].any()
-    assert changed[1, 18:23, 28:33].any()
-    changed[1, 18:23, 28:33] = False
-    assert not changed.any()
+    assert changed[1, 2:7, 4:9].any()
     raw.sum().backward()
     assert all(p.grad is not None for p in head.parameters())
-    with pytest.raises(InputError, match="image_skip"):
-        head(tokens)
-    assert not any("image_skip" in key for key in _head().state_dict())
+    assert not any("guide" in key for key in _head().state_dict())
 
 
 def test_last_projection_is_wide_under_autocast():

@@ -110,21 +110,6 @@ def test_heads_on_every_pixel_give_the_same_gaussians():
         assert (a - b).abs().max() <= 1e-5 * b.abs().max()
 
 
-def test_attributes_are_frozen_for_a_share_of_the_training():
-    batch = make_batch()
-    head = shake(make_head(freeze_attributes=0.2))
-    moving = {}
-    for share in (0.0, 0.19, 0.2, 1.0):
-        head.set_progress(share)
-        gaussians = run(head, batch)
-        head.zero_grad()
-        total = gaussians.opacities.sum() + gaussians.scales.sum() + gaussians.means.sum()
-        (total + gaussians.quaternions[:, 1].sum()).backward()
-        moving[share] = [getattr(head, name)[-1].weight.grad.any().item() for name in HEADERS]
-    assert moving[0.0] == moving[0.19] == [True, False, False, False]
-    assert moving[0.2] == moving[1.0] == [True, True, True, True]
-
-
 @pytest.mark.parametrize("parameterization", ["footprint", "release"])
 def test_no_valid_pixel_gives_no_gaussians(parameterization):
     batch = make_batch(2, 2)
@@ -152,7 +137,6 @@ def test_attributes_are_wide_under_autocast():
     [
         ({"parameterization": "ours"}, "gaussian_head.parameterization"),
         ({"pixels": "some"}, "gaussian_head.pixels"),
-        ({"freeze_attributes": 2.0}, "gaussian_head.freeze_attributes"),
         ({"hidden": [32]}, "gaussian_head.hidden"),
         ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
         ({"attributes": {"opacity_start": 1.0}}, "gaussian_head.attributes.opacity_start"),

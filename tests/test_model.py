@@ -81,7 +81,7 @@ class GivenTokens(nn.Module):
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         self.tokens = Tokens(latent, inputs["dino"].flatten(0, 1), image, row, column, (1, 3, 5, 5), 14)
 
-    def forward(self, images, masks):
+    def forward(self, images, masks, interval):
         return self.tokens
 
 
@@ -265,7 +265,11 @@ def test_geometry_is_wide_under_autocast():
     assert prediction.depth.dtype == torch.float32
     assert torch.equal(prediction.depth_maps.near, expected.depth_maps.near)
     assert (prediction.depth - expected.depth).abs()[batch.masks].max() < 0.1
-    again = Unprojection()(prediction.depth_maps, model.encoder(batch.images, batch.masks), batch)
+    again = Unprojection()(
+        prediction.depth_maps,
+        model.encoder(batch.images, batch.masks, model.depth_head.interval(batch)),
+        batch,
+    )
     assert torch.equal(again.pixels, prediction.points.pixels)
 
 
@@ -294,7 +298,7 @@ def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
     path = tmp_path / "a.ckpt"
     checkpoint(path, config=config("gaussian_head.hidden=[64,32]"))
     with pytest.raises(
-        InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 32\).*\(128, 32\)"
+        InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)"
     ):
         GHGS.from_checkpoint(path)
     checkpoint(path, state_dict={})

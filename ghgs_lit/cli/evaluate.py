@@ -10,7 +10,7 @@ from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.baselines import BASELINES, baseline
 from ghgs_lit.experiments.evaluation import Method, ModelMethod
-from ghgs_lit.experiments.session import build_data, measure_and_write, pick_device
+from ghgs_lit.experiments.session import build_data, measure_and_write, pick_device, with_trained_data
 from ghgs_lit.model import GHGS, read_checkpoint
 
 
@@ -40,7 +40,7 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
 
 def run(cfg: DictConfig) -> None:
     directory = output_dir()
-    config = save_config(cfg, directory)
+    config = save_config(with_trained_data(cfg), directory)
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     methods, facts = _methods(config, device)

@@ -34,7 +34,7 @@ VERBS = {
     ),
     "predict": (
         "turn photographs into a splat (PLY) and a turntable",
-        "ghgs predict checkpoint=last.ckpt data=synthetic subject=0",
+        "ghgs predict checkpoint=last.ckpt subject=0",
     ),
     "table": ("collect a sweep into the paper's table", "ghgs table sweep=runs/train/sweep_..."),
 }
@@ -120,6 +120,8 @@ def _run(verb: str, argv: list[str]) -> int:
 def main() -> int:
     """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 when interrupted."""
     argv = list(sys.argv)
+    # Threads of OpenMP that spin while they wait slow one another down tenfold on cores that are shared.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
         completed = _completion_argv(argv)
         return 0 if completed is None else _run(completed[1], completed)

@@ -11,7 +11,7 @@ from ghgs_lit.config import build
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.experiments.pictures import save_png, sheet, to_uint8
 from ghgs_lit.experiments.ply import write_ply
-from ghgs_lit.experiments.session import build_data, pick_device
+from ghgs_lit.experiments.session import build_data, pick_device, with_trained_data
 from ghgs_lit.experiments.turntable import turntable
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch
@@ -33,7 +33,7 @@ def subject_batch(data: LightningDataModule, subject: str | int, split: str) -> 
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
     directory = output_dir()
-    config = save_config(cfg, directory)
+    config = save_config(with_trained_data(cfg), directory)
     frames = config["turntable"]["frames"]
     require(isinstance(frames, int) and frames >= 0, "turntable.frames", "a number of at least 0", frames)
     device = pick_device(config["device"])

@@ -40,7 +40,7 @@ class Lights:
     count: int = 6
     ambient: float = 0.5
     softness: float = 0.3
-    exposure: float = 0.85
+    exposure: float = 0.6
     elevation: float = 30.0
     jitter: float = 0.25
 

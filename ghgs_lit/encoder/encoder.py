@@ -11,6 +11,8 @@ from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.relative import INTERVAL_CHANNELS, relative_interval
+from ghgs_lit.geometry.visual_hull import Interval
 from ghgs_lit.types import Tokens
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -28,7 +30,8 @@ class VGGTEncoder(nn.Module):
             stem; ``{kind: dinov2, depth, heads}`` a DINOv2 ViT with registers.
         layers: pairs whose tokens are read out, ascending; the last must be the last of all.
         image_size: side of the square image whose patch positions a DINOv2 ViT stores.
-        mask_input: the mask is a fourth image channel.
+        mask_input: the mask is a further image channel.
+        interval_input: where a pixel's interval of depths begins and how long it is are two more.
         layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
         trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
         checkpointing: recompute activations in the backward pass instead of keeping them.
@@ -45,15 +48,16 @@ class VGGTEncoder(nn.Module):
         registers: int = 4,
         image_size: int = 518,
         mask_input: bool = False,
+        interval_input: bool = False,
         layer_scale: float = 0.01,
         trainable: str = "all",
         checkpointing: bool = False,
     ):
         super().__init__()
-        self.patch_size, self.mask_input = patch_size, mask_input
+        self.patch_size, self.mask_input, self.interval_input = patch_size, mask_input, interval_input
         self.dim_latent, self.dim_semantic = 2 * width, width
-        channels = 4 if mask_input else 3
-        mean, std = (*IMAGENET_MEAN, 0.5)[:channels], (*IMAGENET_STD, 0.5)[:channels]
+        mean, std = (*IMAGENET_MEAN, *[0.5] * mask_input), (*IMAGENET_STD, *[0.5] * mask_input)
+        channels = len(mean) + INTERVAL_CHANNELS * interval_input
         # Not in a checkpoint, so real even in a model that is built on the meta device and then assigned.
         for name, values in (("mean", mean), ("std", std)):
             constant = torch.tensor(values, device="cpu").view(-1, 1, 1)
@@ -76,17 +80,23 @@ class VGGTEncoder(nn.Module):
         for blocks in (self.aggregator.frame_blocks, self.aggregator.global_blocks):
             blocks[depth - count :].requires_grad_(True)
 
-    def forward(self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."]) -> Tokens:
+    def forward(
+        self,
+        images: Float[Tensor, "b v c H W"],
+        masks: Bool[Tensor, "..."],
+        interval: Interval | None = None,
+    ) -> Tokens:
         """All patches of all views.
 
         Args:
             images: ``[B, V, 3, H, W]``, RGB in [0, 1], sides divisible by the patch size.
-            masks: ``[B, V, H, W]``; read only where ``mask_input`` is set.
+            masks: ``[B, V, H, W]``; read where ``mask_input`` or ``interval_input`` is set.
+            interval: near and far, each ``[B, V, H, W]``; read where ``interval_input`` is set.
         """
         self._check(images, masks)
         b, v, _, height, width = images.shape
         grid = (b, v, height // self.patch_size, width // self.patch_size)
-        pairs, patches = self.aggregator(self._normalized(images, masks))
+        pairs, patches = self.aggregator(self._normalized(images, masks, interval))
         first = self.aggregator.special
         axes = (torch.arange(n, device=images.device) for n in (b * v, *grid[2:]))
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
@@ -108,12 +118,16 @@ class VGGTEncoder(nn.Module):
         require(divisible, "images", expected, f"{height} x {width}")
         require(masks.shape == (b, v, height, width), "masks", str((b, v, height, width)), tuple(masks.shape))
 
-    def _normalized(self, images: Tensor, masks: Tensor) -> Tensor:
+    def _normalized(self, images: Tensor, masks: Tensor, interval: Interval | None) -> Tensor:
         """Channels to zero mean and unit spread, in the precision of the weights."""
         x = wide(images)
         if self.mask_input:
             x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
-        return ((x - self.mean) / self.std).to(self.aggregator.camera_token.dtype)
+        x = (x - self.mean) / self.std
+        if self.interval_input:
+            require(interval is not None, "encoder.interval_input", "depths that are bounded", "no bounds")
+            x = torch.cat((x, relative_interval(interval, masks).to(x.dtype)), dim=2)
+        return x.to(self.aggregator.camera_token.dtype)
 
 
 def _patch_embedding(

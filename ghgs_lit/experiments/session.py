@@ -8,13 +8,15 @@ import rich
 import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch import LightningDataModule
+from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
 from ghgs_lit.config import build
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.experiments.evaluation import Method, measure_all
 from ghgs_lit.experiments.provenance import provenance
 from ghgs_lit.experiments.results import Row, metric_names, summarize, write_results
+from ghgs_lit.model import read_checkpoint
 
 # What is printed, with its decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}
@@ -26,6 +28,15 @@ def build_data(config: Mapping[str, Any]) -> LightningDataModule:
     return build(
         config["data"], "data", views=config["views"], targets=config["targets"], seed=config["seed"]
     )
+
+
+def with_trained_data(cfg: DictConfig) -> DictConfig:
+    """``cfg`` with the data that its checkpoint was trained on, where no ``data`` was chosen."""
+    if cfg.get("data") is not None:
+        return cfg
+    if cfg.checkpoint is None:
+        raise InputError("data: expected data=... where there is no checkpoint; found none")
+    return OmegaConf.merge({"data": read_checkpoint(cfg.checkpoint)["config"]["data"]}, cfg)
 
 
 def pick_device(name: str) -> torch.device:

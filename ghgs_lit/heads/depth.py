@@ -9,8 +9,10 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.relative import INTERVAL_CHANNELS, relative_interval
 from ghgs_lit.geometry.visual_hull import Interval, SubjectBounds
 from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Tokens
 
@@ -48,6 +50,7 @@ class DepthHead(nn.Module):
         bounds: where near and far come from: ``box`` or ``hull``; ``none`` with ``inverse_linear``.
         search: options of :class:`SubjectBounds`.
         start: share of the way from near to far at which training starts.
+        guide: let the dense head see photographs, masks and the intervals of depth at full resolution.
         views: ``all``, or ``subject``: views whose mask is empty are not decoded (their depths mean nothing).
     """
 
@@ -60,6 +63,7 @@ class DepthHead(nn.Module):
         search: Mapping | None = None,
         start: float = 0.5,
         views: str = "all",
+        guide: bool = False,
     ):
         super().__init__()
         choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
@@ -75,7 +79,8 @@ class DepthHead(nn.Module):
         self.parameterization, self.start = parameterization, log(start / (1 - start))
         self.views = views
         self.bounds = None if bounds == "none" else SubjectBounds(kind=bounds, **(search or {}))
-        self.dpt = proportioned_dpt(dim_latent, 2, **(dpt or {}))
+        channels = PHOTO_CHANNELS + INTERVAL_CHANNELS * (bounds != "none") if guide else 0
+        self.dpt = proportioned_dpt(dim_latent, 2, guide_channels=channels, **(dpt or {}))
         if self.bounds is not None:
             last = self.dpt.scratch.output_conv2[-1]
             nn.init.zeros_(last.weight)
@@ -91,7 +96,11 @@ class DepthHead(nn.Module):
         What is not finite becomes 1 m, invalid.
         """
         wanted = batch.masks.flatten(2).any(-1) | (self.views == "all")
-        raw = wide(decode_views(self.dpt, tokens, batch, wanted))
+        guide = None
+        if self.dpt.guide is not None:
+            shape = () if interval is None else (relative_interval(interval, batch.masks),)
+            guide = photo_guide(batch, *shape)
+        raw = wide(decode_views(self.dpt, tokens, guide, wanted))
         value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
         near, far = interval or (None, None)
         if interval is None:

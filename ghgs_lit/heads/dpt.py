@@ -5,10 +5,11 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import require
+from ghgs_lit.heads.guide import GuidePyramid
 from ghgs_lit.heads.position import position_embedding
 from ghgs_lit.types import Tokens
 
@@ -25,8 +26,8 @@ def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n
     return F.linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
-def _resize(x: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c h2 w2"]:
-    if x.shape[-2:] == size:
+def _resize(x: Float[Tensor, "n c h w"], size: Sequence[int]) -> Float[Tensor, "n c h2 w2"]:
+    if tuple(x.shape[-2:]) == tuple(size):
         return x
     return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
@@ -89,8 +90,8 @@ class DPTHead(nn.Module):
         out_channels: channels of the four levels (multiples of 4), fine to coarse.
         output_dim: channels of the result; activations are the caller's.
         hidden: channels before the last convolution (32 as published).
-        image_skip: add one convolution of the picture and its mask at full resolution, which keeps a small
-            head sharp; published weights have none.
+        guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
+            sharp; 0: none, as published.
         images_per_step: images that go through the head together where no gradient is kept (bounds memory).
     """
 
@@ -101,7 +102,7 @@ class DPTHead(nn.Module):
         out_channels: Sequence[int],
         output_dim: int,
         hidden: int = 32,
-        image_skip: bool = False,
+        guide_channels: int = 0,
         images_per_step: int = 2,
     ):
         super().__init__()
@@ -126,22 +127,17 @@ class DPTHead(nn.Module):
             )
         )
         self.scratch = Scratch(out_channels, features, hidden, output_dim)
-        self.image_skip = _conv3(4, features // 2) if image_skip else None
+        self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 
     def forward(
-        self,
-        tokens: Tokens,
-        images: Float[Tensor, "b v 3 H W"] | None = None,
-        masks: Bool[Tensor, "b v H W"] | None = None,
+        self, tokens: Tokens, guide: Float[Tensor, "b v k H W"] | None = None
     ) -> Float[Tensor, "bv o H W"]:
-        """Raw maps of all images, float32 or wider; ``images`` and ``masks`` are read by the image skip."""
+        """Raw maps of all images, float32 or wider; ``guide`` is wanted where ``guide_channels`` is set."""
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
+        expected = "none" if self.guide is None else "a map"
+        require((guide is None) == (self.guide is None), "guide", expected, guide is not None)
         levels = self._levels(tokens)
-        picture = None
-        if self.image_skip is not None:
-            require(images is not None and masks is not None, "image_skip", "images and masks", None)
-            picture = torch.cat((images, masks.to(images.dtype)[:, :, None]), dim=2).flatten(0, 1)
-            picture = picture.contiguous(memory_format=torch.channels_last)
+        flat = None if guide is None else guide.flatten(0, 1)
         count = levels[0].shape[0]
         step = count if torch.is_grad_enabled() else self.images_per_step
         parts = []
@@ -151,7 +147,7 @@ class DPTHead(nn.Module):
                 self._decode(
                     [level[part] for level in levels],
                     tokens.patch_size,
-                    None if picture is None else picture[part],
+                    None if flat is None else flat[part],
                 )
             )
         return parts[0] if len(parts) == 1 else torch.cat(parts)
@@ -165,7 +161,7 @@ class DPTHead(nn.Module):
         return levels
 
     def _decode(
-        self, levels: list[Tensor], patch_size: int, picture: Tensor | None
+        self, levels: list[Tensor], patch_size: int, guide: Tensor | None
     ) -> Float[Tensor, "n o H W"]:
         height, width = levels[0].shape[-2:]
         aspect = width / height
@@ -174,16 +170,22 @@ class DPTHead(nn.Module):
             level = _add_positions(levels[i], aspect)
             levels[i] = getattr(s, f"layer{i + 1}_rn")(resize(level))
 
+        if guide is not None:
+            full, half, quarter = self.guide(guide)
+            levels[0] = levels[0] + _resize(quarter, levels[0].shape[-2:])
+
         sizes = [tuple(level.shape[-2:]) for level in levels]
         x = s.refinenet4(levels[3], None, sizes[2])
         x = s.refinenet3(x, levels[2], sizes[1])
         x = s.refinenet2(x, levels[1], sizes[0])
         x = s.refinenet1(x, levels[0], (2 * sizes[0][0], 2 * sizes[0][1]))
 
+        if guide is not None:
+            x = x + _resize(half, x.shape[-2:])
         x = _resize(s.output_conv1(x), (patch_size * height, patch_size * width))
         x = _add_positions(x, aspect)
-        if picture is not None:
-            x = x + F.relu(self.image_skip(picture))
+        if guide is not None:
+            x = x + full
         x = s.output_conv2[:-1](x)
         # The last projection stays wide under autocast: depths and offsets of millimetres hang on it.
         last = s.output_conv2[-1]

@@ -11,7 +11,9 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.relative import relative_depth
 from ghgs_lit.heads.activations import unit
+from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Tokens
 
@@ -114,8 +116,7 @@ class GaussianHead(nn.Module):
         pixels: ``subject`` runs the four networks on the subject's pixels, ``all`` on every pixel and
             selects after; the Gaussians are the same.
         views: ``subject`` decodes views with a pixel of the subject only, ``all`` every view.
-        freeze_attributes: share of the training (told by :meth:`set_progress`) during which scale, rotation
-            and opacity stay as they start: while depths are wrong, transparency is the best answer to them.
+        guide: let the dense head see photographs, masks and depths at full resolution.
     """
 
     def __init__(
@@ -128,17 +129,16 @@ class GaussianHead(nn.Module):
         attributes: Mapping | None = None,
         pixels: str = "subject",
         views: str = "subject",
-        freeze_attributes: float = 0.0,
+        guide: bool = False,
     ):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
         choice("gaussian_head.views", views, ("subject", "all"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
-        require(0 <= freeze_attributes <= 1, "gaussian_head.freeze_attributes", "a share", freeze_attributes)
         self.pixels, self.views = pixels, views
-        self.freeze_attributes, self.frozen = freeze_attributes, False
-        self.decoder = proportioned_dpt(dim_latent, channels, **(dpt or {}))
+        guided = PHOTO_CHANNELS + 1 if guide else 0
+        self.decoder = proportioned_dpt(dim_latent, channels, guide_channels=guided, **(dpt or {}))
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
         self.rot_header = _mlp((channels, *hidden, 4), nn.ReLU)
@@ -150,14 +150,13 @@ class GaussianHead(nn.Module):
                 nn.init.zeros_(header[-1].weight)
                 nn.init.zeros_(header[-1].bias)
 
-    def set_progress(self, share: float) -> None:
-        """Say how much of the training is over."""
-        self.frozen = share < self.freeze_attributes
-
     def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians of the valid pixels in the order of element, view, row, column."""
         wanted = points.valid.flatten(2).any(-1) | (self.views == "all")
-        maps = decode_views(self.decoder, tokens, batch, wanted)
+        guide = None
+        if self.decoder.guide is not None:
+            guide = photo_guide(batch, relative_depth(wide(depth_maps.depth), points.valid))
+        maps = decode_views(self.decoder, tokens, guide, wanted)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
         descriptors = maps.flatten(2).transpose(1, 2)
         if self.pixels == "subject":
@@ -185,7 +184,4 @@ class GaussianHead(nn.Module):
             wide(header(descriptors))
             for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header)
         )
-        if self.frozen:
-            # Zero gradients and not none: every process of a distributed run waits for all of them.
-            scale, rotation, opacity = (value.detach() + 0 * value for value in (scale, rotation, opacity))
         return offset, scale, rotation, opacity[..., 0]

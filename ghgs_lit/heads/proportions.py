@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.heads.dpt import DPTHead
-from ghgs_lit.types import Batch, Tokens
+from ghgs_lit.types import Tokens
 
 
 def proportioned_dpt(
@@ -31,7 +31,10 @@ def proportioned_dpt(
 
 
 def decode_views(
-    dpt: DPTHead, tokens: Tokens, batch: Batch, wanted: Bool[Tensor, "b v"]
+    dpt: DPTHead,
+    tokens: Tokens,
+    guide: Float[Tensor, "b v k H W"] | None,
+    wanted: Bool[Tensor, "b v"],
 ) -> Float[Tensor, "bv o H W"]:
     """What ``dpt`` makes of the images that are ``wanted``; 0 for the others, which it does not see.
 
@@ -39,7 +42,7 @@ def decode_views(
     """
     flat = wanted.flatten()
     if flat.all() or not flat.any():
-        return dpt(tokens, batch.images, batch.masks)
+        return dpt(tokens, guide)
     kept = flat.nonzero()[:, 0]
     chosen = flat[tokens.image]
     part = dataclasses.replace(
@@ -51,7 +54,7 @@ def decode_views(
         column=tokens.column[chosen],
         grid=(1, len(kept), *tokens.grid[2:]),
     )
-    maps = dpt(part, batch.images.flatten(0, 1)[kept][None], batch.masks.flatten(0, 1)[kept][None])
+    maps = dpt(part, None if guide is None else guide.flatten(0, 1)[kept][None])
     return torch.zeros(len(flat), *maps.shape[1:], dtype=maps.dtype, device=maps.device).index_copy(
         0, kept, maps
     )

@@ -1,0 +1,39 @@
+"""What a dense head may look at beside its tokens: photographs, masks and depths at full resolution.
+
+A patch is one token, so that a head on tokens alone draws soft edges. Published weights use no guide.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.geometry.projection import wide
+from ghgs_lit.types import Batch
+
+#: Channels of :func:`photo_guide` without further maps.
+PHOTO_CHANNELS = 4
+
+
+def photo_guide(batch: Batch, *maps: Float[Tensor, "B V c H W"]) -> Float[Tensor, "B V k H W"]:
+    """Photographs, masks and further ``maps`` as the channels of one map."""
+    images = wide(batch.images)
+    return torch.cat((images, batch.masks.to(images.dtype)[:, :, None], *maps), dim=2)
+
+
+class GuidePyramid(nn.Module):
+    """A guide at full, half and quarter resolution, by three convolutions.
+
+    Gives maps of ``features / 2``, ``features`` and ``features`` channels, to be added to a dense head's.
+    """
+
+    def __init__(self, channels: int, features: int):
+        super().__init__()
+        self.to_full = nn.Conv2d(channels, features // 2, 3, padding=1)
+        self.to_half = nn.Conv2d(features // 2, features, 3, stride=2, padding=1)
+        self.to_quarter = nn.Conv2d(features, features, 3, stride=2, padding=1)
+
+    def forward(self, guide: Float[Tensor, "n c H W"]) -> tuple[Tensor, Tensor, Tensor]:
+        full = F.relu(self.to_full(guide.contiguous(memory_format=torch.channels_last)))
+        half = F.relu(self.to_half(full))
+        return full, half, F.relu(self.to_quarter(half))
