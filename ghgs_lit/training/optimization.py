@@ -56,6 +56,7 @@ class Optimization:
             betas=tuple(self.betas),
             eps=self.eps,
             weight_decay=self.weight_decay,
+            fused=True,
         )
 
     def drop_held(self, model: nn.Module, progress: float) -> None:
