@@ -1,58 +1,23 @@
-import copy
 import dataclasses
 import functools
-import pickle
 import subprocess
 import sys
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from stage_models import close, config, make_model
 from stage_scenes import CASES, fixture, make_batch
 from torch import nn
 
 import ghgs_lit
-from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.points import Unprojection
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
-from ghgs_lit.model import FORMAT_VERSION, GHGS, check_batch
+from ghgs_lit.model import GHGS, check_batch
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Cameras, Tokens
-
-TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]
-TINY += ["recalibration.k=8", "recalibration.num_heads=2"]
-ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
-
-
-def config(*overrides):
-    return copy.deepcopy(_composed(overrides))
-
-
-@functools.cache  # composing costs more than the tiny models
-def _composed(overrides):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        composed = compose("train", overrides=[*TINY, *overrides])
-    stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
-    return OmegaConf.to_container(OmegaConf.masked_copy(composed, list(stages)), resolve=True)
-
-
-def make_model(*overrides, seed=0):
-    """A model that has left its initial state, in which many outputs are constant."""
-    torch.manual_seed(seed)
-    model = GHGS.from_config(config(*overrides))
-    for last in (
-        model.depth_head.dpt.scratch.output_conv2[-1],
-        *(
-            getattr(model.gaussian_head, name)[-1]
-            for name in ("offset_header", "scale_header", "rot_header", "opacity_header")
-        ),
-    ):
-        nn.init.normal_(last.weight, std=0.5)
-    return model
 
 
 def element(batch, b):
@@ -61,12 +26,6 @@ def element(batch, b):
         batch.images[index], batch.masks[index], batch.cameras[index], depths=batch.depths[index],
         body_vertices=None,
     )  # fmt: skip
-
-
-def close(a, b, limit=1e-5):
-    for name in ATTRIBUTES:
-        x, y = getattr(a, name), getattr(b, name)
-        assert (x - y).abs().max() <= limit * y.abs().max(), name
 
 
 class GivenTokens(nn.Module):
@@ -271,73 +230,6 @@ def test_geometry_is_wide_under_autocast():
         batch,
     )
     assert torch.equal(again.pixels, prediction.points.pixels)
-
-
-def checkpoint(path, **changes):
-    model = make_model()
-    content = {
-        "state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}
-        | {"loss.weight": torch.ones(1)},
-        "config": config(),
-        "format_version": FORMAT_VERSION,
-    }
-    torch.save({k: v for k, v in (content | changes).items() if v is not None}, path)
-    return model
-
-
-def test_a_checkpoint_rebuilds_its_model(tmp_path):
-    model = checkpoint(tmp_path / "a.ckpt").eval()
-    loaded = GHGS.from_checkpoint(tmp_path / "a.ckpt")
-    assert not loaded.training
-    batch = make_batch(1, 3)
-    with torch.no_grad():
-        close(loaded(batch).gaussians, model(batch).gaussians, 0)
-
-
-def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
-    path = tmp_path / "a.ckpt"
-    checkpoint(path, config=config("gaussian_head.hidden=[64,32]"))
-    with pytest.raises(
-        InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)"
-    ):
-        GHGS.from_checkpoint(path)
-    checkpoint(path, state_dict={})
-    with pytest.raises(InputError, match=r"a\.ckpt: encoder.*expected a tensor of shape"):
-        GHGS.from_checkpoint(path)
-
-
-class Foreign:
-    pass
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"config": None}, "'config'"),
-        ({"state_dict": None}, "'state_dict'"),
-        ({"format_version": None}, "'format_version'"),
-        ({"format_version": FORMAT_VERSION + 1}, "newer version"),
-        ({"config": {"encoder": {}}}, "depth_head"),
-        ({"config": Foreign()}, "plain data"),
-    ],
-)
-def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
-    path = tmp_path / "b.ckpt"
-    checkpoint(path, **changes)
-    with pytest.raises(InputError, match=message) as error:
-        GHGS.from_checkpoint(path)
-    assert "b.ckpt" in str(error.value) or "depth_head" in message
-
-
-def test_files_that_are_no_checkpoints(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"c\.ckpt"):
-        GHGS.from_checkpoint(tmp_path / "c.ckpt")
-    (tmp_path / "c.ckpt").write_bytes(b"no checkpoint at all")
-    with pytest.raises(InputError, match=r"c\.ckpt"):
-        GHGS.from_checkpoint(tmp_path / "c.ckpt")
-    (tmp_path / "c.ckpt").write_bytes(pickle.dumps([1, 2]))
-    with pytest.raises(InputError, match=r"c\.ckpt"):
-        GHGS.from_checkpoint(tmp_path / "c.ckpt")
 
 
 @functools.cache

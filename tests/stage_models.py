@@ -1,0 +1,49 @@
+"""Tiny models of any configuration, for the tests of the whole model."""
+
+import copy
+import functools
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from torch import nn
+
+from ghgs_lit.config import conf_dir
+from ghgs_lit.model import GHGS
+
+ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
+TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]
+TINY += ["recalibration.k=8", "recalibration.num_heads=2"]
+
+
+def config(*overrides):
+    return copy.deepcopy(_composed(overrides))
+
+
+@functools.cache  # composing costs more than the tiny models
+def _composed(overrides):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        composed = compose("train", overrides=[*TINY, *overrides])
+    stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
+    return OmegaConf.to_container(OmegaConf.masked_copy(composed, list(stages)), resolve=True)
+
+
+def make_model(*overrides, seed=0):
+    """A model that has left its initial state, in which many outputs are constant."""
+    torch.manual_seed(seed)
+    model = GHGS.from_config(config(*overrides))
+    for last in (
+        model.depth_head.dpt.scratch.output_conv2[-1],
+        *(
+            getattr(model.gaussian_head, name)[-1]
+            for name in ("offset_header", "scale_header", "rot_header", "opacity_header")
+        ),
+    ):
+        nn.init.normal_(last.weight, std=0.5)
+    return model
+
+
+def close(a, b, limit=1e-5):
+    for name in ATTRIBUTES:
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x - y).abs().max() <= limit * y.abs().max(), name
