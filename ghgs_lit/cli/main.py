@@ -22,7 +22,7 @@ BAD_INPUT = (InputError, FileNotFoundError)
 VERBS = {
     "prepare": (
         "render scans into training data, or make the built-in people",
-        "ghgs prepare task=render data=scans data.source=~/scans data.root=~/rendered",
+        "ghgs prepare task=render data=scans data.source=scans data.root=rendered",
     ),
     "train": (
         "train a model and evaluate it",
