@@ -1,8 +1,10 @@
 """Tiny people for tests: coloured boxes, as meshes, as scans on disk and as a rendered data set."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from PIL import Image
 
@@ -11,6 +13,8 @@ from ghgs_lit.data.rig import Rig
 from ghgs_lit.data.scans import ScanSource
 from ghgs_lit.people.mesh import Person, TexturedMesh
 
+V4 = {"name": "v4", "training_counts": [4], "evaluation_count": 4}
+RELEASE = {"name": "release", "training_vids": [2, 3, 4]}
 RIG = Rig()
 TINY = RenderSettings(size=42, samples=2)
 
@@ -52,3 +56,21 @@ def render_boxes(root: Path, folder: Path, train: int = 3, val: int = 2, **chang
     arguments = {"rig": RIG, "settings": TINY, "seed": 0, "workers": 0} | changes
     render_people(root, {"train": names[:train], "val": names[train:]}, source, **arguments)
     return source
+
+
+def equal(a, b) -> bool:
+    """Whether two batches agree in every tensor and name."""
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, torch.Tensor):
+            if not torch.equal(x, y):
+                return False
+        elif dataclasses.is_dataclass(x):
+            if not equal(x, y):
+                return False
+        elif isinstance(x, list):
+            if not all(torch.equal(p, q) for p, q in zip(x, y, strict=True)):
+                return False
+        elif x != y:
+            return False
+    return True

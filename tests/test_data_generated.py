@@ -1,11 +1,8 @@
 """DataModules from configuration, and generated people: built, cached, extended, refused."""
 
-import dataclasses
-
 import numpy as np
 import pytest
-import torch
-from data_people import RIG, box_person
+from data_people import RELEASE, RIG, V4, box_person, equal
 
 from ghgs_lit import people
 from ghgs_lit.config import build, conf_dir
@@ -13,33 +10,8 @@ from ghgs_lit.data import ScansDataModule, SyntheticDataModule
 from ghgs_lit.data.rig import subject_rng
 from ghgs_lit.data.sampling import (
     TargetProtocol,
-    ViewProtocol,
 )
 from ghgs_lit.errors import InputError
-
-FULL = tuple(range(16))
-V4 = {"name": "v4", "training_counts": [4], "evaluation_count": 4}
-RANDOM = ViewProtocol("random", (3, 4, 5), 4)
-RELEASE = {"name": "release", "training_vids": [2, 3, 4]}
-MIDWAY = {"name": "midway", "per_subject": "all"}
-
-
-def equal(a, b) -> bool:
-    """Whether two batches agree in every tensor and name."""
-    for field in dataclasses.fields(a):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, torch.Tensor):
-            if not torch.equal(x, y):
-                return False
-        elif dataclasses.is_dataclass(x):
-            if not equal(x, y):
-                return False
-        elif isinstance(x, list):
-            if not all(torch.equal(p, q) for p, q in zip(x, y, strict=True)):
-                return False
-        elif x != y:
-            return False
-    return True
 
 
 def compose(*overrides):

@@ -1,11 +1,9 @@
 """Sampling protocols and the DataModules: angles, draws that resume, batches, refusals."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
-from data_people import render_boxes
+from data_people import RELEASE, V4, equal, render_boxes
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
@@ -21,9 +19,7 @@ from ghgs_lit.data.sampling import (
 from ghgs_lit.errors import InputError
 
 FULL = tuple(range(16))
-V4 = {"name": "v4", "training_counts": [4], "evaluation_count": 4}
 RANDOM = ViewProtocol("random", (3, 4, 5), 4)
-RELEASE = {"name": "release", "training_vids": [2, 3, 4]}
 MIDWAY = {"name": "midway", "per_subject": "all"}
 
 
@@ -47,24 +43,6 @@ def turns(cameras) -> np.ndarray:
 
 def between(a, b) -> np.ndarray:
     return np.abs((a - b + 180) % 360 - 180)
-
-
-def equal(a, b) -> bool:
-    """Whether two batches agree in every tensor and name."""
-    for field in dataclasses.fields(a):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, torch.Tensor):
-            if not torch.equal(x, y):
-                return False
-        elif dataclasses.is_dataclass(x):
-            if not equal(x, y):
-                return False
-        elif isinstance(x, list):
-            if not all(torch.equal(p, q) for p, q in zip(x, y, strict=True)):
-                return False
-        elif x != y:
-            return False
-    return True
 
 
 def test_even_positions_are_the_protocols():
