@@ -86,7 +86,7 @@ def generated(monkeypatch):
 
 def test_generated_people_are_rendered_once_and_extended(tmp_path, generated):
     data = synthetic(tmp_path)
-    with pytest.raises(InputError, match="expected the root of a rendered data set; found no such folder"):
+    with pytest.raises(InputError, match="expected the folder of the data set; found no such folder"):
         data.train_dataloader()
     data.prepare_data()
     assert generated == [(0, 0), (0, 1), (0, 1_000_000)]

@@ -1,4 +1,4 @@
-"""``ghgs prepare``: render people or scans into training data, or check data that is there."""
+"""``ghgs prepare``: render people or scans into training data, make a miniature, or check what is there."""
 
 import logging
 from pathlib import Path
@@ -17,12 +17,16 @@ log = logging.getLogger(__name__)
 
 def run(cfg: DictConfig) -> None:
     """The verb; prints the root of the data last."""
-    choice("task", cfg.task, ("render", "check"))
+    choice("task", cfg.task, ("render", "miniature", "check"))
     data = build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
     root = Path(data.root or ".").expanduser().resolve()
     if cfg.task == "render":
         render(data)
         announce(root)
+    elif cfg.task == "miniature":
+        miniature = cfg.miniature
+        for folder in data.miniature(dict(miniature.people), miniature.size, cfg.seed):
+            announce(folder)
     else:
         check(data)
         print(root)

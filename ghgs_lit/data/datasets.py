@@ -1,13 +1,15 @@
 """From draws to batches. An item of these data sets is a whole :class:`Batch`."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset, DistributedSampler
 
-from ghgs_lit.data.layout import Layout, View
+from ghgs_lit.data.reader import Reader, View
 from ghgs_lit.data.rig import subject_rng
 from ghgs_lit.data.sampling import Draw, TrainingDraws, photo_name
 from ghgs_lit.types import Batch, Cameras, Targets
@@ -16,22 +18,30 @@ from ghgs_lit.types import Batch, Cameras, Targets
 class Assembler:
     """Reads the photographs of draws into a :class:`Batch`.
 
-    The layout's photographs lie on black with antialiased silhouettes: pixels at the rim carry their
+    Rendered photographs lie on black with antialiased silhouettes: pixels at the rim carry their
     share of the subject, on either side of the mask, as a splat's do. They are left as they are;
     ``apply_mask`` blacks out everything outside the mask, for photographs with a background.
-    ``body_vertices`` (null: all) are drawn from each body, always the same ones.
+    ``body_vertices`` (null: all) are drawn from each body, always the same ones. Inputs are padded
+    with black, evenly, to sides that ``multiple`` divides; targets stay as they are.
     """
 
     def __init__(
-        self, inputs: Layout, targets: Layout, apply_mask: bool = False, body_vertices: int | None = None
+        self,
+        inputs: Reader,
+        targets: Reader,
+        apply_mask: bool = False,
+        body_vertices: int | None = None,
+        multiple: int = 1,
+        depths: bool = True,
     ) -> None:
         self.inputs, self.targets = inputs, targets
         self.apply_mask, self.body_vertices = apply_mask, body_vertices
+        self.multiple, self.depths = multiple, depths
 
     def batch(self, draws: Sequence[Draw]) -> Batch:
         """Samples with equal numbers of inputs and of targets."""
-        inputs = [[self.inputs.view(d.subject, *photo) for photo in d.inputs] for d in draws]
-        targets = [[self.targets.view(d.subject, *photo) for photo in d.targets] for d in draws]
+        inputs = [[self._input(d.subject, *photo) for photo in d.inputs] for d in draws]
+        targets = [[self.targets.view(d.subject, *photo, depth=False) for photo in d.targets] for d in draws]
         depths = [[view.depth for view in row] for row in inputs]
         known = all(depth is not None for row in depths for depth in row)
         bodies = [self._body(d.subject) for d in draws]
@@ -51,6 +61,9 @@ class Assembler:
             views=tuple(tuple(photo_name(photo) for photo in d.inputs) for d in draws),
         )
 
+    def _input(self, name: str, pid: int, vid: int) -> View:
+        return pad(self.inputs.view(name, pid, vid, depth=self.depths), self.multiple)
+
     def _images(self, views: list[list[View]]) -> Tensor:
         images = _stack([[view.image for view in row] for row in views])
         if self.apply_mask:
@@ -65,6 +78,24 @@ class Assembler:
             chosen = subject_rng(0, name).choice(len(vertices), self.body_vertices, replace=False)
             vertices = vertices[np.sort(chosen)]
         return torch.from_numpy(vertices)
+
+
+def pad(view: View, multiple: int) -> View:
+    """The view with black around it, evenly, so that ``multiple`` divides its sides; intrinsics follow."""
+    extra = [-side % multiple for side in view.mask.shape]
+    if not any(extra):
+        return view
+    around = [(n // 2, n - n // 2) for n in extra]
+    intrinsics = view.intrinsics.copy()
+    intrinsics[:2, 2] += (around[1][0], around[0][0])
+    depth = view.inverse_depth
+    return replace(
+        view,
+        image=np.pad(view.image, (*around, (0, 0))),
+        mask=np.pad(view.mask, around),
+        inverse_depth=None if depth is None else np.pad(depth, around),
+        intrinsics=intrinsics,
+    )
 
 
 def _stack(arrays: list[list[np.ndarray]]) -> Tensor:
@@ -98,11 +129,15 @@ class TrainingBatches(Dataset):
 
 
 class EvaluationBatches(Dataset):
-    """Fixed samples, ``batch_size`` at a time; the last batch may be smaller."""
+    """Fixed samples, up to ``batch_size`` neighbours with equal numbers of targets at a time."""
 
     def __init__(self, assembler: Assembler, draws: Sequence[Draw], batch_size: int) -> None:
         self.assembler = assembler
-        self.draws = [draws[i : i + batch_size] for i in range(0, len(draws), batch_size)]
+        self.draws = [
+            alike[i : i + batch_size]
+            for alike in (list(group) for _, group in groupby(draws, lambda d: len(d.targets)))
+            for i in range(0, len(alike), batch_size)
+        ]
 
     def __len__(self) -> int:
         return len(self.draws)

@@ -78,13 +78,15 @@ class TargetProtocol:
 
     ``kind`` of the evaluation: ``release``, view ``vid`` at an input's position (3: 11.25 degrees from
     it); ``midway``, half-way between an input and the next; ``random``, any of ``training_vids`` at
-    any position, fixed by the seed. ``per_subject``: how many in evaluation, one an input from the
-    first on (``all``: every input). Training draws ``per_step`` photographs with ``training_vids``.
+    any position, fixed by the seed; ``cameras``, view ``vid`` at the ``positions`` (null: all) that are
+    no inputs. ``per_subject``: how many in evaluation, the first ones (``all``: one beside every input,
+    or every camera). Training draws ``per_step`` photographs with ``training_vids``.
     """
 
     name: str
     kind: str | None = None
     vid: int = MIDDLE_VID
+    positions: tuple[int, ...] | None = None
     per_subject: int | str = 1
     training_vids: tuple[int, ...] = (0, 2, 3, 4)
     per_step: int = 1
@@ -92,7 +94,15 @@ class TargetProtocol:
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", self.kind or self.name)
         object.__setattr__(self, "training_vids", tuple(self.training_vids))
-        choice("targets.kind", self.kind, ("release", "midway", "random"))
+        choice("targets.kind", self.kind, ("release", "midway", "random", "cameras"))
+        if self.positions is not None:
+            object.__setattr__(self, "positions", tuple(self.positions))
+            require(
+                self.kind == "cameras",
+                "targets.positions",
+                "null unless targets.kind=cameras",
+                self.positions,
+            )
         choice("targets.vid", self.vid, VIEW_IDS)
         known = len(self.training_vids) > 0 and set(self.training_vids) <= set(VIEW_IDS)
         require(known, "targets.training_vids", f"some of {list(VIEW_IDS)}", list(self.training_vids))
@@ -103,7 +113,7 @@ class TargetProtocol:
     @property
     def vids(self) -> set[int]:
         """Every vid that training or evaluation may ask for."""
-        evaluated = {"release": {self.vid}, "midway": {RING_VID, MIDDLE_VID}, "random": set()}[self.kind]
+        evaluated = {"midway": {RING_VID, MIDDLE_VID}, "random": set()}.get(self.kind, {self.vid})
         return evaluated | set(self.training_vids)
 
     def draw(
@@ -122,6 +132,8 @@ class TargetProtocol:
         self, available: Sequence[int], inputs: Sequence[int], ring: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
         """The targets of a sample with these inputs."""
+        if self.kind == "cameras":
+            return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
         if self.kind == "random":
             return self.draw(available, inputs, count, rng)
@@ -132,6 +144,15 @@ class TargetProtocol:
             return tuple((pid, self.vid) for pid in inputs[:count])
         pairs = zip(inputs, [*inputs[1:], inputs[0]], strict=True)
         return tuple(middle(a, b, ring) for a, b in pairs)[:count]
+
+    def _cameras(self, available: Sequence[int], inputs: Sequence[int]) -> tuple[Photo, ...]:
+        listed = available if self.positions is None else self.positions
+        if lacking := sorted(set(listed) - set(available)):
+            raise InputError(f"targets.positions: expected some of {list(available)}; found {lacking[0]}")
+        taken = {(pid, RING_VID) for pid in inputs}
+        photos = [photo for pid in listed if (photo := (pid, self.vid)) not in taken]
+        require(len(photos) > 0, "targets.positions", "a camera that is no input", list(listed))
+        return tuple(photos if self.per_subject == "all" else photos[: int(self.per_subject)])
 
 
 @dataclass(frozen=True)

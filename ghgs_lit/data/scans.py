@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from ghgs_lit.data.layout import read_array, read_image
+from ghgs_lit.data.reader import read_array, read_image
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.people.mesh import Person, TexturedMesh
 

@@ -1,0 +1,104 @@
+"""Pickles of data sets, read without running what they say.
+
+A pickle is a program: whoever wrote it chooses what is called while it is read. Data sets need arrays and
+containers only, so only these are admitted; every other name is refused before anything is called. Names of
+NumPy 1 (``numpy.core``) and 2 (``numpy._core``) and of Python 2 (``__builtin__``) are understood, and
+trimesh's array subclass is read as the array that it is, without trimesh.
+"""
+
+import codecs
+import collections
+import io
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from ghgs_lit.errors import InputError
+
+
+def _bytes(text: str, encoding: str = "latin1") -> bytes:
+    """How protocols below 3 write bytes; no other codec than theirs."""
+    if encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError(f"codec {encoding!r}")
+    return codecs.encode(text, "latin1")
+
+
+_ARRAY = np.zeros(0).__reduce__()[0]
+_SCALAR = np.float64(0).__reduce__()[0]
+_BUFFER = np.zeros(1).__reduce_ex__(5)[0]
+_BUILTINS = (bool, bytearray, bytes, complex, dict, float, frozenset, int, list, set, str, tuple)
+
+_ADMITTED: dict[tuple[str, str], Any] = {
+    ("numpy", "dtype"): np.dtype,
+    ("numpy", "ndarray"): np.ndarray,
+    ("_codecs", "encode"): _bytes,
+    ("collections", "OrderedDict"): collections.OrderedDict,
+    ("trimesh.caching", "TrackedArray"): np.ndarray,
+    ("trimesh.util", "TrackedArray"): np.ndarray,
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _ARRAY for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): _SCALAR for core in ("core", "_core")},
+    **{(f"numpy.{core}.numeric", "_frombuffer"): _BUFFER for core in ("core", "_core")},
+    **{(module, kind.__name__): kind for kind in _BUILTINS for module in ("builtins", "__builtin__")},
+}
+
+
+class _Refused(pickle.UnpicklingError):
+    """A name that is not admitted."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return _ADMITTED[module, name]
+        except KeyError:
+            raise _Refused(f"{module}.{name}") from None
+
+
+def _load(path: Path, stream: io.BufferedIOBase) -> Any:
+    try:
+        return _Unpickler(stream, encoding="latin1").load()
+    except _Refused as error:
+        raise InputError(
+            f"{path}: expected a pickle of NumPy arrays and plain containers; found {error}"
+        ) from None
+    except Exception as error:  # broken pickles raise anything
+        raise InputError(f"{path}: expected a readable pickle; found {error!r}") from error
+
+
+def load_pickle(path: Path) -> Any:
+    """The arrays, scalars and plain containers of a pickle.
+
+    Raises:
+        InputError: it is missing, broken, or names anything else, which is then not called.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: expected a pickle; found no such file")
+    with path.open("rb") as stream:
+        return _load(path, stream)
+
+
+def load_npy(path: Path) -> Any:
+    """An ``.npy`` file; what is pickled in it is read as by :func:`load_pickle`.
+
+    A pickled object in an array without dimensions (``np.save`` of a dictionary) comes out as itself.
+
+    Raises:
+        InputError: it is missing, broken, or names anything but arrays and plain containers.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: expected an .npy file; found no such file")
+    try:
+        with path.open("rb") as stream:
+            version = npy.read_magic(stream)
+            header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+            if header(stream)[2].hasobject:
+                content = _load(path, stream)
+                return content.item() if isinstance(content, np.ndarray) and content.ndim == 0 else content
+        return np.load(path, allow_pickle=False)
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        raise InputError(f"{path}: expected a readable .npy file; found {error}") from error
