@@ -299,7 +299,7 @@ def test_splits(tmp_path):
         custom.write_text(content)
         with pytest.raises(InputError, match=pattern):
             split_names(tmp_path, names, str(custom), 0.2, 0)
-    with pytest.raises(InputError, match="expected a JSON file, or a folder"):
+    with pytest.raises(InputError, match="expected a JSON file or a folder"):
         split_names(tmp_path, names, str(tmp_path / "none.json"), 0.2, 0)
 
 

@@ -1,16 +1,22 @@
-"""Photographs of people: made from meshes, kept on disk in one layout, drawn into batches."""
+"""Photographs of people: made from meshes or read from published data sets, drawn into batches."""
 
+import importlib
 from typing import Any
 
 # Looked up when asked for: rendering processes import this package too, and need no Lightning.
-_MODULES = {"RenderedDataModule", "ScansDataModule", "SyntheticDataModule"}
+_MODULES = {
+    "HuMManDataModule": "humman",
+    "RenderedDataModule": "datamodule",
+    "ScansDataModule": "datamodule",
+    "SyntheticDataModule": "datamodule",
+    "THuman2DataModule": "thuman2",
+    "ZJUMoCapDataModule": "zju_mocap",
+}
 
-__all__ = ["RenderedDataModule", "ScansDataModule", "SyntheticDataModule"]
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from ghgs_lit.data import datamodule
-
-    return getattr(datamodule, name)
+    return getattr(importlib.import_module(f"ghgs_lit.data.{_MODULES[name]}"), name)

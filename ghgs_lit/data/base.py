@@ -100,6 +100,10 @@ class PhotographsDataModule(LightningDataModule):
         """Problems of the files beside those that :meth:`reader` finds, ``path: expected ...; found ...``."""
         return []
 
+    def people(self, phase: str) -> int:
+        """How many people a phase has; where a person is drawn in several frames, fewer than subjects."""
+        return len(self.subjects(phase))
+
     @property
     def folder(self) -> Path:
         """The folder of the data.

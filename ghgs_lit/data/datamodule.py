@@ -10,7 +10,7 @@ from typing import Any
 
 from ghgs_lit import people
 from ghgs_lit.data.base import PHASES, PhotographsDataModule
-from ghgs_lit.data.jobs import RenderSettings, SyntheticSource, identity, render_people
+from ghgs_lit.data.jobs import RenderSettings, Source, SyntheticSource, identity, render_people
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.rig import Rig
 from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
@@ -53,18 +53,18 @@ class RenderedDataModule(PhotographsDataModule):
         """Names of a phase, or None: all that are found."""
         return None
 
+    def layout_options(self, phase: str) -> dict[str, Any]:
+        """How :class:`Layout` is to read a phase."""
+        return {
+            "names": self.subject_names(phase),
+            "limit": self.limit[phase],
+            "pixel_centers": self.pixel_centers,
+            "body_models": self.body_models,
+            "cache_mb": self.cache_images_mb,
+        }
+
     def reader(self, phase: str, size: tuple[int, int] | None, strict: bool = True) -> Layout:
-        return Layout(
-            self.folder,
-            phase,
-            size,
-            names=self.subject_names(phase),
-            limit=self.limit[phase],
-            pixel_centers=self.pixel_centers,
-            body_models=self.body_models,
-            cache_mb=self.cache_images_mb,
-            strict=strict,
-        )
+        return Layout(self.folder, phase, size, **self.layout_options(phase), strict=strict)
 
 
 class SyntheticDataModule(RenderedDataModule):
@@ -139,7 +139,7 @@ class ScansDataModule(RenderedDataModule):
         targets: TargetProtocol | Mapping[str, Any],
         size: int | Sequence[int],
         source: str | None = None,
-        split: str | None = None,
+        split: str | Mapping[str, Sequence[str]] | None = None,
         val_fraction: float = 0.1,
         render_seed: int = 0,
         rig: Rig | Mapping[str, Any] | None = None,
@@ -155,13 +155,24 @@ class ScansDataModule(RenderedDataModule):
         self.render_seed, self.render_workers = render_seed, render_workers
         self.render = from_config(RenderSettings, "data.render", render or {})
 
+    @property
+    def source_folder(self) -> Path:
+        if self.source is None:
+            raise InputError("data.source: expected a folder of scans; found null")
+        return Path(self.source).expanduser()
+
+    def scans(self) -> Source:
+        """Where the scans come from."""
+        return ScanSource(self.source_folder)
+
     def render_scans(self) -> int:
         """Render every scan of the split (up to ``limit``) that ``root`` lacks; how many those were."""
-        for key in ("source", "root"):
-            if getattr(self, key) is None:
-                raise InputError(f"data.{key}: expected a folder; found null")
-        source = ScanSource(Path(self.source).expanduser())
-        names = split_names(source.folder, source.names(), self.split, self.val_fraction, self.render_seed)
+        source = self.scans()
+        if self.root is None:
+            raise InputError("data.root: expected a folder; found null")
+        names = split_names(
+            self.source_folder, source.names(), self.split, self.val_fraction, self.render_seed
+        )
         names = {phase: listed[: self.limit[phase]] for phase, listed in names.items()}
         root = Path(self.root).expanduser()
         return render_people(

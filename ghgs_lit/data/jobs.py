@@ -40,6 +40,9 @@ class Source(Protocol):
 
     def load(self, name: str) -> Person: ...
 
+    def facing(self, name: str) -> float:
+        """Degrees about y that the first camera is turned by, to look at the front."""
+
 
 @dataclass(frozen=True)
 class SyntheticSource:
@@ -49,6 +52,9 @@ class SyntheticSource:
 
     def load(self, name: str) -> Person:
         return people.generate(self.seed, int(name[1:]))
+
+    def facing(self, name: str) -> float:
+        return 0.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ def render_subject(job: _Job) -> _Job:
     """Render one subject into its workspace."""
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
-    yaws, lights = job.rig.yaws(rng), job.settings.lights.draw(rng)
+    yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), job.settings.lights.draw(rng)
     studio = Studio(person, lights, job.settings.samples)
     vids = job.settings.vids
     positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions

@@ -15,6 +15,7 @@ from ghgs_lit.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
+_SPLIT_FILES = ("splits.json", "split_train.txt")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,10 @@ class ScanSource:
         body_path = folder / "body_vertices.npy"
         body = read_array(body_path, [(None, 3)]).astype(np.float32) if body_path.exists() else None
         return Person(name=name, parts=load_parts(path), body_vertices=body)
+
+    def facing(self, name: str) -> float:
+        """Degrees about y that the first camera is turned by: nothing is known of these scans."""
+        return 0.0
 
 
 def _mesh_file(folder: Path) -> Path | None:
@@ -124,23 +129,21 @@ def _image_beside(path: Path) -> Image.Image | None:
 
 
 def split_names(
-    source: Path, names: Sequence[str], split: str | None, val_fraction: float, seed: int
+    source: Path,
+    names: Sequence[str],
+    split: str | Mapping[str, Sequence[str]] | None,
+    val_fraction: float,
+    seed: int,
 ) -> dict[str, list[str]]:
     """Which of ``names`` are ``train`` and which ``val``.
 
-    ``split`` is a JSON file with lists ``train`` and ``val`` (or ``test``), or a folder with
-    ``split_train.txt`` and ``split_val.txt`` (one id a line). Without it, such files in the source
-    folder count; without those, ``val_fraction`` of the names are drawn by ``seed``.
+    ``split`` is as for :func:`read_split`. Without it, such files in the source folder count; without
+    those, ``val_fraction`` of the names are drawn by ``seed``.
 
     Raises:
         InputError: the split is missing or malformed, names scans that do not exist, or overlaps.
     """
-    place = Path(split).expanduser() if split else source
-    if place.is_dir():
-        place = next((p for n in ("splits.json", "split_train.txt") if (p := place / n).exists()), place)
-    if split and not place.is_file():
-        raise InputError(f"{place}: expected a JSON file, or a folder with split_train.txt; found neither")
-    if not place.is_file():
+    if split is None and not any((source / name).exists() for name in _SPLIT_FILES):
         require(0 <= val_fraction < 1, "data.val_fraction", "at least 0 and below 1", val_fraction)
         order = np.random.default_rng(seed).permutation(len(names))
         count = round(val_fraction * len(names))
@@ -148,13 +151,57 @@ def split_names(
             "train": [names[i] for i in sorted(order[count:])],
             "val": [names[i] for i in sorted(order[:count])],
         }
-    chosen = _read_split(place)
+    chosen = read_split(source if split is None else split, names)
     for phase, listed in chosen.items():
         if unknown := sorted(set(listed) - set(names)):
-            raise InputError(f"{place}: expected ids of scans in {source}; found {unknown[0]!r} in {phase}")
+            raise InputError(
+                f"{split or source}: expected ids of scans in {source}; found {unknown[0]!r} in {phase}"
+            )
+    return chosen
+
+
+def read_split(split: str | Path | Mapping[str, Sequence[str]], names: Sequence[str]) -> dict[str, list[str]]:
+    """Who is ``train`` and who ``val`` (a split without ``val`` may call it ``test``).
+
+    ``split``: a JSON file with these lists, a folder with one or with ``split_train.txt`` and
+    ``split_val.txt`` (one id a line), or a mapping of ids and of ranges ``0000-0425``, which stand for
+    those of ``names`` that lie in them.
+
+    Raises:
+        InputError: it is missing, malformed, or somebody is in both.
+    """
+    if isinstance(split, Mapping):
+        place: Path | str = "data.split"
+        chosen = _lists(place, split)
+        chosen = {
+            phase: [n for entry in listed for n in _expand(entry, names)] for phase, listed in chosen.items()
+        }
+    else:
+        folder = place = Path(split).expanduser()
+        if folder.is_dir():
+            place = next((p for n in _SPLIT_FILES if (p := folder / n).exists()), folder)
+        if not place.is_file():
+            raise InputError(f"{place}: expected a JSON file or a folder with split_train.txt; found neither")
+        chosen = _read_split(place)
     if both := sorted(set(chosen["train"]) & set(chosen["val"])):
         raise InputError(f"{place}: expected disjoint train and val; found {both[0]!r} in both")
     return chosen
+
+
+def _expand(entry: object, names: Sequence[str]) -> list[str]:
+    """An id, or those of ``names`` in a range of ids of equal length."""
+    first, dash, last = str(entry).partition("-")
+    if not dash:
+        return [str(entry)]
+    return [name for name in names if len(name) == len(first) and first <= name <= last]
+
+
+def _lists(place: Path | str, content: Mapping) -> dict[str, list]:
+    chosen = {"train": content.get("train"), "val": content.get("val", content.get("test"))}
+    for phase, listed in chosen.items():
+        if not isinstance(listed, Sequence) or isinstance(listed, str):
+            raise InputError(f"{place}: expected a list {phase!r} (test does for val); found {listed!r}")
+    return {phase: list(listed) for phase, listed in chosen.items()}
 
 
 def _read_split(path: Path) -> dict[str, list[str]]:
@@ -163,12 +210,7 @@ def _read_split(path: Path) -> dict[str, list[str]]:
             content = json.loads(path.read_text())
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: expected JSON; found {error}") from error
-        content = content if isinstance(content, Mapping) else {}
-        chosen = {"train": content.get("train"), "val": content.get("val", content.get("test"))}
-        for phase, listed in chosen.items():
-            if not isinstance(listed, list):
-                raise InputError(f"{path}: expected a list {phase!r} (test does for val); found {listed!r}")
-        return chosen
+        return _lists(path, content if isinstance(content, Mapping) else {})
     result = {}
     for phase in ("train", "val"):
         file = path.with_name(f"split_{phase}.txt")
