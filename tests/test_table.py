@@ -1,72 +1,25 @@
-"""The ablation table out of fabricated runs."""
+"""The ablation table out of fabricated runs: rows, columns, best, seeds, what is missing, what is refused."""
 
+import csv
+import io
 import json
 
 import pytest
+import yaml
+from table_runs import body, start_run, tables_of, write_run
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.results import read_results, summarize, write_results
-from ghgs_lit.experiments.table import (
-    FOOTNOTE,
-    ILLUSTRATION,
-    NO_SEMANTICS,
-    caption,
-    collect,
-    deviation,
-    to_csv,
-    to_markdown,
-)
-
-SWITCHES = {
-    "full": (True, True),
-    "no_unprojection": (False, True),
-    "no_semantic": (True, False),
-    "neither": (False, False),
-}
-
-
-def write_run(folder, ablation, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None):
-    """A run of two subjects whose mean PSNR at n views is ``psnr + n``."""
-    unprojection, semantic = SWITCHES[ablation]
-    config = {
-        "ablation": {"name": ablation, "unprojection": unprojection, "semantic": semantic},
-        "model": {"name": "paper"},
-        "encoder": {"weights": weights},
-        "seed": seed,
-    }
-    rows = [
-        {
-            "method": "model", "subject": subject, "views": n, "targets": targets, "target": "000/3",
-            "inputs": ["000/0"], "psnr": psnr + n + shift, "ssim": 0.9, "flip": 0.1,
-            **({} if lpips is None else {"lpips": lpips}),
-        }
-        for n in views
-        for subject, shift in (("a", -1.0), ("b", 1.0))
-    ]  # fmt: skip
-    source = {
-        "config": config,
-        "seed": seed,
-        "data": {"name": "synthetic", "split": "val"},
-        "protocol": {"metrics": "correct"},
-        "choices": {"encoder": "vggt_nano"},
-    }
-    return write_results(folder, rows, source)
-
-
-def body(markdown):
-    """The table's rows by their first two cells, without marks for notes."""
-    lines = [
-        [c.strip() for c in line.strip("|").split("|")] for line in markdown.splitlines() if line[:1] == "|"
-    ]
-    return {(row[0], row[1][:1]): row[2:] for row in lines[2:]}, lines[0]
+from ghgs_lit.experiments.tables import read_sweep, to_csv, to_markdown
+from ghgs_lit.experiments.tables.text import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS, deviation
 
 
 def test_rows_columns_best_and_missing(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1" / "deep", "no_semantic", 21.0, views=(4,))
     write_run(tmp_path / "2", "no_unprojection", 19.0)
-    (table,) = collect(tmp_path)
-    rows, header = body(to_markdown(table, [3, 4, 5]))
+    (table,) = tables_of(tmp_path)
+    rows, header = body(to_markdown(table))
     assert header[2:5] == ["3-view PSNR ↑", "3-view SSIM ↑", "3-view FLIP ↓"]
     assert header[5] == "4-view PSNR ↑"
     assert list(rows) == [("✗", "✗"), ("✗", "✓"), ("✓", "✗"), ("✓", "✓")]
@@ -82,67 +35,144 @@ def test_rows_columns_best_and_missing(tmp_path):
 def test_several_seeds_give_a_deviation(tmp_path):
     for seed, psnr in ((1, 20.0), (2, 21.0), (3, 22.0)):
         write_run(tmp_path / str(seed), "full", psnr, seed=seed)
-    (table,) = collect(tmp_path)
-    rows, _ = body(to_markdown(table, [4]))
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
     assert rows["✓", "✓"][0] == "25.00 ± 1.00"
-    assert "3 seeds" in caption(table)
+    assert "3 seeds" in table.caption
     assert deviation([1.0]) is None
+
+
+def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
+    write_run(tmp_path / "0", "full", 20.0, lpips=0.05)
+    write_run(tmp_path / "1", "neither", 20.0, lpips=0.06)
+    (table,) = tables_of(tmp_path, views=(3,), metrics=("lpips", "flip"))
+    rows, header = body(to_markdown(table))
+    assert header[2:] == ["3-view LPIPS ↓", "3-view FLIP ↓"]
+    assert rows["✓", "✓"] == ["**0.0500**", "0.1000"]
+    assert rows["✗", "✗"] == ["0.0600", "0.1000"]
+
+
+def test_seeds_that_were_asked_for_and_are_not_there_are_said(tmp_path):
+    for seed in (1, 2):
+        write_run(tmp_path / f"full{seed}", "full", 20.0 + seed, seed=seed)
+    write_run(tmp_path / "other", "neither", 20.0, seed=1)
+    start_run(tmp_path / "going", "neither", seed=2)
+    multirun = "hydra: {overrides: {task: ['seed=1,2,3', 'ablation=full,neither']}, sweeper: {params: null}}"
+    (tmp_path / "multirun.yaml").write_text(multirun)
+    # Half-written, and foreign: neither is a run.
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "config.yaml").write_text("ablation: {name: [")
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
+    assert rows["✓", "✓"][0] == "**25.50 ± 0.71 (2/3)**"
+    assert rows["✗", "✗"][0] == "24.00 (1/3)"
+    assert any("synthetic paper neither seed 2" in note for note in table.notes)
+    assert not any("seed 1" in note for note in table.notes)
+
+
+def test_the_seeds_of_a_sweeps_parameters_are_asked_for_too(tmp_path):
+    write_run(tmp_path / "0", "full", 20.0)
+    for seed, seeds in (("range(1,4)", {1, 2, 3}), ("1,2", {1, 2}), (5, {5})):
+        hydra = {"overrides": {"task": []}, "sweeper": {"params": {"seed": seed}}}
+        (tmp_path / "multirun.yaml").write_text(yaml.safe_dump({"hydra": hydra}))
+        assert read_sweep([tmp_path]).seeds == seeds
+
+
+def test_a_row_is_told_by_what_was_trained(tmp_path):
+    """The configuration of `ghgs evaluate` says nothing about the model in its checkpoint."""
+    write_run(tmp_path / "evaluated", "no_semantic", 20.0, seed=7, verb="evaluate")
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
+    assert rows["✓", "✗"][0] == "24.00"
+    assert rows["✗", "✗"][0] == "missing"
 
 
 def test_lpips_is_shown_when_every_run_has_it(tmp_path):
     write_run(tmp_path / "0", "full", 20.0, lpips=0.05, weights="vggt.safetensors")
-    (table,) = collect(tmp_path)
-    text = to_markdown(table, [3])
+    (table,) = tables_of(tmp_path, views=(3,))
+    text = to_markdown(table)
     assert "3-view LPIPS ↓" in text
     assert "FLIP" not in text
     assert NO_SEMANTICS not in text
     write_run(tmp_path / "1", "neither", 20.0, weights="vggt.safetensors")
-    (table,) = collect(tmp_path)
-    assert "3-view FLIP ↓" in to_markdown(table, [3])
+    (table,) = tables_of(tmp_path, views=(3,))
+    assert "3-view FLIP ↓" in to_markdown(table)
 
 
 def test_notes_and_caption_say_what_the_numbers_are(tmp_path):
-    write_run(tmp_path / "0", "full", 20.0)
-    (table,) = collect(tmp_path)
-    text = to_markdown(table, [3], illustration=True)
+    write_run(tmp_path / "0", "full", 20.0, git={"commit": "a" * 40, "changed": False})
+    (table,) = tables_of(tmp_path, illustration=True)
+    text = to_markdown(table)
     for said in (FOOTNOTE, NO_SEMANTICS, ILLUSTRATION, "`synthetic`", "2 subjects", "`release`", "`correct`"):
         assert said in text
-    assert ILLUSTRATION not in to_markdown(table, [3])
+    assert "states of the code" not in text
+    write_run(
+        tmp_path / "1", "neither", 20.0, git={"commit": "b" * 40, "changed": True}, optimizer={"lr": 0.1}
+    )
+    (table,) = tables_of(tmp_path)
+    text = to_markdown(table)
+    assert ILLUSTRATION not in text
+    # What a reviewer would ask: is it the same code and the same training?
+    assert "2 states of the code: aaaaaaaaa, bbbbbbbbb with changes" in text
+    assert "differ also in `optimizer.lr` (absent, 0.1)" in text
 
 
 def test_targets_are_tables_of_their_own_and_can_be_picked(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 18.0, targets="midway")
-    assert [t.setting.targets for t in collect(tmp_path)] == ["release", "midway"]
-    assert [t.setting.targets for t in collect(tmp_path, ["midway"])] == ["midway"]
+    write_run(tmp_path / "2", "full", 18.0, protocol="release")
+    settings = [tuple(t.about["records"][0].setting.__dict__.values()) for t in tables_of(tmp_path)]
+    assert [s[2:] for s in settings] == [
+        ("release", "correct"),
+        ("midway", "correct"),
+        ("release", "release"),
+    ]
+    (table,) = tables_of(tmp_path, targets=("midway",))
+    assert "targets `midway`" in table.caption
     with pytest.raises(InputError, match="others only"):
-        collect(tmp_path, ["random"])
+        tables_of(tmp_path, targets=("random",))
 
 
-def test_two_runs_of_one_cell_are_refused(tmp_path):
+def test_two_runs_of_one_cell_are_refused_and_can_be_told_apart(tmp_path):
+    write_run(tmp_path / "0", "full", 20.0, optimizer={"lr": 0.1})
+    write_run(tmp_path / "1", "full", 21.0, optimizer={"lr": 0.2})
+    expected = r"ablation=full, 3 views, seed 1; found .*0/metrics\.json .*by=\[optimizer\.lr\]"
+    with pytest.raises(InputError, match=expected):
+        tables_of(tmp_path)
+    first, second = tables_of(tmp_path, by=["optimizer.lr"])
+    assert "`optimizer.lr=0.1`" in first.caption
+    assert "`optimizer.lr=0.2`" in second.caption
+
+
+def test_the_same_numbers_twice_are_one_run(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
-    write_run(tmp_path / "1", "full", 21.0)
-    with pytest.raises(InputError, match=r"ablation=full, 3 views, seed 1; found .*0/metrics\.json"):
-        collect(tmp_path)
+    write_run(tmp_path / "1", "full", 20.0, verb="evaluate")
+    (table,) = tables_of(tmp_path)
+    assert all(list(cell.seeds) == [1] for line in table.lines for cell in line.cells.values())
 
 
 def test_csv_has_every_cell_in_full(tmp_path):
     write_run(tmp_path / "0", "full", 20.0 + 1 / 3, views=(3,))
-    lines = to_csv(collect(tmp_path), [3, 4]).splitlines()
-    assert len(lines) == 1 + 4 * 2 * 3
-    (line,) = (line for line in lines if ",True,True,3,psnr," in line)
-    assert float(line.split(",")[-2]) == pytest.approx(23 + 1 / 3, abs=1e-12)
+    rows = list(csv.DictReader(io.StringIO(to_csv(tables_of(tmp_path, views=(3, 4))))))
+    assert len(rows) == 4 * 2 * 3
+    (row,) = (r for r in rows if (r["ablation"], r["views"], r["metric"]) == ("full", "3", "psnr"))
+    assert float(row["mean"]) == pytest.approx(23 + 1 / 3, abs=1e-12)
+    assert (row["seeds"], row["subjects"], row["runs"], row["deviation"]) == ("1", "2", "full1", "")
+    assert sum(r["mean"] == "" for r in rows) == 24 - 3
 
 
 def test_results_that_are_none_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        collect(tmp_path / "nowhere")
+        read_sweep([tmp_path / "nowhere"])
     with pytest.raises(InputError, match="none"):
-        collect(tmp_path)
+        read_sweep([tmp_path])
+    start_run(tmp_path / "going", "full")
+    with pytest.raises(InputError, match="1 runs without one"):
+        read_sweep([tmp_path])
     path = tmp_path / "metrics.json"
     path.write_text("{")
     with pytest.raises(InputError, match=r"metrics\.json"):
-        collect(tmp_path)
+        read_sweep([tmp_path])
     path.write_text(json.dumps({"format_version": 99}))
     with pytest.raises(InputError, match="format_version 1; found 99"):
         read_results(path)
@@ -166,6 +196,6 @@ def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
     assert content["rows"][0]["psnr_box"] is None
     assert content["rows"][2]["psnr_box"] is None
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
-    assert lines[0] == "method,subject,views,targets,target,inputs,psnr,psnr_box,depth_error_mm"
-    assert lines[1] == "model,a,3,release,t,a b,20.0,,"
+    assert lines[0].startswith("method,subject,views,targets,target,inputs,psnr,psnr_box,depth_error_mm")
+    assert lines[1].startswith("model,a,3,release,t,a b,20.0,,")
     assert not list(tmp_path.glob(".*"))

@@ -1,33 +1,74 @@
-"""``ghgs table``: the runs below a directory as the paper's ablation table."""
+"""``ghgs table``: the runs below a directory as one of the paper's tables."""
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
 
 from ghgs_lit.cli.runtime import announce, output_dir, plain
-from ghgs_lit.errors import require
-from ghgs_lit.experiments.table import caption, collect, notes, to_csv, to_markdown, to_terminal
+from ghgs_lit.data.settings import from_config
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.experiments import tables as t
+
+
+def _listed(key: str, value: Any, kind: type) -> tuple | None:
+    """A value, a list of them, or None for null and an empty list."""
+    values = [value] if isinstance(value, kind) else value or ()
+    valid = isinstance(values, Sequence) and all(isinstance(v, kind) for v in values)
+    require(valid, key, f"one or more of type {kind.__name__}, or null", value)
+    return tuple(values) or None
+
+
+def _options(config: dict[str, Any]) -> t.TableOptions:
+    evaluation = config["evaluation"]
+    try:
+        unit = re.compile(config["test"].pop("unit") or "(.+)")
+    except re.error as error:
+        raise InputError(f"test.unit: expected a regular expression; found {error}") from None
+    require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
+    return t.TableOptions(
+        layout=t.layout_named(config["layout"]),
+        views=_listed("evaluation.views", evaluation["views"], int),
+        targets=_listed("evaluation.targets", evaluation["targets"], str),
+        metrics=_listed("metrics", config["metrics"], str),
+        reported=config["reported"],
+        test=from_config(t.PairedTest, "test", config["test"]),
+        unit=unit,
+    )
 
 
 def run(cfg: DictConfig) -> None:
     config = plain(cfg)
-    views, targets = config["evaluation"]["views"], config["evaluation"]["targets"]
-    are_counts = isinstance(views, list) and bool(views) and all(isinstance(n, int) for n in views)
-    require(are_counts, "evaluation.views", "a list of numbers of views", views)
-    targets = [targets] if isinstance(targets, str) else targets
-    tables = collect(Path(config["sweep"]).expanduser(), targets)
-    text = "\n".join(to_markdown(table, views, config["illustration"]) for table in tables)
+    options = _options(config)
+    folders = [Path(p).expanduser() for p in _listed("sweep", config["sweep"], str) or ()]
+    others = [
+        r for p in _listed("others", config["others"], str) or () for r in t.read_others(Path(p).expanduser())
+    ]
+    sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
+    tables = t.build_tables(sweep, others, options)
+    for table in tables:
+        table.caption = t.write_caption(table)
+        table.notes = t.write_notes(table, options.test, config["illustration"])
     directory = output_dir()
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "table.csv").write_text(to_csv(tables, views))
-    (directory / "table.md").write_text(text)
+    labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
+    latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))
+    (directory / "table.csv").write_text(t.to_csv(tables))
+    (directory / "table.tex").write_text(t.PREAMBLE + latex)
+    (directory / "table.md").write_text("\n".join(t.to_markdown(table) for table in tables))
     for table in tables:
-        printed = to_terminal(table, views)
-        # A number cut short is worse than a line that wraps.
-        needed = Console(width=1000).measure(printed).maximum
-        console = Console(width=max(Console().width, needed))
-        console.print(caption(table).replace("`", ""))
-        console.print(printed)
-        console.print("\n".join(notes(table, config["illustration"])).replace("**", ""))
+        _print(table)
     announce(directory / "table.md")
+
+
+def _print(table: t.Table) -> None:
+    printed = t.to_terminal(table)
+    # A number cut short is worse than a line that wraps.
+    needed = Console(width=1000).measure(printed).maximum
+    console = Console(width=max(Console().width, needed))
+    console.print(table.caption.replace("`", ""), highlight=False)
+    console.print(printed)
+    console.print("\n".join(table.notes).replace("**", "").replace("`", ""), markup=False, highlight=False)

@@ -12,6 +12,8 @@ from typing import Any
 from ghgs_lit.errors import InputError
 
 FORMAT_VERSION = 1
+METHOD = "model"
+"""The method of rows that a trained model made; others are baselines."""
 KEYS = ("method", "subject", "views", "targets", "target", "inputs")
 """What a row is about; everything else in it is a number."""
 
