@@ -1,0 +1,190 @@
+"""Photographs of ZJU-MoCap sequences as they were downloaded.
+
+``<root>/CoreView_<id>/`` holds ``annots.npy`` (see :mod:`.annotations`), the photographs of each camera,
+``mask_cihp/`` and sometimes ``mask/`` (label maps: any value but 0 is the subject), ``new_vertices/`` and
+``vertices/`` (<frame number>.npy: 6890 x 3, metres, world with z up).
+"""
+
+import functools
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from ghgs_lit.data.reader import Reader, View, check_name, read_array, read_image, read_map
+from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
+from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
+from ghgs_lit.errors import InputError, require
+
+log = logging.getLogger(__name__)
+
+BODY_VERTICES = 6890
+# How far from the image's centre a principal point may lie, as a part of the side.
+_OFF_CENTRE = 0.25
+
+
+@dataclass(frozen=True)
+class Split:
+    """``sequences`` (ids) with the frames ``range(*frames)`` of each: places in its ``annots.npy``, from 0.
+
+    A sequence that is shorter gives those that it has, as in the published loaders.
+    """
+
+    sequences: tuple[str, ...]
+    frames: tuple[int, int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sequences", tuple(map(str, self.sequences)))
+        object.__setattr__(self, "frames", tuple(self.frames))
+        require(len(self.sequences) > 0, "data.splits.sequences", "ids such as 377", list(self.sequences))
+        start, stop, step = self.frames if len(self.frames) == 3 else (-1, 0, 0)
+        valid = 0 <= start < stop and step >= 1
+        require(valid, "data.splits.frames", "[start, stop, step] with start < stop", list(self.frames))
+
+
+@dataclass(frozen=True)
+class _Frame:
+    folder: Path
+    annotations: Annotations
+    index: int
+
+    @property
+    def number(self) -> int:
+        return frame_number(self.annotations.frames[self.index][0])
+
+
+class ZJUMoCapReader(Reader):
+    """Frames of ``splits``, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
+
+    Args:
+        folder: root of the data set.
+        splits: which sequences and frames.
+        cameras: the first so many of each sequence (None: all 21 or 23).
+        undistorted: take the lens distortion out of photographs and masks.
+        masks: folders whose label maps are united, those that a sequence has.
+        bodies: folders of vertices, the first that a sequence has.
+        limit: of all frames, the first so many.
+        size, cache_mb, strict: as for :class:`Reader`.
+
+    Sequences that are not there are left out (``ghgs prepare task=check`` counts them).
+
+    Raises:
+        InputError: none of the sequences is there, or annotations are bad.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        splits: Sequence[Split],
+        cameras: int | None = 20,
+        undistorted: bool = True,
+        masks: Sequence[str] = ("mask_cihp",),
+        bodies: Sequence[str] = ("new_vertices", "vertices"),
+        limit: int | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self.undistorted, self.masks, self.bodies = undistorted, tuple(masks), tuple(bodies)
+        self._frames: dict[str, _Frame] = {}
+        for sequence, frames in ((s, split.frames) for split in splits for s in split.sequences):
+            path = folder / f"CoreView_{sequence}"
+            if path.is_dir():
+                self._add(path, frames, cameras)
+            else:
+                log.warning("%s: no such sequence, left out", path)
+        if not self._frames and not self.problems:
+            self.problem(f"{folder}: expected sequences of the split, such as {path.name}; found none")
+        self.subjects = dict(list(self.subjects.items())[:limit])
+
+    @property
+    def sequences(self) -> set[str]:
+        """Names of the sequences that the subjects are frames of."""
+        return {self._frames[name].folder.name for name in self.subjects}
+
+    def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
+        """The chosen frames of one sequence."""
+        try:
+            annotations = read_annotations(path / "annots.npy")
+            count = len(annotations.intrinsics)
+            if cameras is not None and cameras > count:
+                raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
+            wanted = range(*frames)
+            chosen = [index for index in wanted if index < len(annotations.frames)]
+            if not chosen:
+                raise InputError(
+                    f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
+                    f"found {len(annotations.frames)} frames"
+                )
+            found = [_Frame(path, annotations, index) for index in chosen]
+            named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in found}
+        except InputError as error:
+            self.problem(str(error))
+            return
+        if len(chosen) < len(wanted):
+            log.info("%s: %d of %d frames (the sequence is shorter)", path, len(chosen), len(wanted))
+        self._frames |= named
+        self.subjects |= dict.fromkeys(named, tuple(range(count if cameras is None else cameras)))
+
+    def read_view(self, name: str, pid: int, vid: int, depth: bool) -> View:
+        frame = self._frames[name]
+        photograph = frame.annotations.frames[frame.index][pid]
+        path = _find(frame.folder, photograph, photograph.suffix)
+        image = np.array(read_image(path).convert("RGB"))
+        mask = self._mask(frame.folder, photograph, image.shape[:2])
+        intrinsics = frame.annotations.intrinsics[pid].copy()
+        _check_centre(path, intrinsics, *image.shape[:2])
+        if self.undistorted:
+            grid = undistorting_grid(intrinsics, frame.annotations.distortions[pid], *image.shape[:2])
+            image, mask = undistort(image, mask, grid)
+        image[~mask] = 0
+        intrinsics[:2, 2] += 0.5  # the calibration puts pixel centres at integers
+        return View(
+            image=image,
+            mask=mask,
+            inverse_depth=None,
+            intrinsics=intrinsics.astype(np.float32),
+            extrinsics=frame.annotations.extrinsics[pid].astype(np.float32),
+        )
+
+    def read_body(self, name: str) -> np.ndarray | None:
+        frame = self._frames[name]
+        folder = next((f for b in self.bodies if (f := frame.folder / b).is_dir()), None)
+        if folder is None:
+            return None
+        return read_array(folder / f"{frame.number}.npy", [(BODY_VERTICES, 3)]).astype(np.float32)
+
+    def place(self, name: str, pid: int, vid: int) -> str:
+        frame = self._frames[name]
+        photograph = frame.annotations.frames[frame.index][pid]
+        return str(_find(self._mask_folders(frame.folder)[0], photograph, ".png"))
+
+    def _mask_folders(self, folder: Path) -> list[Path]:
+        folders = [path for name in self.masks if (path := folder / name).is_dir()]
+        if not folders:
+            raise InputError(f"{folder}: expected a folder of masks, {' or '.join(self.masks)}; found none")
+        return folders
+
+    def _mask(self, folder: Path, photograph: PurePosixPath, size: tuple[int, int]) -> np.ndarray:
+        """Where any of the label maps has a label."""
+        paths = [_find(masks, photograph, ".png") for masks in self._mask_folders(folder)]
+        return functools.reduce(np.logical_or, [read_map(path, size) != 0 for path in paths])
+
+
+def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
+    """A file of a photograph under its own name, or under its frame field alone (313 and 315, renamed)."""
+    path = folder / photograph.with_suffix(suffix)
+    renamed = path.with_name(frame_field(photograph) + suffix)
+    return renamed if not path.exists() and renamed.exists() else path
+
+
+def _check_centre(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
+    """Photographs that were resized by somebody no longer fit their calibration."""
+    off = np.abs(intrinsics[:2, 2] / [width, height] - 0.5)
+    if off.max() > _OFF_CENTRE:
+        raise InputError(
+            f"{path}: expected a photograph of the calibration's size, its principal point "
+            f"{intrinsics[0, 2]:.0f}, {intrinsics[1, 2]:.0f} near the centre; found {height}x{width}"
+        )
