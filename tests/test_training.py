@@ -14,7 +14,9 @@ from training_standins import Standin, example_batch, flat_renderer
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
-from ghgs_lit.training.callbacks import Checkpoints, Pictures, RunProgress, StepTime
+from ghgs_lit.training.callbacks import RunProgress, StepTime
+from ghgs_lit.training.checkpoints import Checkpoints
+from ghgs_lit.training.watch import Pictures
 
 RELEASE = Optimization(lr=1e-4, warmup=0.01, start_factor=0.04, end_factor=5e-4)
 CONFIG = {"encoder": {"width": 3, "layers": [0, 1]}, "seed": 1, "resume": None}
@@ -186,11 +188,11 @@ def test_callbacks_write_pictures_and_numbers(tmp_path):
     ]
     header = (tmp_path / "csv" / "metrics.csv").read_text().splitlines()[0].split(",")
     expected = {
-        "train/loss",
-        "train/render_l1",
-        "train/chamfer",
+        "loss/total",
+        "loss/render_l1",
+        "loss/chamfer",
         "train/gradient_norm",
-        "time/step",
+        "time_ms/step",
         "val/psnr",
     }
     assert expected <= set(header)

@@ -18,7 +18,7 @@ ERROR_GAIN = 4.0
 
 
 @cache
-def _colors(name: str) -> np.ndarray:
+def palette(name: str) -> np.ndarray:
     import matplotlib
 
     return (matplotlib.colormaps[name](np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
@@ -34,7 +34,7 @@ def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor |
     """[h, w] numbers as colours between ``low`` and ``high``; black where not ``valid``."""
     values = values.detach().float().cpu()
     scaled = ((values - low) / max(high - low, 1e-9)).nan_to_num(0).clamp(0, 1)
-    picture = _colors(name)[(scaled * 255).round().long().numpy()]
+    picture = palette(name)[(scaled * 255).round().long().numpy()]
     if valid is not None:
         picture = picture * valid.cpu().numpy()[..., None].astype(np.uint8)
     return picture

@@ -50,6 +50,11 @@ def choices() -> dict[str, str]:
     return dict(HydraConfig.get().runtime.choices) if HydraConfig.initialized() else {}
 
 
+def overrides() -> list[str]:
+    """What the command line, or the sweep, changed in this run; empty outside of Hydra."""
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+
+
 def measure_and_write(
     methods: Mapping[str, Method],
     data: LightningDataModule,

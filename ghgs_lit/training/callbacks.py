@@ -1,32 +1,18 @@
-"""What happens beside the training step: checkpoints, pictures, times."""
+"""Numbers beside the training step: progress, times, memory."""
 
-import time
+import resource
+import sys
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, ProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.utilities import rank_zero_only
+import torch
+from lightning.pytorch.callbacks import Callback, ProgressBar
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from torch import nn
 
-from ghgs_lit.errors import require
-from ghgs_lit.experiments.pictures import save_png, sheet
+from ghgs_lit.training.clock import PARTS, StepClock
 from ghgs_lit.types import Batch
-
-
-class Checkpoints(ModelCheckpoint):
-    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; each file replaces the last of its name.
-
-    A file is written aside and renamed by Lightning, so that a killed run leaves the one before whole.
-    """
-
-    def __init__(self, **kwargs):
-        super().__init__(auto_insert_metric_name=False, enable_version_counter=False, **kwargs)
-
-    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        self.dirpath = self.dirpath or str(Path(trainer.default_root_dir) / "checkpoints")
-        super().setup(trainer, pl_module, stage)
 
 
 class RunProgress(ProgressBar):
@@ -80,56 +66,74 @@ class RunProgress(ProgressBar):
             self._bar = None
 
 
+def _logs_now(trainer: L.Trainer) -> bool:
+    return trainer.global_step % trainer.log_every_n_steps == 0
+
+
 class StepTime(Callback):
-    """Logs the seconds of a step and, apart, those spent waiting for data."""
+    """Logs the milliseconds of a step and of each part of it, as means since the last log.
 
-    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._ended = time.perf_counter()
-
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        self._started = time.perf_counter()
-
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        # The check of the gradient's norm has waited for the device already.
-        now = time.perf_counter()
-        pl_module.log_dict({"time/data": self._started - self._ended, "time/step": now - self._started})
-        self._ended = now
-
-
-class Pictures(Callback):
-    """Writes inputs, depths, targets and renders of the first subjects of each validation.
-
-    To TensorBoard and to ``<run>/pictures/step_<step>/<subject>.png``.
+    ``time_ms/01_data`` is the wait for data, ``time_ms/step`` the sum of all parts; validation, the
+    writing of checkpoints and of logs are in none of them. Parts that a model does not have are left out.
     """
 
-    def __init__(self, subjects: int = 2):
-        require(subjects >= 0, "callbacks.pictures.subjects", "a number of at least 0", subjects)
-        self.subjects = subjects
-        self._left = 0
+    #: A stage of the model: the part that ends where it begins, and the part that it is.
+    STAGES = (
+        ("encoder", "interval", "encode"),
+        ("depth_head", None, "depth"),
+        ("recalibration", "unproject", "recalibrate"),
+        ("gaussian_head", None, "gaussians"),
+    )
 
-    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._left = 0 if trainer.sanity_checking else self.subjects
+    def __init__(self):
+        self._hooks: list = []
 
-    @rank_zero_only
-    def on_validation_batch_end(
-        self,
-        trainer: L.Trainer,
-        pl_module: L.LightningModule,
-        outputs: dict[str, Any],
-        batch: Batch,
-        *args: Any,
-    ) -> None:
-        for element in range(min(self._left, len(batch.images))):
-            prediction = outputs["prediction"]
-            picture = sheet(
-                batch, outputs["rendering"].image, element, prediction.depth, prediction.depth_valid
-            )
-            name = batch.subjects[element] if batch.subjects else f"subject_{self.subjects - self._left}"
-            folder = Path(trainer.default_root_dir) / "pictures" / f"step_{trainer.global_step:06d}"
-            save_png(picture, folder / f"{name}.png")
-            for logger in trainer.loggers:
-                if isinstance(logger, TensorBoardLogger):
-                    logger.experiment.add_image(
-                        f"val/{name}", picture, trainer.global_step, dataformats="HWC"
-                    )
-            self._left -= 1
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        pl_module.clock = StepClock(pl_module.device)
+        for name, before, part in self.STAGES:
+            stage = getattr(pl_module.model, name, None)
+            if isinstance(stage, nn.Module):
+                if before is not None:
+                    hook = stage.register_forward_pre_hook(lambda *_, part=before: pl_module.mark(part))
+                    self._hooks.append(hook)
+                self._hooks.append(stage.register_forward_hook(lambda *_, part=part: pl_module.mark(part)))
+        pl_module.clock.start()
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        pl_module.mark("data")
+
+    def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        pl_module.mark("backward")
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        pl_module.clock.end()
+        if _logs_now(trainer):
+            names = {part: f"{place:02d}_{part}" for place, part in enumerate(PARTS, start=1)}
+            means = pl_module.clock.means()
+            pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        pl_module.clock = None
+        while self._hooks:
+            self._hooks.pop().remove()
+
+
+def resident_mb() -> float:
+    """Memory of this process: what it holds now on Linux, the most it ever held elsewhere."""
+    pages = Path("/proc/self/statm")
+    if pages.exists():
+        return int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+class Memory(Callback):
+    """Logs the process's memory and, on CUDA, the most that tensors took since the last log, in MiB."""
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
+        if not _logs_now(trainer):
+            return
+        pl_module.log("memory_mb/process", resident_mb())
+        if pl_module.device.type == "cuda":
+            pl_module.log("memory_mb/cuda_peak", torch.cuda.max_memory_allocated(pl_module.device) / 2**20)
+            torch.cuda.reset_peak_memory_stats(pl_module.device)

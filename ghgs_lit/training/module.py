@@ -4,14 +4,17 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import lightning.pytorch as L
+import numpy as np
 import torch
 from lightning.pytorch.callbacks import Timer
 from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
-from ghgs_lit.metrics import PSNR
+from ghgs_lit.metrics import PSNR, depth_error_mm
+from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.model import FORMAT_VERSION
+from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
@@ -42,12 +45,32 @@ class GHGSModule(L.LightningModule):
         self.config = config
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
         self.used_budget = 0.0
+        self.clock: StepClock | None = None
+
+    def mark(self, part: str) -> None:
+        """A part of the step ends here; says so to the clock, where one listens."""
+        if self.clock is not None:
+            self.clock.mark(part)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         prediction = self.model(batch)
-        return prediction, self.renderer(prediction.gaussians, batch.targets.cameras)
+        self.mark("gaussians")
+        rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
+        self.mark("render")
+        return prediction, rendering
+
+    def on_train_start(self) -> None:
+        # The scheduler does not ask again before the first step after a restart is taken.
+        self.used_budget = self.progress()
+
+    def step_seed(self, batch_idx: int) -> int:
+        """Seed of the random numbers of this step: the same whether the run was interrupted or not."""
+        part = batch_idx % self.trainer.accumulate_grad_batches
+        numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
+        return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        torch.manual_seed(self.step_seed(batch_idx))
         prediction, rendering = self(batch)
         total, values = self.losses(prediction, rendering, batch)
         if not torch.isfinite(total):
@@ -56,9 +79,12 @@ class GHGSModule(L.LightningModule):
             raise DivergedError(
                 f"step {self.global_step}: expected finite losses; found {broken} (subjects {subjects})"
             )
+        self.mark("loss")
         size = len(batch.images)
-        self.log("train/loss", total.detach(), prog_bar=True, batch_size=size)
-        self.log_dict({f"train/{name}": v.detach() for name, v in values.items()}, batch_size=size)
+        self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
+        self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
+        rate = self.optimizers().param_groups[0]["lr"]
+        self.log_dict({"train/learning_rate": rate, "train/budget": self.used_budget}, batch_size=size)
         self.log("train/gaussians", float(len(prediction.gaussians)) / size, batch_size=size)
         return total
 
@@ -69,6 +95,13 @@ class GHGSModule(L.LightningModule):
         for name, metric in (("val/psnr", self.val_psnr), ("val/psnr_box", self.val_psnr_box)):
             metric.update(image.clamp(0, 1), target, mask)
             self.log(name, metric, prog_bar=name == "val/psnr", on_epoch=True, batch_size=size)
+        means = {"val/ssim": ssim(image, target).mean()}
+        if batch.depths is not None:
+            valid = batch.masks & prediction.depth_valid
+            means["val/depth_error_mm"] = depth_error_mm(
+                prediction.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1)
+            )
+        self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
 
     def progress(self) -> float:
@@ -111,6 +144,14 @@ class GHGSModule(L.LightningModule):
                 f" {len(broken)} parameters, first {broken[0] if broken else 'none'}"
             )
         self.log("train/gradient_norm", norm)
+
+    def on_train_batch_end(self, *args: Any) -> None:
+        # Called after all callbacks: the clock does not count what they did since the step ended.
+        if self.clock is not None:
+            self.clock.start()
+
+    def on_validation_end(self) -> None:
+        self.on_train_batch_end()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Plain data only: such a file loads with ``torch.load(weights_only=True)``."""
