@@ -4,13 +4,13 @@ import logging
 from pathlib import Path
 
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import track
 
-from ghgs_lit.cli.runtime import announce
+from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.config import build
-from ghgs_lit.data.datamodule import PHASES, RenderedDataModule, ScansDataModule
-from ghgs_lit.errors import choice
+from ghgs_lit.data.base import PHASES, PhotographsDataModule
+from ghgs_lit.data.check import inspect, show, write
+from ghgs_lit.data.datamodule import ScansDataModule
+from ghgs_lit.errors import InputError, choice
 
 log = logging.getLogger(__name__)
 
@@ -28,11 +28,10 @@ def run(cfg: DictConfig) -> None:
         for folder in data.miniature(dict(miniature.people), miniature.size, cfg.seed):
             announce(folder)
     else:
-        check(data)
-        print(root)
+        check(data, output_dir(), cfg.check.least_iou)
 
 
-def render(data: RenderedDataModule) -> None:
+def render(data: PhotographsDataModule) -> None:
     """Make what is missing, then see that it reads back."""
     if isinstance(data, ScansDataModule):
         data.render_scans()
@@ -42,17 +41,15 @@ def render(data: RenderedDataModule) -> None:
         log.info("%s: %d subjects", phase, len(data.subjects(phase)))
 
 
-def check(data: RenderedDataModule) -> None:
-    """Read every photograph, mask, depth map, camera and body.
+def check(data: PhotographsDataModule, folder: Path, least_iou: float) -> None:
+    """Read everything once; tables on the terminal, ``check.json`` and a contact sheet in ``folder``.
 
     Raises:
-        InputError: the first one that is bad, missing or does not fit.
+        InputError: training cannot start.
     """
-    for phase in PHASES:
-        layout = data.assembler(phase).inputs
-        photos = [(name, pid) for name, pids in layout.subjects.items() for pid in pids]
-        for name, pid in track(photos, f"checking {phase}", console=Console(stderr=True)):
-            for vid in layout.vids(name, pid):
-                layout.view(name, pid, vid)
-        bodies = sum(layout.body(name) is not None for name in layout.subjects)
-        log.info("%s: %d subjects, %d with a body, all sound", phase, len(layout.subjects), bodies)
+    report = inspect(data, least_iou)
+    show(report)
+    announce(write(report, folder))
+    if report.problems:
+        count = len(report.problems)
+        raise InputError(f"{data.name}: expected nothing missing or broken; found {count} (see check.json)")

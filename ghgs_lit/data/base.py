@@ -1,7 +1,7 @@
 """The LightningDataModule that all data sets share: protocols, draws, batches, loaders."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -96,13 +96,16 @@ class PhotographsDataModule(LightningDataModule):
         that their longer side has ``size`` pixels. Returns the folders that were written."""
         raise InputError(f"task=miniature: expected a data set with a published layout; found {self.name}")
 
-    def inspect(self) -> list[str]:
-        """Problems of the files beside those that :meth:`reader` finds, ``path: expected ...; found ...``."""
+    def inspections(self) -> Sequence[Callable[[], None]]:
+        """What task=check is to look at beside the photographs: each call raises InputError if it is bad.
+
+        They run in other processes (functions of a module, or partials of such).
+        """
         return []
 
-    def people(self, phase: str) -> int:
-        """How many people a phase has; where a person is drawn in several frames, fewer than subjects."""
-        return len(self.subjects(phase))
+    def people(self, reader: Reader) -> int:
+        """How many people a reader has; where a person is drawn in several frames, fewer than subjects."""
+        return len(reader.subjects)
 
     @property
     def folder(self) -> Path:

@@ -4,7 +4,8 @@ The renders lie as :mod:`ghgs_lit.data.layout` says; what GPS-Gaussian, GHG, RoG
 release render is read as it is. GHG keeps its bodies beside the scans (``<source>/<id>/<id>_transform.npy``).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -75,6 +76,13 @@ class THuman2DataModule(ScansDataModule):
         return THuman2Layout(
             self.folder, phase, size, source=source, **self.layout_options(phase), strict=strict
         )
+
+    def inspections(self) -> list[Callable[[], None]]:
+        """Every raw scan with its fit, where ``source`` is given."""
+        if self.source is None:
+            return []
+        source = self.scans()
+        return [partial(source.check, name) for name in source.names()]
 
     def miniature(self, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
         """Raw scans in ``source`` where it is given, else renders in ``root``, as published scripts make."""

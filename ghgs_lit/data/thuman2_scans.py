@@ -150,6 +150,15 @@ class THuman2Source:
         _check_body(self.fit(name), scan, body)
         return Person(name, scan.parts, body.astype(np.float32))
 
+    def check(self, name: str) -> None:
+        """Read all that rendering a scan will read.
+
+        Raises:
+            InputError: something of it is bad.
+        """
+        self.load(name)
+        self.facing(name)
+
     def facing(self, name: str) -> float:
         """Degrees about y that the first camera is turned by, to look at the scan's front; 0 without fit."""
         folder = self.fit(name)

@@ -1,0 +1,66 @@
+"""Whether a camera sees a body where its mask says: the check that finds wrong units, axes and centres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ghgs_lit.data.reader import View, resize_image
+
+# Fewer vertices than this do not fill a silhouette.
+MIN_VERTICES = 500
+# Cells that a body is high: with more, those between two vertices of SMPL's torso would stay empty.
+_CELLS = 96
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """``iou`` of the body's silhouette and the mask; ``inside``, the share of the vertices that the
+    photograph shows which lie in the mask (or in a cell beside it, a hundredth of the body)."""
+
+    iou: float
+    inside: float
+
+
+def project(vertices: np.ndarray, view: View) -> np.ndarray:
+    """Pixels [m, 2] (u, v) of those vertices [n, 3] that are before the camera, by double precision."""
+    pose, matrix = view.extrinsics.astype(np.float64), view.intrinsics.astype(np.float64)
+    points = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+    points = points[points[:, 2] > 1e-6] @ matrix.T
+    return points[:, :2] / points[:, 2:]
+
+
+def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
+    """How body ``vertices`` [n, 3] fit the mask of ``view``; None for a body of too few vertices.
+
+    The silhouette of the vertices is taken on a coarse grid, where they lie densely enough to be joined
+    without knowing the faces; parts outside the photograph count on neither side.
+    """
+    if len(vertices) < MIN_VERTICES:
+        return None
+    height, width = view.mask.shape
+    pixels = project(vertices, view)
+    shown = ((pixels >= 0) & (pixels < (width, height))).all(-1)
+    if not shown.any() or not view.mask.any():
+        return Overlap(0.0, 0.0)
+    pixels = pixels[shown]
+    cells = min(_CELLS, int(1.2 * np.sqrt(len(vertices))))
+    cell = max(np.ptp(pixels[:, 1]) / cells, 1.0)
+    rows, columns = max(round(height / cell), 1), max(round(width / cell), 1)
+    share = resize_image(np.repeat(view.mask[..., None] * np.uint8(255), 3, -1), rows, columns)[..., 0]
+    hit = np.zeros((rows, columns), bool)
+    row = (pixels[:, 1] * rows / height).astype(int)
+    column = (pixels[:, 0] * columns / width).astype(int)
+    hit[row, column] = True
+    body = _joined(hit)
+    subject = share >= 128
+    near = ndimage.binary_dilation(share > 0, np.ones((3, 3)))
+    iou = (body & subject).sum() / max((body | subject).sum(), 1)
+    return Overlap(float(iou), float(near[row, column].mean()))
+
+
+def _joined(hit: np.ndarray) -> np.ndarray:
+    """The silhouette of scattered hits: gaps of up to four cells closed, holes filled."""
+    margin = 3
+    closed = ndimage.binary_closing(np.pad(hit, margin), np.ones((3, 3)), iterations=2)
+    return ndimage.binary_fill_holes(closed)[margin:-margin, margin:-margin]
