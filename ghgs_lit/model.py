@@ -1,6 +1,8 @@
 """The whole method as one module: photographs in, Gaussians out (paper, section 3)."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Collection, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -9,29 +11,43 @@ from torch import nn
 
 from ghgs_lit.config import build
 from ghgs_lit.encoder import VGGTEncoder
-from ghgs_lit.errors import InputError, require
-from ghgs_lit.geometry.crop import subject_windows
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.crop import patch_padding, subject_windows
 from ghgs_lit.geometry.points import Unprojection
 from ghgs_lit.geometry.visual_hull import Interval
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.types import Batch, Prediction, Tokens
+from ghgs_lit.weights.checkpoint import (
+    FORMAT_VERSION,
+    STATE_PREFIX,
+    load_strictly,
+    model_state,
+    read_checkpoint,
+    require_fit,
+)
+from ghgs_lit.weights.reading import cast
+
+__all__ = [
+    "FORMAT_VERSION",
+    "GHGS",
+    "STAGES",
+    "STATE_PREFIX",
+    "check_batch",
+    "load_strictly",
+    "read_checkpoint",
+]
 
 STAGES = ("encoder", "depth_head", "recalibration", "gaussian_head")
-
-#: Version of the checkpoints that :meth:`GHGS.from_checkpoint` reads.
-FORMAT_VERSION = 1
-
-#: Where a LightningModule keeps its :class:`GHGS`.
-STATE_PREFIX = "model."
 
 
 class GHGS(nn.Module):
     """Encode, predict depth, unproject, recalibrate, regress Gaussians: ``model(batch) -> Prediction``.
 
-    With ``crop`` the stages see windows around the subject in place of the whole photographs; what
-    comes back is that of the whole photographs.
+    With ``pad="multiple"`` photographs of any size get a black border up to the next multiple of the
+    patch size. With ``crop`` the stages see windows around the subject in place of the whole photographs.
+    What comes back is that of the whole photographs.
     """
 
     def __init__(
@@ -42,8 +58,10 @@ class GHGS(nn.Module):
         gaussian_head: GaussianHead,
         unprojection: Unprojection | None = None,
         crop: bool = False,
+        pad: str = "none",
     ):
         super().__init__()
+        choice("model.pad", pad, ("none", "multiple"))
         require(
             depth_head.bounds is not None or not getattr(encoder, "interval_input", False),
             "encoder.interval_input",
@@ -55,119 +73,105 @@ class GHGS(nn.Module):
         self.unproject = unprojection or Unprojection()
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
-        self.crop = crop
+        self.frames = [patch_padding] * (pad == "multiple") + [subject_windows] * crop
 
     def forward(self, batch: Batch) -> Prediction:
-        check_batch(batch, self.encoder.patch_size)
-        # From the whole frames: a window would hide from the hull what lies beside it.
+        patch = self.encoder.patch_size
+        check_batch(batch, 1 if patch_padding in self.frames else patch)
+        # From the whole photographs: a frame hides from the hull, or invents, what lies at its border.
         interval = self.depth_head.interval(batch)
-        if not self.crop:
-            return self._predict(batch, interval)
-        windows = subject_windows(batch.masks, self.encoder.patch_size)
-        if interval is not None:
-            interval = (windows.cut(interval[0]), windows.cut(interval[1]))
-        return windows.paste_prediction(self._predict(windows.cut_batch(batch), interval))
+        used = []
+        for frame_of in self.frames:
+            frame = frame_of(batch.masks, patch)
+            if frame is not None:
+                batch, interval = frame.cut_batch(batch), frame.cut_interval(interval)
+                used.append(frame)
+        prediction = self._predict(batch, interval)
+        for frame in reversed(used):
+            prediction = frame.paste_prediction(prediction)
+        return prediction
 
     def _predict(self, batch: Batch, interval: Interval | None) -> Prediction:
-        tokens = self.encoder(batch.images, batch.masks, interval)
+        tokens = self._in_heads_precision(self.encoder(batch.images, batch.masks, interval))
         depth_maps = self.depth_head(tokens, batch, interval)
         points = self.unproject(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points, batch)
         gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
         return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps)
 
+    def _in_heads_precision(self, tokens: Tokens) -> Tokens:
+        """Tokens of an encoder whose weights are in half precision, for heads whose weights are not."""
+        dtype = next(self.recalibration.parameters()).dtype
+        if torch.is_autocast_enabled(tokens.semantic.device.type) or tokens.latent[0].dtype == dtype:
+            return tokens
+        latent = tuple(layer.to(dtype) for layer in tokens.latent)
+        return dataclasses.replace(tokens, latent=latent, semantic=tokens.semantic.to(dtype))
+
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> "GHGS":
+    def from_config(cls, config: Mapping[str, Any], empty: Collection[str] = ()) -> "GHGS":
         """Build from the nodes ``encoder``, ``depth_head``, ``recalibration``, ``gaussian_head``, and, where
-        they are given, ``points`` and ``skip``; other keys are ignored.
+        they are given, ``points``, ``skip`` and ``model.pad``; other keys are ignored.
+
+        Stages in ``empty`` are built without storage (on the meta device), for weights to be assigned to.
 
         Raises:
             InputError: a stage is missing, or a value is impossible; the message starts with the key.
         """
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
-        encoder = build(config["encoder"], "encoder")
+
+        def storage(name: str) -> Any:
+            return torch.device("meta") if name in empty else nullcontext()
+
+        with storage("encoder"):
+            # `weights` says where an imported encoder comes from; it has no part in what is built.
+            encoder = build({k: v for k, v in config["encoder"].items() if k != "weights"}, "encoder")
         skip = config.get("skip") or {}
         extra = {name: {} for name in STAGES}
         extra["gaussian_head"] = {key: skip[key] for key in ("pixels", "views") if key in skip}
         if "views" in skip and config["recalibration"].get("tokens") != "all":
             # Otherwise tokens of views without the subject need a depth as well.
             extra["depth_head"] = {"views": skip["views"]}
-        stages = {
-            name: build(config[name], name, dim_latent=encoder.dim_latent, **extra[name])
-            for name in STAGES[1:]
-        }
+        stages = {}
+        for name in STAGES[1:]:
+            with storage(name):
+                stages[name] = build(config[name], name, dim_latent=encoder.dim_latent, **extra[name])
         points = config.get("points")
         return cls(
             encoder,
             **stages,
             unprojection=Unprojection(**points) if points else None,
             crop=bool(skip.get("crop", False)),
+            pad=(config.get("model") or {}).get("pad", "none"),
         )
 
     @classmethod
-    def from_checkpoint(cls, path: str | Path, map_location: Any = "cpu") -> "GHGS":
-        """The model of a training checkpoint, in evaluation mode, with no YAML at hand.
+    def from_checkpoint(
+        cls, path: str | Path, map_location: Any = "cpu", dtype: torch.dtype | None = None
+    ) -> "GHGS":
+        """The model of a checkpoint, in evaluation mode, with no YAML at hand.
+
+        The weights are mapped from the file and not read before they are used. ``dtype`` is the encoder's
+        (None: as in the file); the heads are float32 or wider.
 
         Raises:
             FileNotFoundError: there is no such file.
-            InputError: the file is no checkpoint of this project, or its weights do not fit its config.
+            InputError: the file is no checkpoint of this package, or its weights do not fit its config.
         """
-        checkpoint = read_checkpoint(path, map_location)
-        model = cls.from_config(checkpoint["config"])
-        state = {
-            key.removeprefix(STATE_PREFIX): value
-            for key, value in checkpoint["state_dict"].items()
-            if key.startswith(STATE_PREFIX)
-        }
-        load_strictly(model, state, path)
+        model = cls.from_config(read_checkpoint(path)["config"], empty=STAGES)
+        model.load(path, dtype)
         return model.to(map_location).eval()
 
+    def load(self, path: str | Path, dtype: torch.dtype | None = None) -> None:
+        """Take over the weights of a checkpoint, as :meth:`from_checkpoint` does."""
+        require_fit(self, model_state(read_checkpoint(path)), path)
 
-def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a checkpoint with ``weights_only=True`` and refuse what is not one of this project."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such checkpoint")
-    try:
-        checkpoint = torch.load(path, map_location=map_location, weights_only=True)
-    except Exception as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(f"{path}: expected a checkpoint of plain data and tensors; {reason}") from error
-    for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
-        found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
-        if not isinstance(found, kind):
-            raise InputError(
-                f"{path}: expected a checkpoint with {key!r}; found "
-                + (
-                    ", ".join(map(repr, checkpoint))
-                    if isinstance(checkpoint, Mapping)
-                    else repr(type(checkpoint))
-                )
-            )
-    if checkpoint["format_version"] > FORMAT_VERSION:
-        raise InputError(
-            f"{path}: expected format_version {FORMAT_VERSION} or less; found "
-            f"{checkpoint['format_version']}, of a newer version of this package"
-        )
-    return checkpoint
+        def precision(name: str, stored: torch.dtype) -> torch.dtype:
+            if name.startswith("encoder."):
+                return dtype or stored
+            return torch.promote_types(stored, torch.float32)
 
-
-def load_strictly(module: nn.Module, state: Mapping[str, torch.Tensor], source: str | Path) -> None:
-    """Load all of ``state`` into ``module``; a mismatch names the source, the key and both shapes."""
-    own = module.state_dict()
-    for key in own:
-        require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(own[key].shape)}", "nothing")
-    for key, value in state.items():
-        require(key in own, f"{source}: {key}", "no such key in the configured model", tuple(value.shape))
-        shape = tuple(own[key].shape)
-        require(
-            tuple(value.shape) == shape,
-            f"{source}: {key}",
-            f"shape {shape} of the configured model",
-            tuple(value.shape),
-        )
-    module.load_state_dict(state)
+        self.load_state_dict(cast(lambda: model_state(read_checkpoint(path)), precision), assign=True)
 
 
 def check_batch(batch: Batch, patch_size: int) -> None:
@@ -176,7 +180,8 @@ def check_batch(batch: Batch, patch_size: int) -> None:
     b, v, _, height, width = batch.images.shape
     require(v >= 2, "batch.images", "2 views or more", v)
     divisible = height % patch_size == width % patch_size == 0
-    require(divisible, "batch.images", f"sides divisible by the patch size {patch_size}", (height, width))
+    expected = f"sides divisible by the patch size {patch_size} (or model.pad=multiple)"
+    require(divisible, "batch.images", expected, (height, width))
     require(
         batch.masks.shape == (b, v, height, width),
         "batch.masks",

@@ -25,6 +25,7 @@ def _composed(overrides):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         composed = compose("train", overrides=[*TINY, *overrides])
     stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
+    stages += ("model", "compat")
     return OmegaConf.to_container(OmegaConf.masked_copy(composed, list(stages)), resolve=True)
 
 

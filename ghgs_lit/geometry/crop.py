@@ -1,46 +1,47 @@
-"""Windows around the subject: most of a photograph is background that no Gaussian comes from."""
+"""Frames that the stages see in place of the photographs: padded to whole patches, or cut to the subject.
+
+A photograph whose sides are no multiples of the patch size gets a black border (:class:`Padding`); most
+of a photograph is background that no Gaussian comes from (:class:`Windows`). What the stages predict
+comes back in the photograph's own pixels.
+"""
 
 import dataclasses
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from ghgs_lit.geometry.visual_hull import Interval
 from ghgs_lit.types import Batch, Points, Prediction
 
 
-@dataclass(frozen=True)
-class Windows:
-    """One window for each view, all ``height`` x ``width``, inside images of ``full`` (height, width)."""
+class Frame(ABC):
+    """Pictures of ``height`` x ``width`` whose first pixel is pixel (``top``, ``left``) of photographs of
+    ``full`` (height, width); both may be negative."""
 
-    top: Int[Tensor, "B V"]
-    left: Int[Tensor, "B V"]
+    top: Int[Tensor, "B V"] | int
+    left: Int[Tensor, "B V"] | int
     height: int
     width: int
     full: tuple[int, int]
 
-    def _index(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Indices that pick the windows out of maps ``[B, V, H, W, ...]``."""
-        b, v = self.top.shape
-        device = self.top.device
-        element = torch.arange(b, device=device)[:, None, None, None]
-        view = torch.arange(v, device=device)[:, None, None]
-        rows = self.top[..., None, None] + torch.arange(self.height, device=device)[:, None]
-        columns = self.left[..., None, None] + torch.arange(self.width, device=device)
-        return element, view, rows, columns
+    @abstractmethod
+    def cut(self, maps: Tensor, fill: float | bool = 0) -> Tensor:
+        """Maps ``[B, V, H, W, ...]`` of the photographs as maps of the frame, ``fill`` where it is larger."""
 
-    def cut(self, maps: Tensor) -> Tensor:
-        """The windows of maps ``[B, V, H, W, ...]``."""
-        return maps[self._index()]
-
+    @abstractmethod
     def paste(self, maps: Tensor, fill: float | bool) -> Tensor:
-        """Maps ``[B, V, H, W, ...]`` that are ``fill`` outside the windows."""
-        whole = maps.new_full((*self.top.shape, *self.full, *maps.shape[4:]), fill)
-        return whole.index_put(self._index(), maps)
+        """Maps of the frame as maps of the photographs, ``fill`` where the frame is smaller."""
+
+    def cut_interval(self, interval: Interval | None) -> Interval | None:
+        """Bounds of depth; outside of the photographs they mean nothing, but they are depths."""
+        return None if interval is None else (self.cut(interval[0], 1.0), self.cut(interval[1], 1.0))
 
     def cut_batch(self, batch: Batch) -> Batch:
-        """The batch as if every input had been photographed through its window; targets stay."""
+        """The batch as if every input had been photographed through the frame; targets stay."""
         intrinsics = batch.cameras.intrinsics.clone()
         intrinsics[..., 0, 2] -= self.left
         intrinsics[..., 1, 2] -= self.top
@@ -50,13 +51,13 @@ class Windows:
         return dataclasses.replace(
             batch,
             images=self.cut(batch.images.movedim(2, -1)).movedim(-1, 2),
-            masks=self.cut(batch.masks),
+            masks=self.cut(batch.masks, False),
             depths=None if batch.depths is None else self.cut(batch.depths),
             cameras=cameras,
         )
 
     def paste_prediction(self, prediction: Prediction) -> Prediction:
-        """The prediction of a cut batch on the full images; outside the windows nothing is valid."""
+        """The prediction of a cut batch on the photographs; outside the frame nothing is valid."""
         maps = prediction.depth_maps
         whole = dataclasses.replace(
             maps,
@@ -67,8 +68,11 @@ class Windows:
             far=None if maps.far is None else self.paste(maps.far, 1.0),
         )
         gaussians = prediction.gaussians
-        row = gaussians.pixel // self.width + self.top.flatten()[gaussians.image]
-        column = gaussians.pixel % self.width + self.left.flatten()[gaussians.image]
+        top, left = (
+            start if isinstance(start, int) else start.flatten()[gaussians.image]
+            for start in (self.top, self.left)
+        )
+        row, column = gaussians.pixel // self.width + top, gaussians.pixel % self.width + left
         return Prediction(
             gaussians=dataclasses.replace(gaussians, pixel=row * self.full[1] + column),
             depth=whole.depth,
@@ -81,6 +85,69 @@ class Windows:
             ),
             depth_maps=whole,
         )
+
+
+@dataclass(frozen=True)
+class Padding(Frame):
+    """The photographs in the middle of a larger frame: ``top`` and ``left`` are 0 or negative."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+    full: tuple[int, int]
+
+    def cut(self, maps: Tensor, fill: float | bool = 0) -> Tensor:
+        return F.pad(maps, self._sides(maps), value=fill)
+
+    def paste(self, maps: Tensor, fill: float | bool) -> Tensor:
+        return F.pad(maps, [-side for side in self._sides(maps)])
+
+    def _sides(self, maps: Tensor) -> list[int]:
+        """The widths of the border in the order of ``F.pad``: last axis first, each before and after."""
+        below, right = self.height - self.full[0] + self.top, self.width - self.full[1] + self.left
+        return [0, 0] * (maps.dim() - 4) + [-self.left, right, -self.top, below]
+
+
+@dataclass(frozen=True)
+class Windows(Frame):
+    """One window for each view, all ``height`` x ``width``, inside the photographs."""
+
+    top: Int[Tensor, "B V"]
+    left: Int[Tensor, "B V"]
+    height: int
+    width: int
+    full: tuple[int, int]
+
+    def cut(self, maps: Tensor, fill: float | bool = 0) -> Tensor:
+        return maps[self._index()]
+
+    def paste(self, maps: Tensor, fill: float | bool) -> Tensor:
+        whole = maps.new_full((*self.top.shape, *self.full, *maps.shape[4:]), fill)
+        return whole.index_put(self._index(), maps)
+
+    def _index(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Indices that pick the windows out of maps ``[B, V, H, W, ...]``."""
+        b, v = self.top.shape
+        device = self.top.device
+        element = torch.arange(b, device=device)[:, None, None, None]
+        view = torch.arange(v, device=device)[:, None, None]
+        rows = self.top[..., None, None] + torch.arange(self.height, device=device)[:, None]
+        columns = self.left[..., None, None] + torch.arange(self.width, device=device)
+        return element, view, rows, columns
+
+
+def patch_padding(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
+    """The smallest border that makes both sides multiples; an odd pixel goes below and to the right.
+
+    512 becomes 518 with 3 pixels on each side, as in the authors' release. None where nothing is missing.
+    """
+    height, width = masks.shape[2:]
+    missing = (-height % multiple, -width % multiple)
+    if missing == (0, 0):
+        return None
+    sides = (height + missing[0], width + missing[1])
+    return Padding(-(missing[0] // 2), -(missing[1] // 2), *sides, full=(height, width))
 
 
 def subject_windows(masks: Bool[Tensor, "B V H W"], multiple: int, margin: int = 2) -> Windows:

@@ -1,0 +1,19 @@
+"""``ghgs export``: a checkpoint to the names of the authors' release and of VGGT-1B."""
+
+from omegaconf import DictConfig
+
+from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.exporting import export_weights
+from ghgs_lit.weights.switches import differences
+
+
+def run(cfg: DictConfig) -> None:
+    config = save_config(cfg, output_dir())
+    report = export_weights(config["checkpoint"], config["vggt"], config["release"])
+    print("\n".join(report), flush=True)
+    if config["release"] is not None:
+        found = differences(read_checkpoint(config["checkpoint"])["config"])
+        if found:
+            print(f"the release's code computes otherwise: {', '.join(found)}", flush=True)
+    announce(config["release"] or config["vggt"])

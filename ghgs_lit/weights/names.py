@@ -1,0 +1,54 @@
+"""Published names and ours, in one table each; everything behind a prefix is called the same."""
+
+from collections.abc import Mapping
+
+#: facebook/VGGT-1B. A file of the aggregator alone comes without its prefix.
+VGGT = {
+    "aggregator.": "encoder.aggregator.",
+    "camera_token": "encoder.aggregator.camera_token",
+    "register_token": "encoder.aggregator.register_token",
+    "patch_embed.": "encoder.aggregator.patch_embed.",
+    "frame_blocks.": "encoder.aggregator.frame_blocks.",
+    "global_blocks.": "encoder.aggregator.global_blocks.",
+}
+
+#: Parts of VGGT-1B that the method does not have: 62, 62, 69 and 394 tensors.
+VGGT_IGNORED = ("depth_head.", "point_head.", "camera_head.", "track_head.")
+
+#: VGGT's depth head as the start of ours (an option). Its last projection stays out: it gives a logarithm of
+#: depth in the scene's own unit, ours a share of the way from near to far.
+VGGT_DEPTH = {"depth_head.": "depth_head.dpt."}
+VGGT_DEPTH_IGNORED = ("depth_head.scratch.output_conv2.2.",)
+
+#: The checkpoint of the authors' release, under the key ``network``.
+RELEASE = {
+    "pos_head.": "depth_head.dpt.",
+    "blk.": "recalibration.block.",
+    "decoder.": "gaussian_head.decoder.",
+    "offset_header.": "gaussian_head.offset_header.",
+    "scale_header.": "gaussian_head.scale_header.",
+    "rot_header.": "gaussian_head.rot_header.",
+    "opacity_header.": "gaussian_head.opacity_header.",
+}
+RELEASE_ENTRY = "network"
+
+#: Modules below these prefixes that only our own variants have.
+UNPUBLISHED = ".guide."
+
+
+def to_ours(name: str, table: Mapping[str, str]) -> str | None:
+    """Our name of a published tensor; None where ``table`` has no place for it."""
+    for published, own in table.items():
+        if name.startswith(published):
+            return own + name.removeprefix(published)
+    return None
+
+
+def to_published(name: str, table: Mapping[str, str]) -> str | None:
+    """The published name of one of our tensors; None where the release has no place for it."""
+    if UNPUBLISHED in name:
+        return None
+    for published, own in table.items():
+        if name.startswith(own):
+            return published + name.removeprefix(own)
+    return None
