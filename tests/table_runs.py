@@ -82,5 +82,5 @@ def body(markdown: str):
     lines = [
         [c.strip() for c in line.strip("|").split("|")] for line in markdown.splitlines() if line[:1] == "|"
     ]
-    two = lines[0][0] == "3D unproj."
+    two = lines[0][0] == "3D Unproj."
     return {(row[0], row[1][:1]) if two else row[0]: row[2 if two else 1 :] for row in lines[2:]}, lines[0]

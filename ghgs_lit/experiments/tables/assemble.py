@@ -106,7 +106,7 @@ def _table(records: list[Record], sweep: Sweep, options: TableOptions) -> Table:
     )
     lines = _reported_lines(layout, reported, groups) if reported else []
     lines += _lines(records, planned, layout)
-    stub = ("3D unproj.", "Semantic cons.") if layout.rows == "ablation" else ("Methods",)
+    stub = ("3D Unproj.", "Semantic Cons.") if layout.rows == "ablation" else ("Methods",)
     about = {"records": records, "planned": planned}
     on = reported_table(reported)[0] if reported else None
     table = Table(layout, about, stub, groups, list(metrics), lines, reported_on=on)

@@ -56,11 +56,12 @@ def _row(table: Table, line: Line) -> str:
 
 
 def _column_spec(table: Table) -> str:
-    """``ccccc`` for the ablation, ``l | c c c | c c c`` for methods."""
+    """``ccccc`` for the ablation, ``l | c c c | c c c`` for methods; for data sets without the first bar."""
     if table.layout.rows == "ablation" and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = "c c" if len(table.stub) == 2 else "l"
-    return " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
+    spec = " | ".join([stub] + [" ".join("c" * len(table.metrics))] * len(table.groups))
+    return spec.replace(" |", "", 1) if table.layout.columns == "data" else spec
 
 
 def _header(table: Table) -> list[str]:

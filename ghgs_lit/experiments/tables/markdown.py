@@ -49,7 +49,7 @@ def to_markdown(table: Table) -> str:
 def to_terminal(table: Table) -> RichTable:
     """The table alone, for a terminal."""
     printed = RichTable(padding=(0, 1, 0, 0))
-    short = {"3D unproj.": "3D\nunp.", "Semantic cons.": "sem.\ncons."}
+    short = {"3D Unproj.": "3D\nunp.", "Semantic Cons.": "sem.\ncons."}
     for name in table.stub:
         justify = "center" if name in short else "left"
         printed.add_column(short.get(name, name), justify=justify, no_wrap=True)
