@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import keyword
 import os
 import sys
 from dataclasses import dataclass
@@ -15,8 +16,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.errors import InputError
+from ghgs_lit.sweeps.work import register_resolver
 
 BAD_INPUT = (InputError, FileNotFoundError)
+register_resolver()  # wherever a launcher brings a job
 
 # verb: (what it does, an example)
 VERBS = {
@@ -36,8 +39,21 @@ VERBS = {
         "turn photographs into a splat (PLY) and a turntable",
         "ghgs predict checkpoint=last.ckpt subject=0",
     ),
+    "import": (
+        "published weights to a checkpoint",
+        "ghgs import vggt=facebook/VGGT-1B release=release.pth out=release.ckpt",
+    ),
+    "export": (
+        "a checkpoint to the published names",
+        "ghgs export checkpoint=last.ckpt vggt=vggt.safetensors release=release.pth",
+    ),
     "table": ("collect a sweep into the paper's table", "ghgs table sweep=runs/train/sweep_..."),
 }
+
+
+def module_of(verb: str) -> str:
+    """The module that a verb lies in; a word of Python's own gets an underscore."""
+    return f"ghgs_lit.cli.{verb}" + "_" * keyword.iskeyword(verb)
 
 
 def usage() -> str:
@@ -63,7 +79,7 @@ class Verb:
         # Lightning starts the other processes of a DDP job by running sys.argv again: it needs the verb.
         sys.argv = list(self.argv)
         try:
-            return importlib.import_module(f"ghgs_lit.cli.{self.name}").run(cfg)
+            return importlib.import_module(module_of(self.name)).run(cfg)
         except BAD_INPUT as error:
             # Hydra would add a line of its own; in a sweep that line says which run it was.
             if self.wants_trace or HydraConfig.get().mode == RunMode.MULTIRUN:

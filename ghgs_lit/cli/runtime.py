@@ -26,13 +26,18 @@ def plain(cfg: DictConfig) -> dict:
     return data
 
 
-def save_config(cfg: DictConfig, directory: Path) -> dict:
-    """Print the full configuration, write it to ``directory/config.yaml``, give it back as plain data."""
-    data = plain(cfg)
+def write_config(data: dict, directory: Path) -> None:
+    """Print the full configuration and write it to ``directory/config.yaml``."""
     text = OmegaConf.to_yaml(OmegaConf.create(data))
     rich.print(Syntax(text, "yaml", theme="ansi_dark", background_color="default"))
     directory.mkdir(parents=True, exist_ok=True)
     (directory / "config.yaml").write_text(text)
+
+
+def save_config(cfg: DictConfig, directory: Path) -> dict:
+    """Print and write the full configuration, give it back as plain data."""
+    data = plain(cfg)
+    write_config(data, directory)
     return data
 
 

@@ -12,10 +12,38 @@ from typing import Any
 
 PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy", "scipy", "gsplat")
 
+# Where a run writes, what it shows and how it shares the machine: no number depends on these.
+UNHASHED = frozenset(
+    {
+        "dry_run",
+        "resume",
+        "logger",
+        "callbacks",
+        "data.cache_dir",
+        "data.cache_images_mb",
+        "data.pin_memory",
+        "data.render_workers",
+        "data.workers",
+        "evaluation.pictures",
+        "trainer.log_every_n_steps",
+    }
+)
+
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits that stand for a resolved configuration; the order of keys is no matter."""
-    text = json.dumps(config, sort_keys=True, separators=(",", ":"), default=str)
+    """Twelve hexadecimal digits that stand for a resolved configuration; the order of keys is no matter.
+
+    What no number depends on (``UNHASHED``) has no part in it.
+    """
+
+    def hashed(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+        return {
+            key: hashed(value, f"{prefix}{key}.") if isinstance(value, Mapping) else value
+            for key, value in node.items()
+            if f"{prefix}{key}" not in UNHASHED
+        }
+
+    text = json.dumps(hashed(config), sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
