@@ -10,6 +10,7 @@ import codecs
 import collections
 import io
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,21 +46,28 @@ _ADMITTED: dict[tuple[str, str], Any] = {
 }
 
 
+_NOTHING: Mapping[tuple[str, str], Any] = {}
+
+
 class _Refused(pickle.UnpicklingError):
     """A name that is not admitted."""
 
 
 class _Unpickler(pickle.Unpickler):
+    def __init__(self, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], Any]) -> None:
+        super().__init__(stream, encoding="latin1")
+        self._admitted = {**_ADMITTED, **also}
+
     def find_class(self, module: str, name: str) -> Any:
         try:
-            return _ADMITTED[module, name]
+            return self._admitted[module, name]
         except KeyError:
             raise _Refused(f"{module}.{name}") from None
 
 
-def _load(path: Path, stream: io.BufferedIOBase) -> Any:
+def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
     try:
-        return _Unpickler(stream, encoding="latin1").load()
+        return _Unpickler(stream, also).load()
     except _Refused as error:
         raise InputError(
             f"{path}: expected a pickle of NumPy arrays and plain containers; found {error}"
@@ -68,8 +76,10 @@ def _load(path: Path, stream: io.BufferedIOBase) -> Any:
         raise InputError(f"{path}: expected a readable pickle; found {error!r}") from error
 
 
-def load_pickle(path: Path) -> Any:
+def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
     """The arrays, scalars and plain containers of a pickle.
+
+    ``also`` admits further names, (module, name), as harmless stand-ins for what they name.
 
     Raises:
         InputError: it is missing, broken, or names anything else, which is then not called.
@@ -77,7 +87,7 @@ def load_pickle(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: expected a pickle; found no such file")
     with path.open("rb") as stream:
-        return _load(path, stream)
+        return _load(path, stream, also)
 
 
 def load_npy(path: Path) -> Any:

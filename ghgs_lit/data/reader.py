@@ -18,6 +18,8 @@ from PIL import Image
 from ghgs_lit.errors import InputError, require
 
 DEPTH_SCALE = 1 << 15
+# How far from the image's centre a principal point may lie, as a part of the side.
+_OFF_CENTRE = 0.25
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
 
@@ -248,6 +250,19 @@ def check_intrinsics(path: Path | str, intrinsics: Any) -> np.ndarray:
             f"{path}: expected focal lengths above 0; found {intrinsics[0, 0]}, {intrinsics[1, 1]}"
         )
     return intrinsics
+
+
+def check_centre(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
+    """A photograph that was resized by somebody no longer fits its calibration.
+
+    Raises:
+        InputError: naming the photograph, where the principal point lies far from its centre.
+    """
+    if np.abs(intrinsics[:2, 2] / [width, height] - 0.5).max() > _OFF_CENTRE:
+        raise InputError(
+            f"{path}: expected a photograph of the calibration's size, its principal point "
+            f"{intrinsics[0, 2]:.0f}, {intrinsics[1, 2]:.0f} near the centre; found {height}x{width}"
+        )
 
 
 def check_extrinsics(path: Path | str, extrinsics: Any) -> np.ndarray:

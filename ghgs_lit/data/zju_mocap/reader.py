@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.data.reader import Reader, View, check_name, read_array, read_image, read_map
+from ghgs_lit.data.reader import Reader, View, check_centre, check_name, read_array, read_image, read_map
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
 from ghgs_lit.errors import InputError, require
@@ -22,8 +22,6 @@ from ghgs_lit.errors import InputError, require
 log = logging.getLogger(__name__)
 
 BODY_VERTICES = 6890
-# How far from the image's centre a principal point may lie, as a part of the side.
-_OFF_CENTRE = 0.25
 
 
 @dataclass(frozen=True)
@@ -89,14 +87,14 @@ class ZJUMoCapReader(Reader):
         super().__init__(**options)
         self.undistorted, self.masks, self.bodies = undistorted, tuple(masks), tuple(bodies)
         self._frames: dict[str, _Frame] = {}
-        for sequence, frames in ((s, split.frames) for split in splits for s in split.sequences):
-            path = folder / f"CoreView_{sequence}"
-            if path.is_dir():
-                self._add(path, frames, cameras)
-            else:
-                log.warning("%s: no such sequence, left out", path)
-        if not self._frames and not self.problems:
-            self.problem(f"{folder}: expected sequences of the split, such as {path.name}; found none")
+        wanted = [(folder / f"CoreView_{s}", split.frames) for split in splits for s in split.sequences]
+        there = [(path, frames) for path, frames in wanted if path.is_dir()]
+        if len(there) < len(wanted):
+            log.warning("%s: %d of %d sequences are there", folder, len(there), len(wanted))
+        if not there:
+            self.problem(f"{folder}: expected sequences such as {wanted[0][0].name}; found none of the split")
+        for path, frames in there:
+            self._add(path, frames, cameras)
         self.subjects = dict(list(self.subjects.items())[:limit])
 
     @property
@@ -135,7 +133,7 @@ class ZJUMoCapReader(Reader):
         image = np.array(read_image(path).convert("RGB"))
         mask = self._mask(frame.folder, photograph, image.shape[:2])
         intrinsics = frame.annotations.intrinsics[pid].copy()
-        _check_centre(path, intrinsics, *image.shape[:2])
+        check_centre(path, intrinsics, *image.shape[:2])
         if self.undistorted:
             grid = undistorting_grid(intrinsics, frame.annotations.distortions[pid], *image.shape[:2])
             image, mask = undistort(image, mask, grid)
@@ -178,13 +176,3 @@ def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
     path = folder / photograph.with_suffix(suffix)
     renamed = path.with_name(frame_field(photograph) + suffix)
     return renamed if not path.exists() and renamed.exists() else path
-
-
-def _check_centre(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
-    """Photographs that were resized by somebody no longer fit their calibration."""
-    off = np.abs(intrinsics[:2, 2] / [width, height] - 0.5)
-    if off.max() > _OFF_CENTRE:
-        raise InputError(
-            f"{path}: expected a photograph of the calibration's size, its principal point "
-            f"{intrinsics[0, 2]:.0f}, {intrinsics[1, 2]:.0f} near the centre; found {height}x{width}"
-        )

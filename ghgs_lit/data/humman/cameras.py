@@ -1,0 +1,62 @@
+"""``cameras.json`` of a HuMMan sequence: ten colour and ten depth cameras.
+
+Each has ``K`` (3, 3), ``R`` (3, 3) and ``T`` (3), OpenCV's, world to camera in metres, without lens
+distortion. The world is the frame of ``kinect_color_000``: y points down.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_lit.data.reader import check_array, check_extrinsics, check_intrinsics
+from ghgs_lit.errors import InputError
+
+KINECTS = range(10)
+# Metres: cameras of one studio stand neither nearer together nor further apart.
+_NEAREST, _FURTHEST = 0.1, 100.0
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Ten cameras: ``intrinsics`` [10, 3, 3], centres at integers; ``extrinsics`` [10, 4, 4] in metres."""
+
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+
+
+def read_calibration(path: Path, kind: str) -> Calibration:
+    """The ``color`` or ``depth`` cameras of a ``cameras.json``.
+
+    Raises:
+        InputError: it is missing or broken, lacks a camera, or one is bad or not in metres.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: expected the cameras of a sequence; found no such file")
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected JSON; found {error}") from error
+    cameras = [_camera(path, content, f"kinect_{kind}_{k:03d}") for k in KINECTS]
+    intrinsics, extrinsics = (np.stack(matrices) for matrices in zip(*cameras, strict=True))
+    centers = -np.einsum("nji,nj->ni", extrinsics[:, :3, :3], extrinsics[:, :3, 3])
+    spread = np.linalg.norm(centers - centers[0], axis=-1).max()
+    if not _NEAREST < spread < _FURTHEST:
+        raise InputError(
+            f"{path}: expected translations T in metres; found {kind} cameras {spread:.4g} m apart"
+        )
+    return Calibration(intrinsics, extrinsics)
+
+
+def _camera(path: Path, content: Any, key: str) -> tuple[np.ndarray, np.ndarray]:
+    camera = content.get(key) if isinstance(content, dict) else None
+    for name in ("K", "R", "T"):
+        if not isinstance(camera, dict) or name not in camera:
+            raise InputError(f"{path}: expected {name} of {key}; found none")
+    place = f"{path}: {key}"
+    rotation = check_array(f"{place}: R", camera["R"], [(3, 3)])
+    translation = check_array(f"{place}: T", camera["T"], [(3,), (3, 1)]).reshape(3, 1)
+    extrinsics = check_extrinsics(place, np.concatenate((rotation, translation), 1))
+    return check_intrinsics(f"{place}: K", camera["K"]), extrinsics
