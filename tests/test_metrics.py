@@ -1,7 +1,10 @@
 """Metrics against torchmetrics, the authors' numbers, the reference FLIP and exact cases."""
 
+import sys
+import types
 from pathlib import Path
 
+import kornia
 import numpy as np
 import pytest
 import torch
@@ -33,6 +36,11 @@ def test_authors_evaluation_numbers():
     assert torch.allclose(
         ssim(first.double(), second.double(), "zeros"), data["out64/ssim_per_image"], atol=2e-7
     )
+    # As the release protocol reports them, over whole images.
+    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")
+    values = release(first, second, torch.zeros(2, 40, 48, dtype=torch.bool))
+    assert torch.allclose(values["psnr"][:, None], data["out/psnr"], atol=1e-5)
+    assert torch.allclose(values["ssim"], data["out/ssim_per_image"], atol=2e-6)
     # Without padding it is another number: the fixture tells them apart.
     assert (ssim(first, second, "valid") - data["out/ssim_per_image"]).abs().min() > 1e-3
 
@@ -48,17 +56,35 @@ def test_psnr_and_ssim_are_torchmetrics():
         assert ssim(a, b, "reflect").item() == pytest.approx(expected.item(), abs=1e-5)
 
 
+def test_psnr_and_ssim_are_scikit_images():
+    metrics = pytest.importorskip("skimage.metrics")
+    image, target = _images()
+    options = {
+        "channel_axis": 0, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5,
+        "use_sample_covariance": False, "full": True,
+    }  # fmt: skip
+    for i in range(len(image)):
+        a, b = image[i].double(), target[i].double()
+        mean, full = metrics.structural_similarity(a.numpy(), b.numpy(), **options)
+        assert ssim(a[None], b[None], "valid").item() == pytest.approx(mean, abs=1e-6)
+        # ... and its map, whose border scikit-image mirrors with the edge pixel doubled.
+        own = ssim_map(a[None], b[None], "reflect")[0]
+        assert np.abs(own.numpy() - full)[:, 5:-5, 5:-5].max() < 1e-6
+        expected = metrics.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1.0)
+        assert psnr(a[None], b[None]).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_maps_are_kornias():
+    image, target = _images(2)
+    for padding, name in (("reflect", "same"), ("valid", "valid")):
+        expected = kornia.metrics.ssim(image, target, 11, padding=name)
+        assert torch.allclose(ssim_map(image, target, padding), expected, atol=2e-5)
+
+
 def test_ssim_without_padding_is_the_interior():
-    """``valid`` is scikit-image's average (``use_sample_covariance=False``): the map without its border."""
     image, target = _images(1)
     inside = ssim_map(image, target, "reflect")[..., 5:-5, 5:-5].mean()
     assert ssim(image, target, "valid").item() == pytest.approx(inside.item(), abs=1e-6)
-    metrics = pytest.importorskip("skimage.metrics")
-    expected = metrics.structural_similarity(
-        image[0].numpy(), target[0].numpy(), channel_axis=0, data_range=1.0,
-        gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-    )  # fmt: skip
-    assert ssim(image, target, "valid").item() == pytest.approx(expected, abs=1e-5)
 
 
 def test_ssim_gradient_is_that_of_finite_differences():
@@ -169,6 +195,94 @@ def test_lpips_is_left_out_with_its_reason_or_refused():
     assert "torchvision" in protocol.left_out["lpips"]
     with pytest.raises(InputError, match="torchvision"):
         ImageMetrics(lpips="require")
+
+
+class RecordingNetwork:
+    """Stands in for torchmetrics' LPIPS: notes its options and what it is fed."""
+
+    def __init__(self, net_type, normalize):
+        self.options, self.fed = (net_type, normalize), []
+
+    def __call__(self, image, target):
+        self.fed.append((image, target))
+        return (image - target).abs().mean()
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    import torchmetrics.image.lpip
+
+    monkeypatch.setitem(sys.modules, "torchvision", types.ModuleType("torchvision"))
+    monkeypatch.setattr(
+        torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", RecordingNetwork, raising=False
+    )
+
+
+@pytest.mark.usefixtures("recorded")
+def test_lpips_sees_what_its_protocol_says():
+    image, target = _images(3)
+    mask = torch.ones(3, 30, 41, dtype=torch.bool)
+    overshooting = image * 1.5
+    for protocol, signed, expected in (
+        (ImageMetrics(), True, overshooting.clamp(0, 1)),
+        # The authors' evaluation: [0, 1] as it is, neither clamped nor mapped.
+        (
+            ImageMetrics("release", ["image"], "zeros", False, "require", lpips_signed=False),
+            False,
+            overshooting,
+        ),
+    ):
+        values = protocol(overshooting, target, mask)["lpips"]
+        network = protocol.metrics["lpips"].network
+        assert network.options == ("vgg", signed)
+        # One image at a time: torchmetrics would give the mean of a batch.
+        assert torch.equal(torch.cat([a for a, _ in network.fed]), expected)
+        assert torch.allclose(values, (expected - target).abs().mean((1, 2, 3)))
+
+
+@pytest.mark.usefixtures("recorded")
+def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
+    import torchmetrics.image.lpip
+
+    def offline(**_):
+        raise OSError("no\nroute")
+
+    monkeypatch.setattr(
+        torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", offline, raising=False
+    )
+    protocol = ImageMetrics()
+    assert "lpips" not in protocol.metrics
+    assert protocol.left_out["lpips"] == "LPIPS: the weights of 'vgg' could not be had: no route"
+
+
+def test_the_box_can_be_wider():
+    mask = torch.zeros(2, 20, 30, dtype=torch.bool)
+    mask[0, 8, 10] = mask[0, 11, 19] = True  # 4 high, 10 wide
+    wider = box_of(mask, 0.5)
+    assert wider[0].nonzero().amin(0).tolist() == [6, 5]
+    assert wider[0].nonzero().amax(0).tolist() == [13, 24]
+    assert wider[0].sum() == 8 * 20
+    assert not wider[1].any()
+    # It ends where the image does.
+    assert box_of(mask, 9.0)[0].all()
+    image, target = _images(2, 20, 30)
+    values = ImageMetrics(lpips="off", box_margin=0.5)(image, target, mask)
+    assert torch.equal(values["psnr_box"][:1], psnr(image, target, wider)[:1])
+    assert values["psnr_box"][1].isnan()
+    with pytest.raises(InputError, match="box_margin"):
+        ImageMetrics(lpips="off", box_margin=-0.1)
+
+
+def test_a_protocol_says_what_its_numbers_mean():
+    said = ImageMetrics(lpips="off", box_margin=0.1).definitions
+    assert said["ssim"].endswith("padding reflect")
+    assert "at most 100 dB" in said["psnr"]
+    assert "0.1 of its sides wider" in said["box"]
+    assert "clamped" in said["image"]
+    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off").definitions
+    assert release["ssim"].endswith("padding zeros")
+    assert "as they are" in release["image"]
+    assert "box" not in release
 
 
 def test_depth_error_is_in_millimetres_on_known_subject_pixels():

@@ -74,11 +74,19 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     if not rows:
         raise InputError("evaluation: expected at least one subject and target; found none")
     directory.mkdir(parents=True, exist_ok=True)
-    columns = [*KEYS, *metric_names(rows)]
+    # Lines of many runs can be put together and still be told apart.
+    origin = {
+        "data": provenance.get("data", {}).get("name"),
+        "split": provenance.get("data", {}).get("split"),
+        "protocol": provenance.get("protocol", {}).get("metrics"),
+        "seed": provenance.get("seed"),
+        "config_hash": provenance.get("config_hash"),
+    }
+    columns = [*KEYS, *metric_names(rows), *origin]
     table = io.StringIO()
     writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({**row, "inputs": " ".join(row["inputs"])} for row in _plain(rows))
+    writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in _plain(rows))
     _write(directory / "metrics.csv", table.getvalue())
     content = {
         "format_version": FORMAT_VERSION,

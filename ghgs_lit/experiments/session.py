@@ -21,6 +21,11 @@ from ghgs_lit.model import read_checkpoint
 # What is printed, with its decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}
 DEVICES = ("auto", "cpu", "cuda")
+SPLITS = {
+    "train": "the subjects that were trained on",
+    "val": "unseen in training; validation shares them: it chooses best.ckpt, and never last.ckpt",
+}
+"""What a reader of numbers has to know about the subjects that they are of."""
 
 
 def build_data(config: Mapping[str, Any]) -> LightningDataModule:
@@ -92,6 +97,8 @@ def measure_and_write(
             "targets": list(protocol["targets"]),
             "reported": list(metrics.metrics),
             "left_out": metrics.left_out,
+            "definitions": metrics.definitions,
+            "split": SPLITS.get(protocol["split"], "unseen in training"),
         },
         choices=choices(),
         **facts,

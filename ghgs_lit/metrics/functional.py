@@ -39,21 +39,30 @@ def mean_inside(
     return mean_over(values, region)
 
 
-def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
-    """The smallest upright box around each mask, as a mask; empty where the mask is."""
+def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n h w"]:
+    """The smallest upright box around each mask, as a mask; empty where the mask is.
+
+    ``margin`` is the share of the box's height and width that is added on each side, inside the image.
+    """
 
     def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
-        return (hit.long().cumsum(-1) > 0) & (hit.flip(-1).long().cumsum(-1).flip(-1) > 0)
+        index = torch.arange(hit.shape[1], device=hit.device)
+        first = torch.where(hit, index, hit.shape[1]).amin(-1, keepdim=True)
+        last = torch.where(hit, index, -1).amax(-1, keepdim=True)
+        grow = (margin * (last - first + 1)).round()
+        return (index >= first - grow) & (index <= last + grow) & hit.any(-1, keepdim=True)
 
     return span(mask.any(-1))[:, :, None] & span(mask.any(-2))[:, None, :]
 
 
-def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
+def region_of(
+    mask: Bool[Tensor, "n h w"], name: str, box_margin: float = 0.0
+) -> Bool[Tensor, "n h w"] | None:
     """Region ``image`` (None: all pixels), ``box`` or ``subject`` of a subject's mask."""
     choice("region", name, REGIONS)
     if name == "image":
         return None
-    return box_of(mask) if name == "box" else mask
+    return box_of(mask, box_margin) if name == "box" else mask
 
 
 def squared_error(

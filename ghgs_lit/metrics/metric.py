@@ -23,8 +23,11 @@ class PerImageMetric(Metric):
     source: tuple = ()
     """What :meth:`maps` depends on: metrics of equal source can share one map."""
 
-    def __init__(self, **kwargs):
+    def __init__(self, region: str = "image", box_margin: float = 0.0, **kwargs):
         super().__init__(**kwargs)
+        choice("region", region, functional.REGIONS)
+        require(box_margin >= 0, "box_margin", "a share of at least 0", box_margin)
+        self.region, self.box_margin = region, box_margin
         self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
 
@@ -35,6 +38,10 @@ class PerImageMetric(Metric):
     def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
         """One value an image; ``mask`` is the subject's in the target."""
         raise NotImplementedError
+
+    def region_of(self, mask: Masks) -> Masks | None:
+        """The pixels that count; None for all."""
+        return functional.region_of(mask, self.region, self.box_margin)
 
     def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
         """The value of each image."""
@@ -60,16 +67,11 @@ class PSNR(PerImageMetric):
     higher_is_better = True
     source = ("squared_error",)
 
-    def __init__(self, region: str = "image", **kwargs):
-        super().__init__(**kwargs)
-        choice("region", region, functional.REGIONS)
-        self.region = region
-
     def maps(self, image: Images, target: Images) -> Tensor:
         return functional.squared_error(image, target)
 
     def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
-        return functional.decibels(functional.mean_over(maps, functional.region_of(mask, self.region)))
+        return functional.decibels(functional.mean_over(maps, self.region_of(mask)))
 
 
 class SSIM(PerImageMetric):
@@ -78,16 +80,15 @@ class SSIM(PerImageMetric):
     higher_is_better = True
 
     def __init__(self, padding: str = "reflect", region: str = "image", **kwargs):
-        super().__init__(**kwargs)
+        super().__init__(region, **kwargs)
         choice("ssim.padding", padding, functional.PADDINGS)
-        choice("region", region, functional.REGIONS)
-        self.padding, self.region, self.source = padding, region, ("ssim", padding)
+        self.padding, self.source = padding, ("ssim", padding)
 
     def maps(self, image: Images, target: Images) -> Tensor:
         return functional.ssim_map(image, target, self.padding).mean(1)
 
     def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
-        return functional.mean_inside(maps, functional.region_of(mask, self.region))
+        return functional.mean_inside(maps, self.region_of(mask))
 
 
 class FLIP(PerImageMetric):
@@ -96,17 +97,16 @@ class FLIP(PerImageMetric):
     higher_is_better = False
 
     def __init__(self, region: str = "image", pixels_per_degree: float = PIXELS_PER_DEGREE, **kwargs):
-        super().__init__(**kwargs)
-        choice("region", region, functional.REGIONS)
+        super().__init__(region, **kwargs)
         require(pixels_per_degree > 0, "pixels_per_degree", "a positive number", pixels_per_degree)
-        self.region, self.pixels_per_degree = region, pixels_per_degree
+        self.pixels_per_degree = pixels_per_degree
         self.source = ("flip", pixels_per_degree)
 
     def maps(self, image: Images, target: Images) -> Tensor:
         return flip_map(image, target, self.pixels_per_degree)
 
     def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
-        return functional.mean_over(maps, functional.region_of(mask, self.region))
+        return functional.mean_over(maps, self.region_of(mask))
 
 
 class LPIPS(PerImageMetric):
@@ -132,12 +132,15 @@ class LPIPS(PerImageMetric):
                 warnings.simplefilter("ignore")
                 self.network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=signed)
         except Exception as error:  # the download fails in as many ways as networks do
-            raise InputError(f"LPIPS: the weights of {net!r} could not be had: {error}") from error
-        self.source = ("lpips", net, signed)
+            raise InputError(
+                f"LPIPS: the weights of {net!r} could not be had: {' '.join(str(error).split())}"
+            ) from error
+        self.net, self.signed, self.source = net, signed, ("lpips", net, signed)
 
     def maps(self, image: Images, target: Images) -> Tensor:
-        # The network's range check has no use for a render that overshoots by a rounding error.
-        singles = (images.float().clamp(0, 1).split(1) for images in (image, target))
+        # Told to map [0, 1], the network refuses what a render overshoots by.
+        low, high = (0, 1) if self.signed else (-1, None)
+        singles = (images.float().clamp(low, high).split(1) for images in (image, target))
         return torch.stack([self.network(a, b) for a, b in zip(*singles, strict=True)])
 
     def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
