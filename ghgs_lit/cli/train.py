@@ -35,8 +35,8 @@ def _quiet() -> None:
 
 def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int | None:
     """Load ``init_from``, check ``resume``; gives the step to resume at, if any."""
-    start.check_start(config)
-    if config["init_from"] is not None:
+    start.check_start(config, directory)
+    if config["init_from"] is not None and config["resume"] is None:
         lines = start.initialize(model, config["init_from"], config["init_strict"])
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)

@@ -6,7 +6,7 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.experiments.pictures import palette, row, stack, to_uint8
+from ghgs_lit.experiments.pictures import grid, palette, row, to_uint8
 from ghgs_lit.recalibration.inspection import TokenAttention
 from ghgs_lit.types import Batch, Points, Tokens
 
@@ -39,8 +39,8 @@ def chosen_token(
 def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:
     """The query (outlined) and its neighbours on the views of its element.
 
-    First row: the neighbours, the nearest brightest; captions say how many of them a view has. Then a row
-    for each layer: the weights, mean over the heads, the largest brightest; captions give each view's share.
+    First the neighbours, the nearest brightest; captions say how many of them a view has. Then for each
+    layer the weights, mean over the heads, the largest brightest; captions give each view's share.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views
@@ -55,7 +55,7 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
         shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
         captions = [f"layer {layer}: {100 * share:.0f}%" for share in shares]
         rows.append(row(_tiles(images, tokens, attention, weights / weights.max()), captions))
-    return stack(rows)
+    return grid(rows)
 
 
 def _tiles(

@@ -14,15 +14,13 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
     """Positions in metres and colours in [0, 1] of one subject, at most ``limit`` points each.
 
-    ``points``: unprojected pixels in their colours; ``gaussians``: centres in theirs; ``body``: vertices
-    of the body, where the data has them; ``points_and_body``: how the two that Chamfer pulls together lie.
+    ``points``: unprojected pixels in their colours; ``body``: vertices of the body, where the data has
+    them; ``points_and_body``: both, which the Chamfer term pulls together.
     Clouds without a point are left out.
     """
     valid = prediction.points.valid[element] & batch.masks[element]
-    gaussians = prediction.gaussians[element]
     found = {
-        "points": (prediction.points.pixels[element][valid], batch.images[element].movedim(1, -1)[valid]),
-        "gaussians": (gaussians.means, gaussians.colors[:, :3]),
+        "points": (prediction.points.pixels[element][valid], batch.images[element].movedim(1, -1)[valid])
     }
     if batch.body_vertices is not None:
         body = batch.body_vertices[element]

@@ -11,10 +11,11 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from ghgs_lit.errors import InputError
 
-#: Prefix of the final numbers: the metrics of TensorBoard's HParams tab.
-FINAL = "hparam"
-#: What a summary row of a results file is about; its other entries are numbers.
-_ABOUT = ("method", "views", "targets", "subjects")
+#: The final numbers that runs are compared by, where they were measured: TensorBoard's HParams tab shows
+#: the first five of its metrics at once. ``metrics.json`` has all.
+COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "ssim")
+#: Groups of the configuration that change no number, and keys that say where a run starts.
+_SILENT = ("hydra", "logger", "callbacks", "evaluation", "resume", "dry_run", "sweep")
 
 Value = str | int | float | bool
 
@@ -48,6 +49,10 @@ class TensorBoardLog(TensorBoardLogger):
 
         start = SessionLog(status=SessionLog.START)
         self.experiment.file_writer.add_event(Event(session_log=start), step)
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Without the epoch, that Lightning adds: steps count here."""
+        super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
 
     @rank_zero_only
     def log_hyperparams(self, params: Mapping[str, Value], *args: Any, **kwargs: Any) -> None:
@@ -108,14 +113,13 @@ def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]],
 
 
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """``hparam/psnr`` of the first row, ``hparam/psnr_v4_midway`` of the others; undefined ones left out."""
-    numbers = {}
-    for place, row in enumerate(summary):
-        protocol = f"_v{row['views']}_{row['targets']}" if place else ""
-        for name, value in row.items():
-            if name not in _ABOUT and value is not None:
-                numbers[f"{FINAL}/{name}{protocol}"] = float(value)
-    return numbers
+    """``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of another; what is undefined is not."""
+    return {
+        (f"hparam_v{row['views']}_{row['targets']}" if place else "hparam") + f"/{name}": float(row[name])
+        for place, row in enumerate(summary)
+        for name in COMPARED
+        if row.get(name) is not None
+    }
 
 
 def hyperparameters(
@@ -127,18 +131,19 @@ def hyperparameters(
     the command line's (``key=value``). Groups that do not change a number are left out.
     """
     found: dict[str, Value] = {
-        group: name
-        for group, name in choices.items()
-        if not group.startswith(("hydra/", "logger", "callbacks")) and name is not None
+        group: name for group, name in choices.items() if name is not None and _matters(group)
     }
     for key in [part.split("=", 1)[0].lstrip("+~") for part in overrides]:
-        if key not in choices and key.split(".")[0] not in ("hydra", "logger", "callbacks", "resume"):
-            value = _lookup(config, key.split("."))
-            if value is not None:
-                found[key] = value if isinstance(value, (str, int, float, bool)) else str(value)
+        value = _lookup(config, key.split("."))
+        if key not in choices and _matters(key) and value is not None:
+            found[key] = value if isinstance(value, (str, int, float, bool)) else str(value)
     if "seed" in config:
         found["seed"] = config["seed"]
     return found
+
+
+def _matters(key: str) -> bool:
+    return key.replace("/", ".").split(".")[0] not in _SILENT
 
 
 def _lookup(config: Any, path: Sequence[str]) -> Any:

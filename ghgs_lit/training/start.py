@@ -23,10 +23,12 @@ def model_state(checkpoint: Mapping[str, Any]) -> dict[str, torch.Tensor]:
     }
 
 
-def check_start(config: Mapping[str, Any]) -> None:
-    """Refuse a configuration that says two ways to start."""
-    both = config["resume"] is not None and config["init_from"] is not None
-    require(not both, "init_from", "null where resume is given", config["init_from"])
+def check_start(config: Mapping[str, Any], directory: Path) -> None:
+    """Refuse two ways to start; a run that goes on in its own ``directory`` began with its ``init_from``."""
+    if config["resume"] is None or config["init_from"] is None:
+        return
+    own = Path(config["resume"]).resolve().is_relative_to(directory.resolve())
+    require(own, "init_from", "null where resume is given", config["init_from"])
 
 
 def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:

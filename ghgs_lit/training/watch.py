@@ -133,7 +133,7 @@ class Attention(_FirstSubjects):
 
 
 class PointClouds(_FirstSubjects):
-    """Predicted points, Gaussian centres and the body as clouds: ``<subject>/points`` and so on.
+    """Predicted points and the body as clouds: ``<subject>/points`` and so on.
 
     To TensorBoard's mesh tab only; ``points`` bounds each cloud.
     """
