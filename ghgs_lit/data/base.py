@@ -25,7 +25,6 @@ class PhotographsDataModule(LightningDataModule):
         root: folder of the data.
         views, targets: protocols (:class:`ViewProtocol`, :class:`TargetProtocol`) or their mappings.
         size, target_size: side or [height, width] in pixels of inputs and targets (null: as inputs).
-        multiple: inputs are padded evenly with black to sides that this divides (the encoder's patch).
         batch_size: samples a step and process. ``steps_per_epoch``: null passes once over the subjects.
         ring: positions on a full ring.
         limit: first subjects of each phase that are used, ``{train: n, val: n}`` (null: all).
@@ -51,7 +50,6 @@ class PhotographsDataModule(LightningDataModule):
         size: int | Sequence[int],
         name: str,
         target_size: int | Sequence[int] | None = None,
-        multiple: int = 1,
         batch_size: int = 1,
         steps_per_epoch: int | None = None,
         ring: int = 16,
@@ -67,7 +65,6 @@ class PhotographsDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         _at_least_1("data.batch_size", batch_size)
-        _at_least_1("data.multiple", multiple)
         for key, value in (("steps_per_epoch", steps_per_epoch), ("body_vertices", body_vertices)):
             require(value is None or value >= 1, f"data.{key}", "at least 1 or null", value)
         require(ring >= 2, "data.ring", "at least 2", ring)
@@ -78,7 +75,7 @@ class PhotographsDataModule(LightningDataModule):
         self.targets = from_config(TargetProtocol, "targets", targets)
         self.size = image_size("data.size", size)
         self.target_size = self.size if target_size is None else image_size("data.target_size", target_size)
-        self.multiple, self.depths = multiple, depths
+        self.depths = depths
         self.batch_size, self.steps_per_epoch, self.ring = batch_size, steps_per_epoch, ring
         self.limit = _limit(limit)
         self.body_vertices, self.apply_mask = body_vertices, apply_mask
@@ -129,7 +126,7 @@ class PhotographsDataModule(LightningDataModule):
             same = self.target_size == self.size
             targets = inputs if same else self.reader(phase, self.target_size)
             self._assemblers[phase] = Assembler(
-                inputs, targets, self.apply_mask, self.body_vertices, self.multiple, self.depths
+                inputs, targets, self.apply_mask, self.body_vertices, self.depths
             )
         return self._assemblers[phase]
 

@@ -1,7 +1,6 @@
 """From draws to batches. An item of these data sets is a whole :class:`Batch`."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -21,8 +20,8 @@ class Assembler:
     Rendered photographs lie on black with antialiased silhouettes: pixels at the rim carry their
     share of the subject, on either side of the mask, as a splat's do. They are left as they are;
     ``apply_mask`` blacks out everything outside the mask, for photographs with a background.
-    ``body_vertices`` (null: all) are drawn from each body, always the same ones. Inputs are padded
-    with black, evenly, to sides that ``multiple`` divides; targets stay as they are.
+    ``body_vertices`` (null: all) are drawn from each body, always the same ones.
+    ``depths``: whether depth maps of inputs are read.
     """
 
     def __init__(
@@ -31,12 +30,11 @@ class Assembler:
         targets: Reader,
         apply_mask: bool = False,
         body_vertices: int | None = None,
-        multiple: int = 1,
         depths: bool = True,
     ) -> None:
         self.inputs, self.targets = inputs, targets
         self.apply_mask, self.body_vertices = apply_mask, body_vertices
-        self.multiple, self.depths = multiple, depths
+        self.depths = depths
 
     def batch(self, draws: Sequence[Draw]) -> Batch:
         """Samples with equal numbers of inputs and of targets."""
@@ -62,7 +60,7 @@ class Assembler:
         )
 
     def _input(self, name: str, pid: int, vid: int) -> View:
-        return pad(self.inputs.view(name, pid, vid, depth=self.depths), self.multiple)
+        return self.inputs.view(name, pid, vid, depth=self.depths)
 
     def _images(self, views: list[list[View]]) -> Tensor:
         images = _stack([[view.image for view in row] for row in views])
@@ -78,24 +76,6 @@ class Assembler:
             chosen = subject_rng(0, name).choice(len(vertices), self.body_vertices, replace=False)
             vertices = vertices[np.sort(chosen)]
         return torch.from_numpy(vertices)
-
-
-def pad(view: View, multiple: int) -> View:
-    """The view with black around it, evenly, so that ``multiple`` divides its sides; intrinsics follow."""
-    extra = [-side % multiple for side in view.mask.shape]
-    if not any(extra):
-        return view
-    around = [(n // 2, n - n // 2) for n in extra]
-    intrinsics = view.intrinsics.copy()
-    intrinsics[:2, 2] += (around[1][0], around[0][0])
-    depth = view.inverse_depth
-    return replace(
-        view,
-        image=np.pad(view.image, (*around, (0, 0))),
-        mask=np.pad(view.mask, around),
-        inverse_depth=None if depth is None else np.pad(depth, around),
-        intrinsics=intrinsics,
-    )
 
 
 def _stack(arrays: list[list[np.ndarray]]) -> Tensor:
