@@ -132,9 +132,8 @@ class LPIPS(PerImageMetric):
                 warnings.simplefilter("ignore")
                 self.network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=signed)
         except Exception as error:  # the download fails in as many ways as networks do
-            raise InputError(
-                f"LPIPS: the weights of {net!r} could not be had: {' '.join(str(error).split())}"
-            ) from error
+            reason = " ".join(str(error).split())
+            raise InputError(f"LPIPS: the weights of {net!r} could not be had: {reason}") from error
         self.net, self.signed, self.source = net, signed, ("lpips", net, signed)
 
     def maps(self, image: Images, target: Images) -> Tensor:
