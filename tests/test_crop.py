@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ghgs_lit.geometry.crop import subject_windows
+from ghgs_lit.geometry.crop import patch_padding, subject_windows
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, Cameras
 
@@ -56,3 +56,25 @@ def test_an_empty_mask_and_a_full_one():
     windows = subject_windows(masks, 14)
     assert (windows.height, windows.width) == (28, 28)
     assert windows.top.eq(0).all()
+
+
+@pytest.mark.parametrize(
+    ("size", "top", "left", "padded"),
+    [((512, 512), -3, -3, (518, 518)), ((360, 640), -2, -2, (364, 644)), ((41, 27), 0, 0, (42, 28))],
+)
+def test_padding_is_centred_and_undone(size, top, left, padded):
+    """512 gets 3 pixels on each side as in the authors' release; a single pixel goes below and right."""
+    batch = Batch(torch.rand(1, 2, 3, *size), boxes(1, 2, *size), cameras(1, 2, *size))
+    padding = patch_padding(batch.masks, 14)
+    assert (padding.top, padding.left) == (top, left)
+    part = padding.cut_batch(batch)
+    assert tuple(part.images.shape[3:]) == tuple(part.masks.shape[2:]) == padded
+    assert (part.cameras.height, part.cameras.width) == padded
+    assert part.images.sum() == pytest.approx(batch.images.sum().item())
+    assert torch.equal(padding.paste(part.masks, True), batch.masks)
+    shift = part.cameras.intrinsics - batch.cameras.intrinsics
+    assert shift[0, 0, :2, 2].tolist() == [-left, -top]
+    depth = torch.rand(1, 2, *padded) + 1
+    inside = unproject_maps(padding.paste(depth, 0.0), batch.cameras)
+    assert torch.allclose(padding.paste(unproject_maps(depth, part.cameras), 0.0), inside, atol=1e-4)
+    assert patch_padding(part.masks, 14) is None

@@ -52,6 +52,7 @@ def release_model(inputs, dtype):
         Recalibration(64, k=8, similarity="product_clamped", tokens="all"),
         GaussianHead(64, dpt, parameterization="release"),
         Unprojection("release", 3),
+        pad="multiple",
     ).to(dtype)
     names = {
         "pos_head.": "depth_head.dpt.",
@@ -77,13 +78,13 @@ def test_the_pipeline_matches_the_release(dtype):
     inputs, expected = fixture(name, "in", dtype), fixture(name, "out64", torch.float64)
     extrinsics = torch.eye(4, dtype=dtype).repeat(1, 3, 1, 1)
     extrinsics[..., :3, :] = inputs["extr"]
-    masks = nn.functional.pad(inputs["mask"][:, :, 0], (3, 3, 3, 3)) != 0
-    cameras = Cameras(inputs["intr"], extrinsics, 64, 64).cropped(-3, -3, 70, 70)
-    batch = Batch(inputs["image"], masks, cameras)
+    masks = inputs["mask"][:, :, 0] != 0
+    # The photographs are 64 x 64; the release pads them to 70 x 70 before, the model does so itself.
+    batch = Batch(inputs["image"][..., 3:-3, 3:-3], masks, Cameras(inputs["intr"], extrinsics, 64, 64))
     model = release_model(inputs, dtype)
     prediction = model(batch)
     found = {
-        "inv_depth": 1 / prediction.depth[..., 3:-3, 3:-3],
+        "inv_depth": 1 / prediction.depth,
         "offset_free_points": prediction.points.pixels[masks],
         "pos": prediction.gaussians.means,
         "rot": prediction.gaussians.quaternions,
@@ -311,3 +312,49 @@ def test_windows_give_gaussians_of_the_same_pixels(size):
     centers = pixel_centers(*size, camera).expand_as(uv)
     assert torch.allclose(uv[batch.masks], centers[batch.masks], atol=1e-3)
     assert torch.allclose(camera[..., 2][batch.masks], part.depth[batch.masks], atol=1e-4)
+
+
+PADS = ["model.pad=multiple"]
+
+
+@pytest.mark.parametrize("skip", ["none", "exact", "balanced"])
+@pytest.mark.parametrize(("size", "name"), [((50, 64), "hull"), ((45, 71), "paper")])
+def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
+    """What the stages see is a batch with a black border; what comes back is in the photograph's pixels."""
+    batch = make_batch(2, 3, *size)
+    overrides = [f"model={name}", f"skip={skip}"]
+    with pytest.raises(InputError, match=r"model\.pad=multiple"):
+        make_model(*overrides)(batch)
+    found = make_model(*overrides, *PADS)(batch)
+    assert found.depth.shape == found.depth_maps.confidence.shape == batch.masks.shape
+    assert found.points.pixels.shape == (*batch.masks.shape, 3)
+    assert torch.equal(found.depth_valid, batch.masks)
+    gaussians = found.gaussians
+    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    assert torch.equal(gaussians.image, image)
+    assert torch.equal(gaussians.pixel, pixel)
+    colors = batch.images.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
+    assert torch.equal(gaussians.colors, colors)
+    # Points lie on the rays of their pixels, with the photographs' own cameras.
+    matrices = (m[:, :, None, None] for m in (batch.cameras.intrinsics, batch.cameras.extrinsics))
+    uv, z = project(found.points.pixels, *matrices)
+    centers = pixel_centers(*size, uv).expand_as(uv)
+    assert torch.allclose(uv[batch.masks], centers[batch.masks], atol=1e-3)
+    assert torch.allclose(z[batch.masks], found.depth[batch.masks], atol=1e-4)
+
+
+def test_padding_is_what_a_black_border_does_by_hand():
+    batch = make_batch(1, 3, 50, 64)
+    border = nn.functional.pad(batch.images, (3, 3, 3, 3))
+    masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))
+    by_hand = Batch(border, masks, batch.cameras.cropped(-3, -3, 56, 70))
+    model = make_model("model=paper", *PADS)
+    # The box is carved from the photographs: a border would say that nothing lies beyond them.
+    expected = model._predict(by_hand, tuple(
+        nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in model.depth_head.interval(batch)
+    ))  # fmt: skip
+    found = model(batch)
+    close(found.gaussians, expected.gaussians, 0)
+    assert torch.equal(found.depth, expected.depth[..., 3:-3, 3:-3])
+    assert torch.equal(found.points.tokens, expected.points.tokens)
+    assert model(make_batch(1, 3, 56, 70)).depth.shape[-2:] == (56, 70)

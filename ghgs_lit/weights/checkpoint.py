@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import open_file
 
 #: Version of the checkpoints that are written and read.
@@ -29,12 +30,19 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
         if not isinstance(found, kind):
-            raise InputError(f"{path}: expected a checkpoint with {key!r}; found {summary(checkpoint)}")
+            hint = " (`ghgs import` makes a checkpoint of published weights)" * _is_published(checkpoint)
+            raise InputError(f"{path}: expected a checkpoint with {key!r}; found {summary(checkpoint)}{hint}")
     version = checkpoint["format_version"]
     if not 1 <= version <= FORMAT_VERSION:
         newer = ", of a newer version of this package" if version > FORMAT_VERSION else ""
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
     return checkpoint
+
+
+def _is_published(content: Any) -> bool:
+    return isinstance(content, Mapping) and any(
+        name == RELEASE_ENTRY or str(name).startswith(tuple(VGGT)) for name in content
+    )
 
 
 def summary(content: Any) -> str:

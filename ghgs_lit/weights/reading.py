@@ -4,6 +4,7 @@ Tensors are mapped from the disk, not read: they take memory where they are touc
 take it back.
 """
 
+import pickle
 import re
 import warnings
 import zipfile
@@ -81,6 +82,8 @@ def _open_torch(path: Path, map_location: Any, mmap: bool) -> Any:
         code = re.search(r"GLOBAL ([\w.]+)", text)
         if code:
             found = f"plain data that is mixed with code ({code[1]}), which is never run"
+        elif isinstance(error, pickle.UnpicklingError):
+            found = "a pickle that PyTorch did not write, or that holds code; such are never run"
         else:
             found = f"one that cannot be read ({(text.strip() or type(error).__name__).splitlines()[0]})"
         raise _unfit(path, found) from error

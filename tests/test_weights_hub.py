@@ -1,0 +1,116 @@
+"""The hub's client is stood in for: progress, resume and cache are its own; checks and answers are ours."""
+
+import hashlib
+import sys
+import types
+import urllib.error
+
+import pytest
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.weights import hub
+
+ADDRESS = "https://hub.test/facebook/VGGT-1B/resolve/main/model.safetensors"
+
+
+def stand_in(monkeypatch, cached=None, download=None, offline=False):
+    """A client whose cache holds ``cached`` and whose download is ``download``."""
+    client = types.ModuleType("huggingface_hub")
+    client.constants = types.SimpleNamespace(HF_HUB_OFFLINE=offline)
+    client.hf_hub_url = lambda repository, filename: f"https://hub.test/{repository}/resolve/main/{filename}"
+    client.try_to_load_from_cache = lambda repository, filename: cached
+    client.hf_hub_download = download or (lambda *_: pytest.fail("no download was needed"))
+    monkeypatch.setitem(sys.modules, "huggingface_hub", client)
+
+
+def unreachable(monkeypatch, error):
+    def open_nothing(request, timeout):
+        assert request.full_url == ADDRESS
+        assert timeout <= 5
+        raise error
+
+    monkeypatch.setattr(hub.urllib.request, "urlopen", open_nothing)
+
+
+def cached_file(folder, content, name=None):
+    """A file in the way the client caches it: under its sum, behind a link."""
+    blob = folder / (name or hashlib.sha256(content).hexdigest())
+    blob.write_bytes(content)
+    link = folder / "model.safetensors"
+    link.symlink_to(blob)
+    return str(link)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("facebook/VGGT-1B", True),
+        ("weights/model.safetensors", False),
+        ("weights/model.pt", False),
+        ("/data/vggt/model", False),
+        ("model", False),
+        ("a/b/c", False),
+    ],
+)
+def test_repositories_are_told_from_files(name, expected):
+    assert hub.is_repository(name) is expected
+
+
+def test_a_file_that_exists_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "facebook").mkdir()
+    (tmp_path / "facebook" / "VGGT-1B").write_bytes(b"x")
+    assert not hub.is_repository("facebook/VGGT-1B")
+
+
+def test_a_cached_file_needs_no_network(monkeypatch, tmp_path):
+    path = cached_file(tmp_path, b"weights")
+    stand_in(monkeypatch, cached=path, offline=True)
+    found, checksum = hub.fetch("facebook/VGGT-1B")
+    assert str(found) == path
+    assert checksum == hashlib.sha256(b"weights").hexdigest()
+
+
+def test_a_download_is_checked(monkeypatch, tmp_path):
+    monkeypatch.setattr(hub.urllib.request, "urlopen", lambda *_, **__: types.SimpleNamespace(close=int))
+    broken = cached_file(tmp_path, b"half of the wei", name="0" * 64)
+    stand_in(monkeypatch, download=lambda *_: broken)
+    with pytest.raises(InputError, match=r"0{64}: expected SHA-256 0{64}; found \w{64}: a broken download"):
+        hub.fetch("facebook/VGGT-1B")
+
+
+@pytest.mark.parametrize(
+    ("error", "offline", "reason"),
+    [
+        (urllib.error.URLError(ConnectionRefusedError("refused")), False, "refused"),
+        (urllib.error.URLError("name or service not known"), False, "not known"),
+        (TimeoutError("timed out"), False, "timed out"),
+        (None, True, "HF_HUB_OFFLINE is set"),
+    ],
+)
+def test_without_a_network_it_says_at_once_what_to_fetch(monkeypatch, error, offline, reason):
+    """Not after the client's half a minute of tries."""
+    stand_in(monkeypatch, offline=offline)
+    unreachable(monkeypatch, error)
+    with pytest.raises(InputError, match=reason) as caught:
+        hub.fetch("facebook/VGGT-1B")
+    text = str(caught.value)
+    assert f"Fetch {ADDRESS} by hand and say vggt=<that file>" in text
+    assert "\n" not in text
+
+
+def test_what_the_hub_refuses_is_one_line(monkeypatch):
+    unreachable(monkeypatch, urllib.error.HTTPError(ADDRESS, 404, "not found", {}, None))
+
+    def refuse(*_):
+        raise RuntimeError("Repository Not Found.\nMake sure that you are logged in.")
+
+    stand_in(monkeypatch, download=refuse)
+    with pytest.raises(InputError, match=r"expected https://hub\.test.*; found: Repository Not Found\.$"):
+        hub.fetch("facebook/VGGT-1B")
+
+
+def test_without_the_package_it_names_the_extra_and_the_file(monkeypatch):
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(InputError, match=r"ghgs-lit\[hub\].*resolve/main/model\.safetensors by hand"):
+        hub.fetch("facebook/VGGT-1B")
