@@ -28,7 +28,7 @@ def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, 
     for verb, (_, example) in cli.VERBS.items():
         assert example in out
         assert (conf_dir() / f"{verb}.yaml").is_file()
-        assert callable(importlib.import_module(f"ghgs_lit.cli.{verb}").run)
+        assert callable(importlib.import_module(cli.module_of(verb)).run)
 
 
 @pytest.mark.parametrize("argv", [(), ("paint",)])
