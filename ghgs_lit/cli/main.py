@@ -16,10 +16,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.errors import InputError
-from ghgs_lit.sweeps.work import register_resolver
+from ghgs_lit.sweeps.work import register_resolvers
 
 BAD_INPUT = (InputError, FileNotFoundError)
-register_resolver()  # wherever a launcher brings a job
+register_resolvers()  # wherever a launcher brings a job
 
 # verb: (what it does, an example)
 VERBS = {
@@ -111,6 +111,8 @@ def _one_line(error: Exception) -> str:
     if error.__cause__ is not None and not isinstance(error, BAD_INPUT):
         texts.append(str(error.__cause__))
     words = " ".join(" ".join(texts).split())
+    if "Could not find 'hydra/" in words:
+        words += " (launchers and sweepers come with the extras cluster, ray and optuna)"
     return words.replace("To append to your config use +", "it is no key of this verb; to add it: +")
 
 

@@ -32,7 +32,6 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
     planned = plan(
         combinations(sweeper.params, arguments),
         lambda overrides: loader.load_sweep_config(config, overrides),
-        directory,
     )
     if config.get("dry_run"):
         print_plan(planned, directory)
@@ -56,9 +55,7 @@ def combinations(params: Mapping[str, Any] | None, arguments: Sequence[str]) -> 
     return batch
 
 
-def plan(
-    combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig], directory: Path
-) -> list[Planned]:
+def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[Planned]:
     """The different runs among ``combos``, in order.
 
     Raises:
@@ -67,6 +64,7 @@ def plan(
     planned: dict[str, Planned] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
+        directory = Path(str(cfg.hydra.sweep.dir))
         with open_dict(cfg):
             del cfg["hydra"]
         config = plain(cfg)

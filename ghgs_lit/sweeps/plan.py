@@ -2,6 +2,7 @@
 
 import datetime
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +66,10 @@ def _clock(seconds: float | None) -> str:
     return "unknown" if seconds is None else str(datetime.timedelta(seconds=round(seconds)))
 
 
+def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
+    return f"{config['trainer'].get('max_steps')} steps" if seconds is None else _clock(seconds)
+
+
 def _print_table(planned: Sequence[Planned], columns: Mapping[str, Sequence[str]]) -> None:
     """One line a run; overrides that all of them share are left out."""
     shared = set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
@@ -85,7 +90,8 @@ def print_plan(planned: Sequence[Planned], directory: Path) -> None:
     states = [item.run.state for item in planned]
     measured = step_seconds(directory)
     times = [expected_seconds(item.config, measured and measured[0]) for item in planned]
-    _print_table(planned, {"state": [s.value for s in states], "trains for": [_clock(t) for t in times]})
+    budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
+    _print_table(planned, {"state": [s.value for s in states], "trains for": budgets})
     print(f"{len(planned)} runs: {_counts(states)}; nothing was run")
     left = [t for t, state in zip(times, states, strict=True) if state != State.DONE]
     basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
@@ -110,7 +116,11 @@ def print_results(planned: Sequence[Planned], directory: Path) -> None:
 def print_single_plan(config: Mapping[str, Any], run: Run) -> None:
     """The plan of one training run; jobs of a sweep come here only where it is not known beforehand."""
     if is_multirun():
-        raise InputError("dry_run: expected hydra/sweeper=grid, which knows its runs before; found another")
-    expected = _clock(expected_seconds(config, None))
-    _print_table([Planned(config_hash(config), (), (), config, run)], {"trains for": [expected]})
+        print(
+            "dry_run: expected hydra/sweeper=grid, which knows its runs before; found another",
+            file=sys.stderr,
+        )
+        raise SystemExit(1)  # a sweeper would take an error for a failed job and go on
+    budget = _budget(config, expected_seconds(config, None))
+    _print_table([Planned(config_hash(config), (), (), config, run)], {"trains for": [budget]})
     print(f"nothing was run; outputs: {run.directory}/ with {OUTPUTS}", flush=True)

@@ -47,9 +47,16 @@ def _hash_of_run(*, _root_: DictConfig) -> str:
     return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
 
 
-def register_resolver() -> None:
-    """``${config_hash:}`` is the hash of a job's resolved configuration, the name of its directory."""
+def _sqlite(path: str) -> str:
+    place = Path(path).resolve()
+    place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
+    return f"sqlite:///{place}"
+
+
+def register_resolvers() -> None:
+    """``${config_hash:}``, the name of a job's directory, and ``${sqlite:path}``, the URL of a data base."""
     OmegaConf.register_new_resolver("config_hash", _hash_of_run, replace=True)
+    OmegaConf.register_new_resolver("sqlite", _sqlite, replace=True)
 
 
 def going_on(config: dict[str, Any], run: Run) -> dict[str, Any]:
