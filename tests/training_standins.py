@@ -1,8 +1,11 @@
 """A model and a renderer that train in microseconds, and batches for them."""
 
+import lightning.pytorch as L
 import torch
 from torch import nn
+from torch.utils.data import DataLoader, Dataset
 
+from ghgs_lit.data.datasets import StepSampler
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import (
     Batch,
@@ -91,3 +94,33 @@ def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:
     image = colors[:, None, :, None, None].expand(b, t, 3, cameras.height, cameras.width)
     ones = torch.ones(b, t, 1, cameras.height, cameras.width)
     return Rendering(image, ones, ones)
+
+
+class _Steps(Dataset):
+    def __init__(self, length: int):
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, step: int) -> Batch:
+        return example_batch(seed=step)
+
+
+class StepData(L.LightningDataModule):
+    """Training batches that are functions of the step, in epochs of ``length``; two to validate on."""
+
+    def __init__(self, length: int = 5):
+        super().__init__()
+        self.length = length
+
+    def train_dataloader(self) -> DataLoader:
+        def first() -> int:
+            return self.trainer.global_step * self.trainer.accumulate_grad_batches
+
+        steps = _Steps(self.length)
+        return DataLoader(steps, batch_size=None, collate_fn=lambda b: b, sampler=StepSampler(steps, first))
+
+    def val_dataloader(self) -> DataLoader:
+        batches = [example_batch(seed=1000 + i) for i in range(2)]
+        return DataLoader(batches, batch_size=None, collate_fn=lambda b: b)
