@@ -1,7 +1,8 @@
 """HuMMan-Recon v1.0 for Lightning."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,6 +11,7 @@ import numpy as np
 from ghgs_lit.data.base import PHASES, PhotographsDataModule
 from ghgs_lit.data.humman.cameras import read_calibration
 from ghgs_lit.data.humman.reader import BODIES, HuMManReader
+from ghgs_lit.data.reader import Reader
 from ghgs_lit.errors import InputError, choice, require
 
 _SEQUENCE = re.compile(r"p\d{6}_a\d{6}")
@@ -70,28 +72,30 @@ class HuMManDataModule(PhotographsDataModule):
             strict=strict,
         )
 
-    def people(self, phase: str) -> int:
-        return len(self.assembler(phase).inputs.sequences)
+    def people(self, reader: Reader) -> int:
+        return len(reader.sequences)
 
-    def inspect(self) -> list[str]:
-        """Sequences whose world is not the frame of their first colour camera."""
-        found = []
-        for phase in PHASES:
-            for name in self.sequences(phase):
-                path = self.folder / name / "cameras.json"
-                try:
-                    first = read_calibration(path, "color").extrinsics[0]
-                except InputError:  # reported by the reader
-                    continue
-                if np.abs(first - np.eye(4)).max() > _NO_POSE:
-                    found.append(
-                        f"{path}: expected the world in the frame of kinect_color_000 (R = 1, T = 0); "
-                        f"found T = {first[:3, 3].round(3).tolist()}"
-                    )
-        return found
+    def inspections(self) -> Sequence[Callable[[], None]]:
+        names = {name for phase in PHASES for name in self.sequences(phase)} if self.root else set()
+        there = [path for name in sorted(names) if (path := self.folder / name).is_dir()]
+        return [partial(check_world, path / "cameras.json") for path in there]
 
     def miniature(self, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
         from ghgs_lit.data.miniatures.humman import make
 
         require(self.root is not None, "data.root", "a folder to write to", None)
         return make(Path(self.root).expanduser(), self.split["val"], people, size, seed)
+
+
+def check_world(path: Path) -> None:
+    """Refuse a ``cameras.json`` whose world is not the frame of its first colour camera.
+
+    Raises:
+        InputError: so, or the file is bad.
+    """
+    first = read_calibration(path, "color").extrinsics[0]
+    if np.abs(first - np.eye(4)).max() > _NO_POSE:
+        raise InputError(
+            f"{path}: expected the world in the frame of kinect_color_000 (R = 1, T = 0); "
+            f"found T = {first[:3, 3].round(3).tolist()}"
+        )

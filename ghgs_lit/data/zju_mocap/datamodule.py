@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ghgs_lit.data.base import PHASES, PhotographsDataModule
+from ghgs_lit.data.reader import Reader
 from ghgs_lit.data.settings import from_config
 from ghgs_lit.data.zju_mocap.reader import Split, ZJUMoCapReader
 from ghgs_lit.errors import choice, require
@@ -33,8 +34,12 @@ class ZJUMoCapDataModule(PhotographsDataModule):
         super().__init__(**others)
         for phase in splits:
             choice("data.splits key", phase, PHASES)
+        for phase in PHASES:
+            require(
+                bool(splits.get(phase)), f"data.splits.{phase}", "sequences and frames", splits.get(phase)
+            )
         self.splits = {
-            phase: [from_config(Split, f"data.splits.{phase}", split) for split in splits.get(phase, ())]
+            phase: [from_config(Split, f"data.splits.{phase}", split) for split in splits[phase]]
             for phase in PHASES
         }
         require(cameras is None or cameras >= 2, "data.cameras", "at least 2 or null", cameras)
@@ -52,8 +57,8 @@ class ZJUMoCapDataModule(PhotographsDataModule):
             **self._options,
         )
 
-    def people(self, phase: str) -> int:
-        return len(self.assembler(phase).inputs.sequences)
+    def people(self, reader: Reader) -> int:
+        return len(reader.sequences)
 
     def miniature(self, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
         from ghgs_lit.data.miniatures.zju_mocap import make
