@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.agreement import photo_agreement
 from ghgs_lit.geometry.projection import wide
 from ghgs_lit.geometry.relative import INTERVAL_CHANNELS, relative_interval
 from ghgs_lit.geometry.visual_hull import Interval, SubjectBounds
@@ -51,6 +52,8 @@ class DepthHead(nn.Module):
         search: options of :class:`SubjectBounds`.
         start: share of the way from near to far at which training starts.
         guide: let the dense head see photographs, masks and the intervals of depth at full resolution.
+        agreement: at so many depths of each interval the guide also tells how well the photographs agree
+            (:func:`photo_agreement`); 0: none.
         views: ``all``, or ``subject``: views whose mask is empty are not decoded (their depths mean nothing).
     """
 
@@ -64,6 +67,7 @@ class DepthHead(nn.Module):
         start: float = 0.5,
         views: str = "all",
         guide: bool = False,
+        agreement: int = 0,
     ):
         super().__init__()
         choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
@@ -79,7 +83,15 @@ class DepthHead(nn.Module):
         self.parameterization, self.start = parameterization, log(start / (1 - start))
         self.views = views
         self.bounds = None if bounds == "none" else SubjectBounds(kind=bounds, **(search or {}))
-        channels = PHOTO_CHANNELS + INTERVAL_CHANNELS * (bounds != "none") if guide else 0
+        bounded = guide and bounds != "none"
+        require(
+            agreement == 0 or (agreement > 0 and bounded),
+            "depth_head.agreement",
+            "0, or a positive number where there are a guide and bounds",
+            agreement,
+        )
+        self.agreement = agreement
+        channels = guide * PHOTO_CHANNELS + bounded * INTERVAL_CHANNELS + agreement
         self.dpt = proportioned_dpt(dim_latent, 2, guide_channels=channels, **(dpt or {}))
         if self.bounds is not None:
             last = self.dpt.scratch.output_conv2[-1]
@@ -98,8 +110,10 @@ class DepthHead(nn.Module):
         wanted = batch.masks.flatten(2).any(-1) | (self.views == "all")
         guide = None
         if self.dpt.guide is not None:
-            shape = () if interval is None else (relative_interval(interval, batch.masks),)
-            guide = photo_guide(batch, *shape)
+            maps = [] if interval is None else [relative_interval(interval, batch.masks)]
+            if self.agreement:
+                maps.append(photo_agreement(batch, interval, self.agreement))
+            guide = photo_guide(batch, *maps)
         raw = wide(decode_views(self.dpt, tokens, guide, wanted))
         value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
         near, far = interval or (None, None)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.agreement import photo_agreement
 from ghgs_lit.geometry.projection import wide
 from ghgs_lit.geometry.relative import relative_depth
 from ghgs_lit.heads.activations import unit
@@ -102,8 +103,8 @@ def release_attributes(
 class GaussianHead(nn.Module):
     """A dense head over the recalibrated tokens, then four small networks for each pixel of the subject.
 
-    Colours are the input pixels'. Published names: ``offset_header``, ``scale_header``, ``rot_header``,
-    ``opacity_header``, linears at 0, 2 and 4.
+    Colours are the input pixels', unless ``color_limit`` lets them change. Published names:
+    ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, linears at 0, 2 and 4.
 
     Args:
         dim_latent: width of the tokens (from the encoder).
@@ -117,6 +118,10 @@ class GaussianHead(nn.Module):
             selects after; the Gaussians are the same.
         views: ``subject`` decodes views with a pixel of the subject only, ``all`` every view.
         guide: let the dense head see photographs, masks and depths at full resolution.
+        agreement: the guide also tells how well the photographs agree at the depth that was found
+            (:func:`photo_agreement`): a splat off the surface can become transparent.
+        color_limit: how far a colour may leave its pixel's, in each channel, which makes up for the blur of
+            splats and for dark rims; 0: not at all (the paper).
     """
 
     def __init__(
@@ -130,58 +135,81 @@ class GaussianHead(nn.Module):
         pixels: str = "subject",
         views: str = "subject",
         guide: bool = False,
+        agreement: bool = False,
+        color_limit: float = 0.0,
     ):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
         choice("gaussian_head.views", views, ("subject", "all"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
+        require(guide or not agreement, "gaussian_head.agreement", "false where there is no guide", agreement)
+        require(color_limit >= 0, "gaussian_head.color_limit", "0 or more", color_limit)
         self.pixels, self.views = pixels, views
-        guided = PHOTO_CHANNELS + 1 if guide else 0
+        self.agreement, self.color_limit = agreement, color_limit
+        guided = PHOTO_CHANNELS + 1 + agreement if guide else 0
         self.decoder = proportioned_dpt(dim_latent, channels, guide_channels=guided, **(dpt or {}))
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
         self.rot_header = _mlp((channels, *hidden, 4), nn.ReLU)
         self.opacity_header = _mlp((channels, *hidden, 1), nn.ReLU)
+        headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
+        from_zero = []
+        if color_limit > 0:
+            self.color_header = _mlp((channels, *hidden, 3), nn.ReLU)
+            headers.append(self.color_header)
+            from_zero.append(self.color_header)
         self.activate = release_attributes
         if parameterization == "footprint":
             self.activate = FootprintAttributes(**(attributes or {}))
-            for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header):
-                nn.init.zeros_(header[-1].weight)
-                nn.init.zeros_(header[-1].bias)
+            from_zero = headers
+        for header in from_zero:
+            nn.init.zeros_(header[-1].weight)
+            nn.init.zeros_(header[-1].bias)
 
     def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """Gaussians of the valid pixels in the order of element, view, row, column."""
         wanted = points.valid.flatten(2).any(-1) | (self.views == "all")
-        guide = None
-        if self.decoder.guide is not None:
-            guide = photo_guide(batch, relative_depth(wide(depth_maps.depth), points.valid))
-        maps = decode_views(self.decoder, tokens, guide, wanted)
+        maps = decode_views(self.decoder, tokens, self._guide(batch, points, depth_maps), wanted)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
         descriptors = maps.flatten(2).transpose(1, 2)
         if self.pixels == "subject":
             raw = self._raw(descriptors[image, pixel])
         else:
             raw = tuple(value[image, pixel] for value in self._raw(descriptors))
+        offset, scale, rotation, opacity, *color = raw
         focal = wide(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
         # Without a gradient: a splat that is too large must not come nearer to become smaller.
         footprint = depth.detach() / focal
-        offset, scales, quaternions, opacities = self.activate(*raw, footprint)
+        offset, scales, quaternions, opacities = self.activate(offset, scale, rotation, opacity, footprint)
+        colors = wide(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
         return Gaussians(
             means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
             quaternions=quaternions,
             scales=scales,
             opacities=opacities,
-            colors=wide(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel],
+            colors=colors + self.color_limit * color[0].tanh() if color else colors,
             splits=tuple(points.valid.flatten(1).sum(1).tolist()),
             image=image,
             pixel=pixel,
         )
 
-    def _raw(self, descriptors: Float[Tensor, "*n c"]) -> Attributes:
-        offset, scale, rotation, opacity = (
-            wide(header(descriptors))
-            for header in (self.offset_header, self.scale_header, self.rot_header, self.opacity_header)
-        )
-        return offset, scale, rotation, opacity[..., 0]
+    def _guide(
+        self, batch: Batch, points: Points, depth_maps: DepthMaps
+    ) -> Float[Tensor, "B V k H W"] | None:
+        if self.decoder.guide is None:
+            return None
+        maps = [relative_depth(wide(depth_maps.depth), points.valid)]
+        if self.agreement:
+            depth = wide(depth_maps.depth.detach())
+            maps.append(photo_agreement(batch, (depth, depth), 1))
+        return photo_guide(batch, *maps)
+
+    def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:
+        """What the networks say: offset, scale, rotation, opacity and, where there is one, color."""
+        headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
+        if self.color_limit > 0:
+            headers.append(self.color_header)
+        offset, scale, rotation, opacity, *color = (wide(header(descriptors)) for header in headers)
+        return offset, scale, rotation, opacity[..., 0], *color
