@@ -15,7 +15,7 @@ from ghgs_lit.types import Batch
 PHOTO_CHANNELS = 4
 
 
-def photo_guide(batch: Batch, *maps: Float[Tensor, "B V c H W"]) -> Float[Tensor, "B V k H W"]:
+def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Float[Tensor, "B V k H W"]:
     """Photographs, masks and further ``maps`` as the channels of one map."""
     images = wide(batch.images)
     return torch.cat((images, batch.masks.to(images.dtype)[:, :, None], *maps), dim=2)
