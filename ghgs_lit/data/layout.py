@@ -27,6 +27,7 @@ from ghgs_lit.data.reader import (
     read_array,
     read_image,
     read_map,
+    rgb,
 )
 from ghgs_lit.errors import InputError, choice
 
@@ -177,7 +178,7 @@ class Layout(Reader):
         intrinsics[:2, 2] += self._shift
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
         return View(
-            image=np.asarray(image.convert("RGB")),
+            image=rgb(image),
             mask=mask > mask.max() / 2,
             inverse_depth=inverse,
             intrinsics=intrinsics.astype(np.float32),

