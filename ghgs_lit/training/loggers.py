@@ -113,7 +113,7 @@ def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]],
 
 
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of another; undefined ones left out."""
+    """``hparam/psnr`` of the first protocol; ``hparam_v4_midway/psnr`` of others; not what is undefined."""
     return {
         (f"hparam_v{row['views']}_{row['targets']}" if place else "hparam") + f"/{name}": float(row[name])
         for place, row in enumerate(summary)

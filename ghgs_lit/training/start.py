@@ -4,23 +4,26 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import nn
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.model import STATE_PREFIX, load_strictly, read_checkpoint
+from ghgs_lit.model import load_strictly, read_checkpoint
+from ghgs_lit.weights.checkpoint import model_state
+from ghgs_lit.weights.switches import differences as differing_switches
 
 #: What may differ between a run and the one that it goes on from: where it writes, how far it goes.
-FREE = ("resume", "trainer.max_steps", "trainer.max_time", "logger", "callbacks", "evaluation", "metrics")
-
-
-def model_state(checkpoint: Mapping[str, Any]) -> dict[str, torch.Tensor]:
-    """The model's tensors of a checkpoint, under the model's own names."""
-    return {
-        key.removeprefix(STATE_PREFIX): value
-        for key, value in checkpoint["state_dict"].items()
-        if key.startswith(STATE_PREFIX)
-    }
+FREE = (
+    "resume",
+    "encoder.weights",
+    "dry_run",
+    "sweep",
+    "trainer.max_steps",
+    "trainer.max_time",
+    "logger",
+    "callbacks",
+    "evaluation",
+    "metrics",
+)
 
 
 def check_start(config: Mapping[str, Any], directory: Path) -> None:
@@ -96,6 +99,29 @@ def initialize(model: nn.Module, path: str | Path, strict: bool = False) -> list
         raise InputError(f"init_from: expected weights that fit the model; found none in {path}")
     model.load_state_dict(fitting, strict=False)
     return lines
+
+
+def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any]:
+    """``config`` that says where the encoder's weights come from, if those of the start do and all fit.
+
+    Tables then know that semantic features carry semantics (``encoder.weights``).
+    """
+    path = config["resume"] or config["init_from"]
+    if path is None:
+        return config
+    checkpoint = read_checkpoint(path)
+    origin, state = checkpoint["config"].get("encoder", {}).get("weights"), model_state(checkpoint)
+    fits = all(
+        name in state and state[name].shape == tensor.shape
+        for name, tensor in model.state_dict().items()
+        if name.startswith("encoder.")
+    )
+    return {**config, "encoder": {**config["encoder"], "weights": origin}} if origin and fits else config
+
+
+def switched(config: Mapping[str, Any]) -> list[str]:
+    """The switches (:mod:`ghgs_lit.weights.switches`) in which this model differs from ``init_from``'s."""
+    return differing_switches(config, read_checkpoint(config["init_from"])["config"])
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:

@@ -18,10 +18,10 @@ from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.recalibration.inspection import attention_of
 from ghgs_lit.types import Batch
 
-#: How TensorBoard shows clouds: points of about a centimetre, a lens that does not distort.
+#: How TensorBoard shows clouds: points of two centimetres, a lens that does not distort.
 CLOUD_VIEW = {
     "camera": {"cls": "PerspectiveCamera", "fov": 40},
-    "material": {"cls": "PointsMaterial", "size": 0.012},
+    "material": {"cls": "PointsMaterial", "size": 0.02},
 }
 
 
