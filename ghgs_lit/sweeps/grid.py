@@ -17,7 +17,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.provenance import config_hash
 from ghgs_lit.sweeps.plan import Planned, print_plan, print_results
 from ghgs_lit.sweeps.run import Run, State
-from ghgs_lit.sweeps.work import BUSY
+from ghgs_lit.sweeps.work import BUSY, refuse_shared_process
 
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between two looks at runs that others work on
@@ -33,6 +33,8 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
         combinations(sweeper.params, arguments),
         lambda overrides: loader.load_sweep_config(config, overrides),
     )
+    for item in planned:
+        refuse_shared_process(item.config, config.hydra.runtime.choices["hydra/launcher"])
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []

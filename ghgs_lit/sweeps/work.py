@@ -98,19 +98,27 @@ def work_in_own_process(run: Run) -> float | str | None:
     return run.metric if run.done else BUSY
 
 
-def needs_own_process(config: Mapping[str, Any]) -> bool:
-    """Whether this job of a sweep trains in several processes that Lightning starts.
+def refuse_shared_process(config: Mapping[str, Any], launcher: str) -> bool:
+    """Whether a job of a sweep trains in several processes.
 
     Raises:
-        InputError: the jobs of the sweep share a process.
+        InputError: it does, and the ``launcher`` runs all jobs in one process.
     """
     devices = config["trainer"].get("devices", 1)
-    if not is_multirun() or devices in (1, "1", [0]):
+    if devices in (1, "1", [0]):
         return False
-    launcher = HydraConfig.get().runtime.choices.get("hydra/launcher", "basic")
     if launcher == "basic":
         raise InputError(
             f"trainer.devices: expected 1 in a sweep whose jobs share a process; found {devices}"
             " (hydra/launcher=joblib, submitit_local or submitit_slurm gives each job its own)"
         )
-    return "slurm" not in launcher  # SLURM starts the processes of a job itself
+    return True
+
+
+def needs_own_process(config: Mapping[str, Any]) -> bool:
+    """Whether this job of a sweep trains in several processes that Lightning starts."""
+    if not is_multirun():
+        return False
+    launcher = HydraConfig.get().runtime.choices.get("hydra/launcher", "basic")
+    # SLURM starts the processes of a job itself.
+    return refuse_shared_process(config, launcher) and "slurm" not in launcher
