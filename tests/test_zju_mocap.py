@@ -1,6 +1,7 @@
 """ZJU-MoCap: every oddity of the format, on a miniature in its true layout."""
 
 import shutil
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -287,3 +288,15 @@ def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
     make(tmp_path, ["386"], SIZE, seed=3, frames=1)
     for name in ("Camera_B7/000000.jpg", "mask_cihp/Camera_B7/000000.png", "new_vertices/0.npy"):
         assert (tmp_path / "CoreView_386" / name).read_bytes() == (root / "CoreView_386" / name).read_bytes()
+
+
+def test_targets_between_cameras_that_stand_still_are_refused(root):
+    data = build_data("zju_mocap", root, "data.size=64", "data.workers=0", "targets=release")
+    for draw in (
+        data.training_draws,
+        data.evaluation_loader,
+        partial(data.evaluation_loader, targets="midway"),
+    ):
+        with pytest.raises(InputError, match=r"targets: expected cameras for data=zju_mocap.*; found"):
+            draw()
+    assert len(data.evaluation_loader(targets="cameras")) > 0

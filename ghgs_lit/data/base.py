@@ -10,7 +10,14 @@ from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.data.datasets import Assembler, EvaluationBatches, StepSampler, TrainingBatches
 from ghgs_lit.data.reader import Reader
-from ghgs_lit.data.sampling import TargetProtocol, TrainingDraws, ViewProtocol, evaluation_draws
+from ghgs_lit.data.sampling import (
+    CAMERAS,
+    RING_VID,
+    TargetProtocol,
+    TrainingDraws,
+    ViewProtocol,
+    evaluation_draws,
+)
 from ghgs_lit.data.settings import from_config, image_size
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.types import Batch
@@ -41,6 +48,8 @@ class PhotographsDataModule(LightningDataModule):
 
     # Subjects of each phase in the publication, where there is one.
     published: ClassVar[Mapping[str, int]] = {}
+    # Whether cameras stand still: there are no views between them to be targets.
+    still: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -145,8 +154,8 @@ class PhotographsDataModule(LightningDataModule):
 
     def training_draws(self) -> TrainingDraws:
         """What training sees at each step."""
-        subjects = self.subjects("train")
-        return TrainingDraws(subjects, self.views, self.targets, self.ring, self.batch_size, self.seed)
+        subjects, targets = self.subjects("train"), self._possible(self.targets)
+        return TrainingDraws(subjects, self.views, targets, self.ring, self.batch_size, self.seed)
 
     def training_batch(self, step: int) -> Batch:
         """The batch of a single process at ``step``."""
@@ -171,14 +180,25 @@ class PhotographsDataModule(LightningDataModule):
         (null: this module's; another name: that protocol with its default values).
         """
         if isinstance(targets, str):
-            targets = self.targets if targets == self.targets.name else TargetProtocol(targets)
+            named = CAMERAS if targets == CAMERAS.name else TargetProtocol(targets)
+            targets = self.targets if targets == self.targets.name else named
         targets = self.targets if targets is None else from_config(TargetProtocol, "targets", targets)
+        self._possible(targets)
         assembler = self.assembler(split)
         count = views or self.views.evaluation_count
         draws = evaluation_draws(
             assembler.inputs.subjects, count, targets, self.ring, self.seed, self.evaluation_positions
         )
         return self._loader(EvaluationBatches(assembler, draws, batch_size or self.batch_size))
+
+    def _possible(self, targets: TargetProtocol) -> TargetProtocol:
+        """``targets``, unless they are views between cameras that stand still."""
+        if self.still and targets.vids != {RING_VID}:
+            raise InputError(
+                f"targets: expected cameras for data={self.name}, as with targets=cameras "
+                f"evaluation.targets=[cameras]; found {targets.name}, which asks for views between cameras"
+            )
+        return targets
 
     def val_dataloader(self) -> DataLoader:
         return self.evaluation_loader()

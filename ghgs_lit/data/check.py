@@ -17,6 +17,7 @@ from ghgs_lit.data.base import PHASES, PhotographsDataModule
 from ghgs_lit.data.contact import Tile, draw_tile, save_sheet
 from ghgs_lit.data.overlap import overlap
 from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
@@ -126,6 +127,8 @@ def inspect(data: PhotographsDataModule, least_iou: float = 0.5) -> Report:
     reach 0.75 to 0.95, a camera that is off 0 to 0.4.
     """
     report = Report()
+    if data.still:  # whatever targets the command line has: they are a matter of training
+        data.targets = CAMERAS
     data.cache_images_mb = min(data.cache_images_mb, 4)  # a body is read once for all its photographs
     inspections = data.inspections()
     if inspections:

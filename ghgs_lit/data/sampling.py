@@ -155,6 +155,10 @@ class TargetProtocol:
         return tuple(photos if self.per_subject == "all" else photos[: int(self.per_subject)])
 
 
+#: Every camera that is no input, for rigs whose cameras all stand still.
+CAMERAS = TargetProtocol("cameras", vid=RING_VID, per_subject="all", training_vids=(RING_VID,))
+
+
 @dataclass(frozen=True)
 class TrainingDraws:
     """The endless sequence of training batches over ``subjects`` (name to available positions)."""
