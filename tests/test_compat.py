@@ -6,13 +6,16 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from stage_models import config, make_model
 from stage_scenes import make_batch
+from weight_files import PUBLISHED
+from weight_files import config as imported_config
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.geometry.points import Unprojection
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.heads.depth import BOUNDED, DepthHead
-from ghgs_lit.model import GHGS
+from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
+from ghgs_lit.weights import names
 from ghgs_lit.weights.switches import release_switches
 
 #: What a new model of the paper does, beside what the release does (docs/weights.md).
@@ -41,6 +44,18 @@ def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
         overrides = ["depth_head.bounds=none", "depth_head.parameterization=inverse_linear"]
     with torch.device("meta"):
         GHGS.from_config(config("model=paper", *overrides))
+
+
+@pytest.mark.parametrize("model", ["paper", "hull"])
+def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
+    overrides = [f"model={model}", "compat=release"]
+    state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=STAGES).state_dict()
+    found = {
+        names.to_published(name, names.RELEASE): list(tensor.shape)
+        for name, tensor in state.items()
+        if not name.startswith("encoder.")
+    }
+    assert found == PUBLISHED["network"]
 
 
 @pytest.mark.parametrize("verb", VERBS)

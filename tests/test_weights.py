@@ -11,6 +11,7 @@ from weight_files import OTHER_HEADS, PUBLISHED, config, published_tensors, writ
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, STAGES, read_checkpoint
+from ghgs_lit.training import start
 from ghgs_lit.weights import importing, names
 from ghgs_lit.weights.exporting import export_weights
 from ghgs_lit.weights.importing import Source, assign, import_weights
@@ -177,7 +178,10 @@ def tampered(files, tmp_path, change):
             r"blk\.norm1\.weight: expected a tensor of .*\(64,\); .*not",
         ),
         (lambda n: n.update({"blk.lam_s": torch.ones(1)}), r"blk\.lam_s: expected no such tensor"),
-        (lambda n: n.update({"smpl.x": torch.ones(1)}), r"smpl\.x: expected a name that release\.pth has"),
+        (
+            lambda n: n.update({"smpl.x": torch.ones(1)}),
+            r"smpl\.x: expected a tensor of the authors' release",
+        ),
         (
             lambda n: n.update({"blk.norm1.weight": torch.ones(3)}),
             r"blk\.norm1\.weight: expected shape \(64,\) of the configured model; found \(3,\)",
@@ -207,7 +211,7 @@ def test_a_tensor_that_comes_twice_is_refused(tmp_path, files):
 
 def test_files_in_the_wrong_place_are_refused(tmp_path, files):
     vggt, release, *_ = files
-    with pytest.raises(InputError, match=r"release\.pth: network: expected a name that"):
+    with pytest.raises(InputError, match=r"release\.pth: network: expected a tensor of VGGT-1B"):
         import_weights(config(), tmp_path / "out.ckpt", release, None)
     with pytest.raises(InputError, match=r"expected the entry 'network'; found 'aggregator\..* more"):
         import_weights(config(), tmp_path / "out.ckpt", vggt, vggt)
@@ -251,3 +255,21 @@ def test_tiny_files_have_the_published_structure():
     assert set(network) == set(PUBLISHED["network"])
     own = {name for name in vggt if name.startswith("aggregator.")}
     assert kinds(own) == {f"aggregator.{name}" for name in kinds(PUBLISHED["vggt"])}
+
+
+def test_training_from_imported_weights_says_where_they_come_from(tmp_path, files):
+    """Tables read ``encoder.weights``: it follows the encoder's tensors, if all of them come along."""
+    out = str(tmp_path / "out.ckpt")
+    settings = config("compat=none", "encoder.trainable=last_1")
+    import_weights(settings, out, files[0])
+    model = GHGS.from_config(settings)
+    lines = start.initialize(model, out, strict=True)
+    assert all(line.startswith("loaded") for line in lines)
+    run = {**settings, "resume": None, "init_from": out}
+    assert start.with_origin(run, model)["encoder"]["weights"] == "vggt.safetensors"
+    assert start.switched(run) == []
+    assert "weights" not in run["encoder"]
+    assert start.with_origin({**run, "init_from": None}, model) == {**run, "init_from": None}
+    wider = config("compat=none", "encoder.mask_input=true")
+    assert "weights" not in start.with_origin({**run, **wider}, GHGS.from_config(wider))["encoder"]
+    assert start.switched({**run, **config()}) != []

@@ -40,6 +40,8 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
         lines = start.initialize(model, config["init_from"], config["init_strict"])
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
+            if start.switched(config):
+                print(f"the weights knew another model: {', '.join(start.switched(config))}", flush=True)
     if config["resume"] is None:
         return None
     step, changed = start.check_resume(config["resume"], model, config)
@@ -92,6 +94,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
     data = build_data(config)
     model = GHGS.from_config(config)
     step = prepare_start(config, model, directory)
+    config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")
     module = GHGSModule(
         model, renderer, build(config["loss"], "loss"), build(config["optimizer"], "optimizer"), config

@@ -41,7 +41,12 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
         return cfg
     if cfg.checkpoint is None:
         raise InputError("data: expected data=... where there is no checkpoint; found none")
-    return OmegaConf.merge({"data": read_checkpoint(cfg.checkpoint)["config"]["data"]}, cfg)
+    trained = read_checkpoint(cfg.checkpoint)["config"]
+    if "data" not in trained:
+        raise InputError(
+            f"data: expected data=... for weights that were imported ({cfg.checkpoint}); found none"
+        )
+    return OmegaConf.merge({"data": trained["data"]}, cfg)
 
 
 def pick_device(name: str) -> torch.device:

@@ -18,6 +18,9 @@ from ghgs_lit.weights.reading import cast, open_file
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
+#: What the files are, in words.
+KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}
+
 #: Where the depth head starts when there is no checkpoint of the release.
 DEPTH_STARTS = ("fresh", "vggt")
 
@@ -61,7 +64,7 @@ class Source:
                 self.skipped[name.split(".")[0]] += 1
                 continue
             own = names.to_ours(name, self.table)
-            require(own is not None, where, f"a name that {self.label} has", "an unknown one")
+            require(own is not None, where, f"a tensor of {KINDS[self.key]}", "an unknown one")
             require(own in model, where, "no such tensor in the configured model", shape_of(tensor))
             require(own not in self.used, where, "one tensor of this meaning", f"{self.used.get(own)} too")
             require_shape(where, model[own], tensor)
