@@ -1,7 +1,8 @@
 """Builds objects from configuration nodes, through a whitelist.
 
 A configuration can come out of somebody else's checkpoint, and Hydra's ``instantiate`` calls whatever
-``_target_`` names. Only this package and the names below are ever called.
+``_target_`` names. Only this package, the names below and what the user has admitted
+(:mod:`ghgs_lit.config.plugins`) are ever called.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,6 +12,7 @@ import hydra.utils
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 
+from ghgs_lit.config.plugins import VARIABLE, admits
 from ghgs_lit.errors import InputError
 
 _OUTSIDE = frozenset(
@@ -47,6 +49,10 @@ def _targets(node: Any, key: str = "") -> Iterator[tuple[str, object]]:
             yield from _targets(value, f"{key}[{index}]")
 
 
+def _is_allowed(target: str) -> bool:
+    return target in _OUTSIDE or target.startswith("ghgs_lit.") or admits(target)
+
+
 def _reason(error: InstantiationException, key: str) -> InputError:
     """What the constructor had to say, as one line that starts with the key."""
     cause = error.__cause__
@@ -74,8 +80,11 @@ def build(node: Mapping | DictConfig, _key: str = "", **extra: Any) -> Any:
         raise InputError(f"{_key or 'configuration'}: expected a mapping with _target_; found {node!r}")
     plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
     for path, target in _targets(plain, _key):
-        if not (isinstance(target, str) and (target in _OUTSIDE or target.startswith("ghgs_lit."))):
-            raise InputError(f"{path}: expected a class of ghgs_lit or a whitelisted one; found {target!r}")
+        if not (isinstance(target, str) and _is_allowed(target)):
+            raise InputError(
+                f"{path}: expected a class of ghgs_lit or a whitelisted one; found {target!r}"
+                f" ({VARIABLE}=file.py admits classes of your own)"
+            )
     try:
         return hydra.utils.instantiate(plain, _convert_="all", **extra)
     except InstantiationException as error:

@@ -1,0 +1,60 @@
+"""Own classes in configurations: modules beside this package whose names a ``_target_`` may have.
+
+A configuration can come out of somebody else's checkpoint, so none can admit anything. The user does: with
+``GHGS_PLUGINS`` in the environment (Python files or names of modules, separated as in ``PATH``), or by
+installing a package that declares an entry point in the group ``ghgs_lit.plugins``.
+"""
+
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from functools import cache
+from pathlib import Path
+
+from ghgs_lit.errors import InputError
+
+VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
+
+
+def admits(target: str) -> bool:
+    """Whether ``target`` lies in a module that the user has admitted; that module is then imported."""
+    names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
+    for name in (*names, *_installed()):
+        if target.startswith(f"{name}."):
+            importlib.import_module(name)
+            return True
+    return False
+
+
+@cache
+def _installed() -> tuple[str, ...]:
+    """Modules of installed packages that declare themselves plugins."""
+    return tuple(point.value for point in importlib.metadata.entry_points(group=GROUP))
+
+
+def _module_of(entry: str) -> str:
+    """The module's name; a file is made importable by the name of its stem, in child processes too.
+
+    Raises:
+        InputError: the file is missing, or another module has its name.
+    """
+    entry = entry.strip()
+    if not entry.endswith(".py"):
+        return entry
+    path = Path(entry).expanduser().resolve()
+    if not path.is_file():
+        raise InputError(f"{VARIABLE}: expected a Python file; found no {path}")
+    if not path.stem.isidentifier():
+        raise InputError(f"{VARIABLE}: expected a file name that Python can import; found {path.name!r}")
+    folder = str(path.parent)
+    if folder not in sys.path:
+        # Behind everything else: the files beside it must not hide installed packages.
+        sys.path.append(folder)
+        importlib.invalidate_caches()
+    spec = importlib.util.find_spec(path.stem)
+    if spec is None or spec.origin is None or Path(spec.origin).resolve() != path:
+        found = spec.origin if spec else "none"
+        raise InputError(f"{VARIABLE}: expected a name that no other module has for {path}; found {found}")
+    return path.stem
