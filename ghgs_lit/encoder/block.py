@@ -8,6 +8,10 @@ from torch.utils.checkpoint import checkpoint
 
 from ghgs_lit.encoder.attention import Attention
 from ghgs_lit.encoder.rope import Rotary
+from ghgs_lit.linear import Linear, even_parts
+
+#: Values inside the MLP that are held at once where no gradient is kept.
+_HIDDEN = 1 << 23
 
 
 class LayerScale(nn.Module):
@@ -26,8 +30,8 @@ class Mlp(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        self.fc1 = nn.Linear(width, 4 * width)
-        self.fc2 = nn.Linear(4 * width, width)
+        self.fc1 = Linear(width, 4 * width)
+        self.fc2 = Linear(4 * width, width)
 
     def forward(self, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
         return self.fc2(F.gelu(self.fc1(x)))
@@ -47,13 +51,24 @@ class Block(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
         x = self.ls1(x, self.attn(self.norm1(x), rotary))
-        return self.ls2(x, self.mlp(self.norm2(x)))
+        if torch.is_grad_enabled():
+            return self.ls2(x, self.mlp(self.norm2(x)))
+        # What ls1 has just made is nobody else's: it is added to in place, some tokens at a time.
+        tokens = x.flatten(0, 1)
+        for rows in even_parts(len(tokens), _HIDDEN // (4 * x.shape[-1])):
+            tokens[rows].addcmul_(self.mlp(self.norm2(tokens[rows])), self.ls2.gamma)
+        return x
 
 
 def run(
     block: Block, x: Float[Tensor, "n t c"], checkpointing: bool, rotary: Rotary | None = None
 ) -> Float[Tensor, "n t c"]:
-    """``block(x)``; with ``checkpointing`` its activations are recomputed in the backward pass."""
-    if checkpointing and torch.is_grad_enabled():
-        return checkpoint(block, x, rotary, use_reentrant=False)
-    return block(x, rotary)
+    """``block(x)``, with a gradient only where something before or inside the block wants one.
+
+    With ``checkpointing`` the block's activations are recomputed in the backward pass.
+    """
+    wanted = x.requires_grad or any(p.requires_grad for p in block.parameters())
+    with torch.set_grad_enabled(wanted and torch.is_grad_enabled()):
+        if checkpointing and torch.is_grad_enabled():
+            return checkpoint(block, x, rotary, use_reentrant=False)
+        return block(x, rotary)

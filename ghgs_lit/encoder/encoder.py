@@ -1,12 +1,12 @@
 """The encode stage: photographs and masks to tokens."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.aggregator import Aggregator
+from ghgs_lit.encoder.aggregator import Aggregator, Pair
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
@@ -101,7 +101,7 @@ class VGGTEncoder(nn.Module):
         axes = (torch.arange(n, device=images.device) for n in (b * v, *grid[2:]))
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         return Tokens(
-            latent=tuple(torch.cat((f[:, first:], g[:, first:]), dim=-1).flatten(0, 1) for f, g in pairs),
+            latent=tuple(_joined(pairs, first)),
             semantic=patches.detach().flatten(0, 1),
             image=image,
             row=row,
@@ -128,6 +128,12 @@ class VGGTEncoder(nn.Module):
             require(interval is not None, "encoder.interval_input", "depths that are bounded", "no bounds")
             x = torch.cat((x, relative_interval(interval, masks).to(x.dtype)), dim=2)
         return x.to(self.aggregator.camera_token.dtype)
+
+
+def _joined(pairs: list[Pair], first: int) -> Iterator[Float[Tensor, "N C"]]:
+    """Tokens from ``first`` on of the frame and the global block side by side; ``pairs`` is used up."""
+    while pairs:
+        yield torch.cat([tokens[:, first:] for tokens in pairs.pop(0)], dim=-1).flatten(0, 1)
 
 
 def _patch_embedding(

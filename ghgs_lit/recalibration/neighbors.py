@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
+from ghgs_lit.linear import even_parts
 
 MODES = ("all", "other_views", "mixed")
 
@@ -38,12 +39,13 @@ def nearest_neighbors(
     require(k >= 1, "recalibration.k", "1 or more", k)
     points = wide(points)
     n = points.shape[0]
-    parts = [
-        _nearest_to_block(points, view, slice(start, start + step), min(k, n), mode)
-        for step in [max(1, _BLOCK // max(n, 1))]
-        for start in range(0, max(n, 1), step)
-    ]
-    return Neighbors(torch.cat([p.index for p in parts]), torch.cat([p.valid for p in parts]))
+    # Filled, not joined: small results kept among freed distances would hold all their memory.
+    index = torch.empty(n, min(k, n), dtype=torch.int64, device=points.device)
+    valid = torch.empty_like(index, dtype=torch.bool)
+    for rows in even_parts(n, _BLOCK // max(n, 1)):
+        part = _nearest_to_block(points, view, rows, min(k, n), mode)
+        index[rows], valid[rows] = part.index, part.valid
+    return Neighbors(index, valid)
 
 
 def _nearest_to_block(points: Tensor, view: Tensor, block: slice, k: int, mode: str) -> Neighbors:

@@ -9,9 +9,13 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
+from ghgs_lit.linear import even_parts, product
 from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
 from ghgs_lit.types import Batch, Points, Tokens
+
+#: Cosines that are held at once.
+_SIMILARITIES = 1 << 22
 
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
@@ -54,25 +58,27 @@ class Recalibration(nn.Module):
         batch_size, views = batch.masks.shape[:2]
         takes_part = points.tokens_valid | (self.tokens == "all")
         chosen = takes_part.nonzero()[:, 0]
-        element = tokens.image[chosen] // views
-        counts = torch.bincount(element, minlength=batch_size).tolist()
+
+        def part(values: Tensor) -> Tensor:
+            return values if len(chosen) == len(values) else values[chosen]
+
+        image = part(tokens.image)
+        counts = torch.bincount(image // views, minlength=batch_size).tolist()
         neighbors = [
-            nearest_neighbors(positions, image, self.k, self.neighbors)
-            for positions, image in zip(
-                self._positions(tokens, points)[chosen].split(counts),
-                tokens.image[chosen].split(counts),
-                strict=True,
+            nearest_neighbors(positions, views_of, self.k, self.neighbors)
+            for positions, views_of in zip(
+                part(self._positions(tokens, points)).split(counts), image.split(counts), strict=True
             )
         ]
         cosines = None
         if self.block.similarity != "none":
-            semantic = tokens.semantic[chosen].split(counts)
+            semantic = part(tokens.semantic).split(counts)
             cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
-        layers = tuple(
-            layer.index_copy(0, chosen, self.block(layer[chosen], neighbors, cosines).to(layer.dtype))
-            for layer in tokens.latent
-        )
-        return dataclasses.replace(tokens, latent=layers)
+        layers = []
+        for layer in tokens.latent:
+            found = self.block(part(layer), neighbors, cosines).to(layer.dtype)
+            layers.append(found if len(found) == len(layer) else layer.index_copy(0, chosen, found))
+        return dataclasses.replace(tokens, latent=tuple(layers))
 
     def _positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
         if self.neighborhood == "xyz":
@@ -90,9 +96,7 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
     """
     with torch.autocast(semantic.device.type, enabled=False):
         unit = F.normalize(wide(semantic), dim=-1, eps=1e-12)
-        step = 1024
-        parts = [
-            (unit[start : start + step] @ unit.T).gather(1, neighbors.index[start : start + step])
-            for start in range(0, max(len(unit), 1), step)
-        ]
-    return torch.cat(parts)
+        cosines = unit.new_empty(neighbors.index.shape)
+        for rows in even_parts(len(unit), _SIMILARITIES // max(1, len(unit))):
+            torch.gather(product(unit[rows], unit), 1, neighbors.index[rows], out=cosines[rows])
+    return cosines
