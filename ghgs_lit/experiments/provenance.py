@@ -24,6 +24,7 @@ UNHASHED = frozenset(
         "data.pin_memory",
         "data.render_workers",
         "data.workers",
+        "encoder.weights",  # said of init_from's, which counts
         "evaluation.pictures",
         "trainer.log_every_n_steps",
     }
