@@ -96,7 +96,9 @@ def test_anything_else_is_refused_by_its_name_and_not_called(tmp_path, call, nam
     path = tmp_path / "bad.pkl"
     for content in (bad, {"a": [bad]}, np.array([bad], dtype=object)):
         path.write_bytes(pickle.dumps(content, protocol=protocol))
-        with pytest.raises(InputError, match=r"bad\.pkl: expected a pickle of NumPy arrays and plain") as caught:
+        with pytest.raises(
+            InputError, match=r"bad\.pkl: expected a pickle of NumPy arrays and plain"
+        ) as caught:
             load_pickle(path)
         assert str(caught.value).split("found ")[1].replace("__builtin__", "builtins") in (
             name,
@@ -109,7 +111,7 @@ def test_no_codec_but_the_one_that_bytes_need(tmp_path):
     path = tmp_path / "a.pkl"
     # _codecs.encode('uryyb', 'rot13')
     path.write_bytes(b"\x80\x02c_codecs\nencode\nX\x05\x00\x00\x00uryybX\x05\x00\x00\x00rot13\x86R.")
-    with pytest.raises(InputError, match="found UnpicklingError.*rot13"):
+    with pytest.raises(InputError, match=r"found UnpicklingError.*rot13"):
         load_pickle(path)
 
 
@@ -133,7 +135,9 @@ def test_npy_files(tmp_path):
     np.save(path, np.array([{"a": 1}, None], dtype=object))
     assert load_npy(path)[0] == {"a": 1}
     np.save(path, {"a": Call(os.system, f"touch {tmp_path}/called")})
-    with pytest.raises(InputError, match=r"a\.npy: expected a pickle of NumPy arrays .*; found posix\.system"):
+    with pytest.raises(
+        InputError, match=r"a\.npy: expected a pickle of NumPy arrays .*; found posix\.system"
+    ):
         load_npy(path)
     assert not (tmp_path / "called").exists()
     for data in (b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00\x05\x00hello", b"text"):

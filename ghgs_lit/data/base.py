@@ -180,8 +180,8 @@ class PhotographsDataModule(LightningDataModule):
         (null: this module's; another name: that protocol with its default values).
         """
         if isinstance(targets, str):
-            named = CAMERAS if targets == CAMERAS.name else TargetProtocol(targets)
-            targets = self.targets if targets == self.targets.name else named
+            known = {CAMERAS.name: CAMERAS, self.targets.name: self.targets}
+            targets = known.get(targets) or TargetProtocol(targets)
         targets = self.targets if targets is None else from_config(TargetProtocol, "targets", targets)
         self._possible(targets)
         assembler = self.assembler(split)

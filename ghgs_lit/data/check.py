@@ -90,9 +90,8 @@ class _Photographs(Dataset):
         problem = None
         if fit.iou < self.least:
             place = self.reader.place(name, pid, vid)
-            problem = (
-                f"{place}: expected the body in its mask (IoU {self.least:.2f}); found IoU {fit.iou:.2f}"
-            )
+            expected = f"the body in its mask (IoU of {self.least:.2f} or more)"
+            problem = f"{place}: expected {expected}; found IoU {fit.iou:.2f}"
         return Seen(name, pid, vid, fit.iou, fit.inside, problem, tile)
 
 
@@ -214,9 +213,8 @@ def split_line(line: str) -> tuple[str, str, str]:
 
 def show(report: Report) -> None:
     """The tables on the terminal."""
-    table = Table(
-        "phase", "people", "subjects", "photographs", "broken", "bodies", "IoU mean", "least", "inside"
-    )
+    columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "least IoU", "inside")
+    table = Table("phase", *columns)
     for name, phase in report.phases.items():
         iou, inside = phase.overlaps("iou"), phase.overlaps("inside")
         numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}", f"{min(inside):.3f}"] if iou else ["-"] * 3

@@ -113,9 +113,7 @@ class THuman2Source:
         if self.fits is None:
             return None
         if not (self.fits / name).is_dir():
-            raise InputError(
-                f"{self.fits / name}: expected the SMPL-X fit of scan {name}; found no such folder"
-            )
+            raise InputError(f"{self.fits / name}: expected the scan's SMPL-X fit; found no such folder")
         return self.fits / name
 
     def body(self, name: str) -> np.ndarray | None:

@@ -8,6 +8,7 @@ Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.data.
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -56,12 +57,13 @@ class _Scan:
     translation: np.ndarray
 
 
+@lru_cache(maxsize=4)
 def _scan(name: str, seed: int) -> _Scan:
     """Person number ``int(name)`` turned by some yaw, in units that are not metres."""
     person = people.generate(seed, int(name))
     rng = subject_rng(seed, name)
     yaw = float(rng.uniform(-np.pi, np.pi))
-    scale, translation = float(rng.uniform(0.5, 1.2)), rng.uniform(-0.05, 0.05, 3)
+    scale, translation = float(rng.uniform(0.5, 0.9)), rng.uniform(-0.3, 0.3, 3)
     turn = Rotation.from_euler("y", yaw).as_matrix().T
 
     def place(vertices: np.ndarray) -> np.ndarray:
