@@ -8,7 +8,7 @@ sequences 313 and 315 these are the original long names, whose fifth field is th
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -71,7 +71,7 @@ def read_annotations(path: Path) -> Annotations:
     )
 
 
-def frame_number(name: PurePosixPath) -> int:
+def frame_number(name: PurePath) -> int:
     """The number in the name of a photograph, which names the body's files too.
 
     Raises:
@@ -85,7 +85,7 @@ def frame_number(name: PurePosixPath) -> int:
     return int(field)
 
 
-def frame_field(name: PurePosixPath) -> str:
+def frame_field(name: PurePath) -> str:
     """The part of a name that says the frame: all of ``000012``, ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
     fields = name.stem.split("_")
     return fields[4] if len(fields) > 4 else name.stem

@@ -51,7 +51,7 @@ class _Frame:
 
     @property
     def number(self) -> int:
-        return frame_number(self.annotations.frames[self.index][0])
+        return frame_number(self.folder / self.annotations.frames[self.index][0])
 
 
 class ZJUMoCapReader(Reader):
