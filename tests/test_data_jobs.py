@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -112,6 +114,51 @@ def test_two_processes_at_once_share_the_work(scans, reference, tmp_path):
         assert process.exitcode == 0
     assert sorted(log.read_text().split()) == ["s0", "s1", "s2", "s3"]  # each rendered once
     assert contents(root) == reference
+
+
+@dataclass(frozen=True)
+class Stuck:
+    """A source that notes which process loads, and takes its time."""
+
+    source: ScanSource
+    log: Path
+
+    def load(self, name):
+        with open(self.log, "a") as file:
+            file.write(f"{os.getpid()}\n")
+        time.sleep(60)
+        return self.source.load(name)
+
+    def facing(self, name):
+        return 0.0
+
+
+def render_stuck(root: Path, scans: Path, log: Path) -> None:
+    names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
+    render_people(root, names, Stuck(ScanSource(scans), log), RIG, SMALL, 0, workers=2)
+
+
+def lives(pid: int) -> bool:
+    """Whether a process runs; one that waits to be buried does not."""
+    state = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
+    return state.strip()[:1] not in ("", "Z")
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(scans, tmp_path, signal_number):
+    log = tmp_path / "log"
+    process = SPAWN.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
+    process.start()
+    limit = time.monotonic() + 60
+    while not (log.exists() and len(log.read_text().split()) == 2) and time.monotonic() < limit:
+        time.sleep(0.05)
+    workers = [int(pid) for pid in log.read_text().split()]
+    assert all(map(lives, workers))
+    os.kill(process.pid, signal_number)
+    process.join()
+    while any(map(lives, workers)) and time.monotonic() < limit:
+        time.sleep(0.05)
+    assert not any(map(lives, workers))
 
 
 def test_several_workers_make_the_same_files(scans, reference, tmp_path):

@@ -9,6 +9,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -190,9 +191,16 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
 
 
 def _start_worker() -> None:
-    """One thread a process; Ctrl-C is the parent's to answer."""
+    """One thread a process; Ctrl-C is the parent's to answer, and without the parent there is no work."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed (``kill``, ``kill -9``, the batch system) takes nobody with it by itself."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
 
 
 def _bar() -> Bar:
