@@ -6,7 +6,7 @@ cd "$(dirname "$0")/.."
 out="${GHGS_DEMO_DIR:-runs/demo_$(date +%Y-%m-%d_%H-%M-%S)}"
 
 ghgs train -m experiment=demo ablation=full,no_unprojection,no_semantic,neither "hydra.sweep.dir=$out"
-ghgs table sweep="$out" illustration=true "hydra.run.dir=$out/table"
+ghgs table runs="$out" illustration=true "hydra.run.dir=$out/table"
 
 cat <<TEXT
 

@@ -225,10 +225,19 @@ def test_a_sweep_becomes_a_table(boxes, tmp_path):
         "evaluation.targets=[release]", "metrics=release", f"hydra.sweep.dir={tmp_path / 'sweep'}",
     )  # fmt: skip
     assert code == 0
-    assert ghgs("table", f"sweep={tmp_path / 'sweep'}", f"hydra.run.dir={tmp_path / 'table'}") == 0
+    assert ghgs("table", f"runs={tmp_path / 'sweep'}", f"hydra.run.dir={tmp_path / 'table'}") == 0
     text = (tmp_path / "table" / "table.md").read_text()
     assert "metrics `release`, model `paper`, encoder `vggt_nano`" in text
     assert text.count("missing") == 2 * 9 + 2 * 6
+    assert r"\begin{tabular}" in (tmp_path / "table" / "table.tex").read_text()
+    assert (tmp_path / "table" / "table.csv").read_text().count(",full,") == 9
+    # The directory under the name that is a group of `train`, too; the paper's layout; a bad one.
+    again = ["table", f"sweep=[{tmp_path / 'sweep'}]", f"hydra.run.dir={tmp_path / 'second'}"]
+    assert ghgs(*again, "layout=table2", "metrics=psnr_box", "test.kind=t") == 1
+    assert ghgs(*again, "layout=table2", "metrics=psnr", "test.kind=t", r'test.unit="(.+)"') == 0
+    assert "RoGSplat" in (tmp_path / "second" / "table.md").read_text()
+    for wrong in ("layout=table9", "evaluation.views=four", "test.kind=anova", "test.unit=x", "test.unt=1"):
+        assert ghgs(*again, wrong) == 1
     # Jobs that share a process cannot start others.
     assert ghgs("train", "-m", *data_of(boxes), *quick, "seed=1,2", "trainer=ddp_cpu") == 1
 
@@ -254,7 +263,8 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("wrote ") == 1
-    assert [p.name for p in directory.rglob("events*")].__len__() == 1
+    # events.out.tfevents.<time>.<host>.<process>.<number>
+    assert len({p.name.split(".")[-2] for p in directory.rglob("events*")}) == 1
     content = json.loads((directory / "metrics.json").read_text())
     assert content["provenance"]["training"] | {"seconds": 0} == {"steps": 2, "seconds": 0, "processes": 2}
     assert GHGS.from_checkpoint(directory / "checkpoints" / "last.ckpt") is not None

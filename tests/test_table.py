@@ -5,7 +5,6 @@ import io
 import json
 
 import pytest
-import yaml
 from table_runs import body, start_run, tables_of, write_run
 
 from ghgs_lit.errors import InputError
@@ -52,13 +51,12 @@ def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
     assert rows["✗", "✗"] == ["0.0600", "0.1000"]
 
 
-def test_seeds_that_were_asked_for_and_are_not_there_are_said(tmp_path):
+def test_runs_that_are_planned_or_going_are_said(tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / f"full{seed}", "full", 20.0 + seed, seed=seed)
     write_run(tmp_path / "other", "neither", 20.0, seed=1)
     start_run(tmp_path / "going", "neither", seed=2)
-    multirun = "hydra: {overrides: {task: ['seed=1,2,3', 'ablation=full,neither']}, sweeper: {params: null}}"
-    (tmp_path / "multirun.yaml").write_text(multirun)
+    start_run(tmp_path / "planned", "full", seed=3)
     # Half-written, and foreign: neither is a run.
     (tmp_path / "half").mkdir()
     (tmp_path / "half" / "config.yaml").write_text("ablation: {name: [")
@@ -68,14 +66,6 @@ def test_seeds_that_were_asked_for_and_are_not_there_are_said(tmp_path):
     assert rows["✗", "✗"][0] == "24.00 (1/3)"
     assert any("synthetic paper neither seed 2" in note for note in table.notes)
     assert not any("seed 1" in note for note in table.notes)
-
-
-def test_the_seeds_of_a_sweeps_parameters_are_asked_for_too(tmp_path):
-    write_run(tmp_path / "0", "full", 20.0)
-    for seed, seeds in (("range(1,4)", {1, 2, 3}), ("1,2", {1, 2}), (5, {5})):
-        hydra = {"overrides": {"task": []}, "sweeper": {"params": {"seed": seed}}}
-        (tmp_path / "multirun.yaml").write_text(yaml.safe_dump({"hydra": hydra}))
-        assert read_sweep([tmp_path]).seeds == seeds
 
 
 def test_a_row_is_told_by_what_was_trained(tmp_path):

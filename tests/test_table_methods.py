@@ -139,3 +139,11 @@ def test_others_that_fit_nowhere_are_refused(tmp_path):
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(InputError, match="expected JSON"):
         read_others(tmp_path / "bad.json")
+
+
+def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
+    """It stands in a run's results, and not yet in its plan."""
+    path = write_run(tmp_path / "0", "full", 20.0, weights="vggt.safetensors").with_name("config.yaml")
+    path.write_text(path.read_text().replace("vggt.safetensors", "null"))
+    (table,) = tables_of(tmp_path, "table3", reported=False)
+    assert [line.stub for line in table.lines] == [("Ours",)]

@@ -47,7 +47,7 @@ VERBS = {
         "a checkpoint to the published names",
         "ghgs export checkpoint=last.ckpt vggt=vggt.safetensors release=release.pth",
     ),
-    "table": ("collect a sweep into the paper's table", "ghgs table sweep=runs/train/sweep_..."),
+    "table": ("collect a sweep into the paper's table", "ghgs table runs=runs/train/sweep_..."),
 }
 
 
@@ -116,11 +116,16 @@ def _one_line(error: Exception) -> str:
     return words.replace("To append to your config use +", "it is no key of this verb; to add it: +")
 
 
+def _renamed(verb: str, argument: str) -> str:
+    """``sweep=`` is a group (of ``train``) to Hydra: as the directory that ``table`` reads it is ``runs``."""
+    return argument.replace("sweep=", "runs=", 1) if (verb, argument[:6]) == ("table", "sweep=") else argument
+
+
 def _run(verb: str, argv: list[str]) -> int:
     # Hydra's own handler would shorten and print errors; with this it raises them, and one place answers.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = [argv[0], *argv[2:]]
+    sys.argv = [argv[0], *(_renamed(verb, argument) for argument in argv[2:])]
     task = Verb(verb, tuple(argv), wants_trace)
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()

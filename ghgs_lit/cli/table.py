@@ -43,7 +43,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 def run(cfg: DictConfig) -> None:
     config = plain(cfg)
     options = _options(config)
-    folders = [Path(p).expanduser() for p in _listed("sweep", config["sweep"], str) or ()]
+    folders = [Path(p).expanduser() for p in _listed("runs", config["runs"], str) or ()]
     others = [
         r for p in _listed("others", config["others"], str) or () for r in t.read_others(Path(p).expanduser())
     ]

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, choice
 from ghgs_lit.experiments.results import mean
 from ghgs_lit.experiments.tables.differences import differing, differing_text
 from ghgs_lit.experiments.tables.layouts import (
@@ -64,7 +64,10 @@ def build_tables(sweep: Sweep, others: Sequence[Record], options: TableOptions) 
     if layout.rows == "ablation":
         own = [r for r in own if r.variant.kind == "model"]
     if not own:
-        raise InputError(f"sweep: expected runs on targets {list(options.targets or [])}; found others only")
+        raise InputError(f"runs: expected some on targets {list(options.targets or [])}; found others only")
+    measured = dict.fromkeys(name for r in (*own, *others) for name in r.means)
+    for name in options.metrics or ():
+        choice("metrics", name, tuple(measured))
     keys = list(dict.fromkeys(_table_key(r, layout) for r in own))
     foreign = [r for r in others if _table_key(r, layout) not in keys]
     if foreign and len(foreign) == len(others):
@@ -112,7 +115,7 @@ def _table(records: list[Record], sweep: Sweep, options: TableOptions) -> Table:
     table = Table(layout, about, stub, groups, list(metrics), lines, reported_on=on)
     for record in records:
         _place(table, record, options)
-    _finish_cells(table, sweep.seeds)
+    _finish_cells(table)
     for column in table.columns:
         _mark_best(table, column)
     _test(table, options.test)
@@ -253,10 +256,10 @@ def _claimed_twice(table: Table, record: Record) -> InputError:
     )
 
 
-def _finish_cells(table: Table, asked: set[int]) -> None:
+def _finish_cells(table: Table) -> None:
     """Subjects' means over seeds, and which seeds are lacking."""
     models = [line for line in table.lines if line.variant.kind == "model"]
-    seeds = asked | {p.seed for p in table.about["planned"]}
+    seeds = {p.seed for p in table.about["planned"]}
     seeds |= {seed for line in models for cell in line.cells.values() for seed in cell.seeds}
     for line in table.lines:
         for cell in line.cells.values():

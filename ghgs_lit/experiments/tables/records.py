@@ -32,7 +32,8 @@ _ENCODER_KEYS = ("patch_size", "width", "heads", "depth", "layers", "vit")
 class Variant:
     """What a row of a table stands for. ``kind``: ``model`` (ours), ``baseline``, ``other`` or ``reported``.
 
-    ``extra`` are further configuration keys that tell rows apart, with their values.
+    ``extra`` are further configuration keys that tell rows apart, with their values. Where an encoder comes
+    from is known when training starts only, and tells no rows apart.
     """
 
     kind: str
@@ -40,7 +41,7 @@ class Variant:
     model: str = ""
     encoder: str = ""
     switches: tuple[bool, bool] | None = None
-    has_semantics: bool = True
+    has_semantics: bool = field(default=True, compare=False)
     extra: tuple[tuple[str, str], ...] = ()
 
 
@@ -90,8 +91,6 @@ class Sweep:
 
     records: list[Record] = field(default_factory=list)
     planned: list[Planned] = field(default_factory=list)
-    seeds: set[int] = field(default_factory=set)
-    """Seeds that the command line of a sweep asked for."""
 
 
 def lookup(config: Mapping[str, Any], key: str) -> Any:
@@ -194,23 +193,6 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
 
 
-def _asked_seeds(path: Path) -> set[int]:
-    """Seeds that a sweep's ``multirun.yaml`` lists on its command line or as its sweeper's parameters."""
-    try:
-        hydra = yaml.safe_load(path.read_text())["hydra"]
-    except (OSError, yaml.YAMLError, KeyError, TypeError):
-        return set()
-    parameters = lookup(hydra, "sweeper.params") or {}
-    texts = [t.split("=", 1)[1] for t in lookup(hydra, "overrides.task") or [] if t.startswith("seed=")]
-    texts += [str(parameters["seed"])] if "seed" in parameters else []
-    found = set()
-    for text in texts:
-        span = re.fullmatch(r"range\((\d+),\s*(\d+)\)", text.strip())
-        values = range(int(span[1]), int(span[2])) if span else text.split(",")
-        found |= {int(v) for v in values if str(v).strip().isdecimal()}
-    return found
-
-
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     """All runs below ``folders``, finished or not.
 
@@ -230,8 +212,6 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         for path in sorted(folder.rglob("config.yaml")):
             if path.parent.name != ".hydra" and (planned := _planned(path, by)) is not None:
                 sweep.planned.append(planned)
-        for path in sorted(folder.rglob("multirun.yaml")):
-            sweep.seeds |= _asked_seeds(path)
     if not sweep.records:
         names = ", ".join(map(str, folders))
         begun = f"{len(sweep.planned)} runs without one" if sweep.planned else "none"
