@@ -116,7 +116,7 @@ def test_clouds_are_the_subjects_points_and_its_body():
 
 def test_a_grid_is_as_wide_as_asked():
     tiles = [np.full((100, 40, 3), n, np.uint8) for n in range(5)]
-    wide, square = grid(tiles), grid(tiles, aspect=0.7)
+    wide, square = grid(tiles), grid(tiles, aspect=0.6)
     assert wide.shape[:2] == (102, 5 * 40 + 4 * 8)
     assert square.shape[:2] == (204, 3 * 40 + 2 * 8)
     assert square[5, [5, 53, 101], 0].tolist() == [0, 1, 2]
