@@ -33,7 +33,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
         layout=t.layout_named(config["layout"]),
         views=_listed("evaluation.views", evaluation["views"], int),
         targets=_listed("evaluation.targets", evaluation["targets"], str),
-        metrics=_listed("metrics", config["metrics"], str),
+        metrics=_listed("columns", config["columns"], str),
         reported=config["reported"],
         test=from_config(t.PairedTest, "test", config["test"]),
         unit=unit,

@@ -67,7 +67,7 @@ def build_tables(sweep: Sweep, others: Sequence[Record], options: TableOptions) 
         raise InputError(f"runs: expected some on targets {list(options.targets or [])}; found others only")
     measured = dict.fromkeys(name for r in (*own, *others) for name in r.means)
     for name in options.metrics or ():
-        choice("metrics", name, tuple(measured))
+        choice("columns", name, tuple(measured))
     keys = list(dict.fromkeys(_table_key(r, layout) for r in own))
     foreign = [r for r in others if _table_key(r, layout) not in keys]
     if foreign and len(foreign) == len(others):
