@@ -18,6 +18,7 @@ from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.model import GHGS, check_batch
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Cameras, Tokens
+from ghgs_lit.weights.names import RELEASE, to_ours
 
 
 def element(batch, b):
@@ -54,21 +55,8 @@ def release_model(inputs, dtype):
         Unprojection("release", 3),
         pad="multiple",
     ).to(dtype)
-    names = {
-        "pos_head.": "depth_head.dpt.",
-        "blk.": "recalibration.block.",
-        "decoder.": "gaussian_head.decoder.",
-    }
-    state = {}
-    for key, value in fixture("predict_gaussian_reduced", "state", dtype).items():
-        for old, new in names.items():
-            if key.startswith(old):
-                key = new + key.removeprefix(old)
-                break
-        else:
-            key = f"gaussian_head.{key}"
-        state[key] = value
-    model.load_state_dict(state)
+    published = fixture("predict_gaussian_reduced", "state", dtype)
+    model.load_state_dict({to_ours(key, RELEASE): value for key, value in published.items()})
     return model
 
 
@@ -128,6 +116,7 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
     g = prediction.gaussians
     assert len(g) == batch.masks.sum()
     loss = g.means.square().mean() + g.scales.mean() + g.opacities.mean() + g.quaternions[:, 1].mean()
+    loss = loss + g.colors.mean()
     (loss + prediction.depth_maps.confidence.mean()).backward()
     for name, parameter in model.named_parameters():
         if parameter.grad is None:
@@ -208,7 +197,8 @@ def test_order_of_later_views_does_not_matter():
     order = torch.tensor([0, 3, 1, 2])  # the encoder treats the first view apart
     swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])
     model = make_model().double()
-    wide = [dataclasses.replace(b, images=b.images.double()) for b in (batch, swapped)]
+    double = torch.float64
+    wide = [Batch(x.images.to(double), x.masks, x.cameras.to(double)) for x in (batch, swapped)]
     with torch.no_grad():
         a, b = (model(x).gaussians for x in wide)
     parts = [(b.image == i).nonzero()[:, 0] for i in (0, 2, 3, 1)]

@@ -4,11 +4,13 @@ import re
 
 import pytest
 import torch
+from hydra.core.global_hydra import GlobalHydra
 from safetensors.torch import load_file, save_file
 from stage_models import close
 from stage_scenes import make_batch
-from weight_files import OTHER_HEADS, PUBLISHED, config, published_tensors, write_published
+from weight_files import OTHER_HEADS, PUBLISHED, TINY, config, published_tensors, write_published
 
+from ghgs_lit.cli import main as cli
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, STAGES, read_checkpoint
 from ghgs_lit.training import start
@@ -235,6 +237,38 @@ def test_our_own_variants_have_no_published_names(tmp_path, files):
     import_weights(config("compat=none"), out, vggt)
     with pytest.raises(InputError, match=r"release: expected a PyTorch file"):
         export_weights(out, None, tmp_path / "back.safetensors")
+
+
+def command(monkeypatch, capsys, *argv):
+    monkeypatch.setattr("sys.argv", ["ghgs", *argv])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    GlobalHydra.instance().clear()
+    try:
+        code = cli.main()
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    return code, *capsys.readouterr()
+
+
+def test_the_verbs(monkeypatch, capsys, tmp_path, files):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = command(
+        monkeypatch, capsys, "import", "vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY
+    )
+    assert code == 0
+    assert "not as the release computes" not in out
+    assert out.splitlines()[-1] == "wrote a/out.ckpt"
+    code, out, _ = command(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
+    assert code == 0
+    assert out.splitlines()[-2:] == [f"back.pth: {len(files[3])} tensors", "wrote back.pth"]
+    for argv, message in (
+        (["vggt=vggt.safetensors", "out=b.ckpt"], "compat: expected none where there is no release"),
+        (["vggt=none.pt", "compat=none", "out=b.ckpt"], "none.pt: expected a file of weights; found none"),
+    ):
+        code, _, err = command(monkeypatch, capsys, "import", *argv, *TINY)
+        assert code == 1
+        assert err.strip().startswith(f"ghgs import: {message}")
+        assert len(err.strip().splitlines()) == 1
 
 
 def test_switches_that_differ_from_the_releases_are_told():
