@@ -1,25 +1,39 @@
 """What the tests of ZJU-MoCap and HuMMan share: miniatures made once, and what a view must agree with."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hydra import compose, initialize_config_dir
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
+from ghgs_lit import people
 from ghgs_lit.config import build, conf_dir
 from ghgs_lit.data.reader import View
 
-SIZE = 160
+_person = functools.lru_cache(people.generate)
+
+
+def make_miniature(miniature, *arguments, **options) -> list[Path]:
+    """``miniature.make(...)`` of people that are generated once for all tests of a process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(miniature.people, "generate", _person)
+        return miniature.make(*arguments, **options)
+
+
+@functools.lru_cache
+def _config(*overrides: str):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return compose("train", overrides=["targets=cameras", *overrides])
 
 
 def build_data(name: str, root: Path, *overrides: str):
-    """The data module that the command line makes of ``data=<name>``."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose(
-            "train", overrides=[f"data={name}", "targets=cameras", f"data.root='{root}'", *overrides]
-        )
-    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
+    """The data module that the command line makes of ``data=<name> data.root=<root>``."""
+    cfg = _config(f"data={name}", *overrides)
+    place = {} if any(o.startswith("data.root=") for o in overrides) else {"root": str(root)}
+    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0, **place)
 
 
 def inside(view: View, points: np.ndarray) -> float:

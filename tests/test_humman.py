@@ -9,24 +9,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_scenes import SIZE, blob, build_data, centroid, inside, project
+from capture_scenes import blob, build_data, centroid, inside, make_miniature, project
 from PIL import Image
 from scipy import sparse
 
 from ghgs_lit.data.humman.reader import HuMManReader
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
-from ghgs_lit.data.miniatures.humman import make
+from ghgs_lit.data.miniatures import humman
 from ghgs_lit.data.miniatures.smpl import stand_in
 from ghgs_lit.errors import InputError
 
 TEST = "p000455_a000986"
-WIDTH, HEIGHT = SIZE, SIZE * 9 // 16
+WIDTH, HEIGHT = 160, 90
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("humman") / "recon"
-    make(folder, [TEST], {"train": 1, "val": 1}, SIZE, seed=3)
+    make_miniature(humman, folder, [TEST], {"train": 1, "val": 1}, WIDTH, seed=3)
     return folder
 
 
@@ -217,7 +217,7 @@ def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monke
 
 
 def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
-    make(tmp_path / "recon", [TEST], {"train": 1, "val": 0}, SIZE, seed=3, frames=[0])
+    make_miniature(humman, tmp_path / "recon", [TEST], {"train": 1, "val": 0}, WIDTH, seed=3, frames=[0])
     for name in ("kinect_color/kinect_007/000000.png", "kinect_depth/kinect_007/000000.png", "cameras.json"):
         place = Path("p100001_a000048") / name
         assert (tmp_path / "recon" / place).read_bytes() == (root / place).read_bytes()

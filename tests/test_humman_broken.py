@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_scenes import blank, build_data, shrink, truncate
+from capture_scenes import blank, build_data, make_miniature, shrink, truncate
 from PIL import Image
 
 from ghgs_lit.data.humman.datamodule import check_world
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
-from ghgs_lit.data.miniatures.humman import make
+from ghgs_lit.data.miniatures import humman
 from ghgs_lit.data.miniatures.smpl import stand_in
 from ghgs_lit.errors import InputError
 
@@ -145,7 +145,7 @@ CASES = {
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "recon"
-    make(folder, [NAME], {"train": 0, "val": 1}, 128, seed=3, frames=[0])
+    make_miniature(humman, folder, [NAME], {"train": 0, "val": 1}, 128, seed=3, frames=[0])
     return folder / NAME
 
 

@@ -7,12 +7,12 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pytest
 import torch
-from capture_scenes import SIZE, blob, build_data, centroid, inside, project
+from capture_scenes import blob, build_data, centroid, inside, make_miniature, project
 from kornia.geometry.calibration import distort_points
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.data.miniatures.zju_mocap import make
+from ghgs_lit.data.miniatures import zju_mocap
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.data.reader import fit
 from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
@@ -21,6 +21,7 @@ from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
 from ghgs_lit.errors import InputError
 
 OPENCV = np.load(Path(__file__).parent / "fixtures" / "opencv_camera.npz")
+SIZE = 112
 BOTH = ("mask_cihp", "mask")
 
 
@@ -28,7 +29,7 @@ BOTH = ("mask_cihp", "mask")
 def root(tmp_path_factory) -> Path:
     """One sequence of each generation with two frames."""
     folder = tmp_path_factory.mktemp("zju_mocap")
-    make(folder, ["386", "313"], SIZE, seed=3, frames=2)
+    make_miniature(zju_mocap, folder, ["386", "313"], SIZE, seed=3, frames=2)
     return folder
 
 
@@ -285,7 +286,7 @@ def test_other_protocols_are_configurations(root):
 
 
 def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
-    make(tmp_path, ["386"], SIZE, seed=3, frames=1)
+    make_miniature(zju_mocap, tmp_path, ["386"], SIZE, seed=3, frames=1)
     for name in ("Camera_B7/000000.jpg", "mask_cihp/Camera_B7/000000.png", "new_vertices/0.npy"):
         assert (tmp_path / "CoreView_386" / name).read_bytes() == (root / "CoreView_386" / name).read_bytes()
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_scenes import blank, build_data, shrink, truncate
+from capture_scenes import blank, build_data, make_miniature, shrink, truncate
 
-from ghgs_lit.data.miniatures.zju_mocap import make
+from ghgs_lit.data.miniatures import zju_mocap
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.errors import InputError
 
@@ -167,7 +167,7 @@ CASES = {
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
-    make(folder, ["386"], 64, seed=3, frames=1)
+    make_miniature(zju_mocap, folder, ["386"], 64, seed=3, frames=1)
     return folder / NAME
 
 
