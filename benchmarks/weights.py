@@ -24,7 +24,7 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_aside
-from ghgs_lit.weights.exporting import _write, export_weights
+from ghgs_lit.weights.exporting import export_weights, write_tensors
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.reading import open_file
 
@@ -53,7 +53,7 @@ def make(folder: Path, tiny: bool) -> None:
         shapes |= OTHERS if entry is None else {}
         tensors = {name: torch.randn(shape).mul_(0.02) for name, shape in shapes.items()}
         write_aside(
-            folder / file, lambda path, f=file, t=tensors, e=entry: _write(Path(f).suffix, path, t, e)
+            folder / file, lambda path, f=file, t=tensors, e=entry: write_tensors(Path(f).suffix, path, t, e)
         )
 
 

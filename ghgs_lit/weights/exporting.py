@@ -32,7 +32,9 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
     ):
         if path is not None:
             tensors = {_published(checkpoint, name, table): tensor for name, tensor in own.items()}
-            write_aside(path, lambda aside, t=tensors, e=entry, p=path: _write(Path(p).suffix, aside, t, e))
+            write_aside(
+                path, lambda aside, t=tensors, e=entry, p=path: write_tensors(Path(p).suffix, aside, t, e)
+            )
             report.append(f"{path}: {len(tensors)} tensors")
     return report
 
@@ -46,7 +48,7 @@ def _published(checkpoint: str | Path, name: str, table: Mapping[str, str]) -> s
     return published
 
 
-def _write(suffix: str, path: Path, tensors: dict[str, Tensor], entry: str | None) -> None:
+def write_tensors(suffix: str, path: Path, tensors: dict[str, Tensor], entry: str | None) -> None:
     if suffix == ".safetensors":
         require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", suffix)
         save_file(tensors, path, metadata={"format": "pt"})
