@@ -106,6 +106,13 @@ def test_few_subjects_are_said_and_not_marked(tmp_path):
     assert any("n = 6 subjects are too few" in n and "0.094" in n for n in table.notes)
 
 
+def test_a_t_test_of_four_subjects_marks_nothing_however_small_its_p(tmp_path):
+    table = table_of(tmp_path, 5.0, shifts=dict(list(SUBJECTS.items())[:4]), test={"kind": "t"})
+    assert table.lines[0].cells[table.columns[0]].test.corrected < 1e-4
+    assert "\\*" not in to_markdown(table)
+    assert any("fewer than 5 subjects" in n for n in table.notes)
+
+
 def test_subjects_are_averaged_over_seeds_before_the_test(tmp_path):
     """More seeds are no more subjects."""
     table = table_of(tmp_path, 1.0, seeds=(1, 2, 3))
