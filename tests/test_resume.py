@@ -157,9 +157,7 @@ def test_time_that_was_used_stays_used(tmp_path):
         fit(tmp_path, Look(4), **options)
     seen.clear()
     fit(tmp_path, Look(), resume=tmp_path / "checkpoints" / "last.ckpt", **options)
-    assert seen[:2] == pytest.approx(
-        [0.6, 0.6], abs=0.02
-    )  # 3 x 200 s of 1000 s, not 3 of 16 steps
+    assert seen[:2] == pytest.approx([0.6, 0.6], abs=0.02)  # 3 x 200 s of 1000 s, not 3 of 16 steps
     assert seen[-1] == pytest.approx((STEPS - 1) / STEPS)
 
 
