@@ -108,6 +108,15 @@ def test_the_order_of_views_does_not_matter():
     torch.testing.assert_close(first[:, order], second)
 
 
+def test_precision_is_that_of_the_interval():
+    batch = make_batch(1, 3, spread=150.0)
+    interval = (batch.depths, batch.depths + 0.2)
+    single = photo_agreement(batch, interval, 2)
+    double = photo_agreement(batch, tuple(bound.double() for bound in interval), 2)
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(single.double(), double, atol=1e-4, rtol=0)
+
+
 def test_heads_ask_for_what_agreement_needs():
     for options in ({"guide": False, "agreement": 4}, {"guide": True, "agreement": -1}):
         with pytest.raises(InputError, match=r"depth_head\.agreement"):

@@ -30,9 +30,9 @@ def photo_agreement(batch: Batch, interval: Interval, steps: int) -> Float[Tenso
     b, v, height, width = batch.masks.shape
     near, far = (wide(bound) for bound in interval)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
-    colors = _smooth(wide(batch.images), batch.masks)
+    colors = _smooth(batch.images.to(near), batch.masks)
     centers = pixel_centers(height, width, near)
-    turn, shift, facing = _relations(batch.cameras)
+    turn, shift, facing = (relation.to(near) for relation in _relations(batch.cameras))
     result = near.new_zeros(b, v, height, width, steps)
     for i in range(b):
         for j in range(v):
