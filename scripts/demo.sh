@@ -8,11 +8,13 @@ out="${GHGS_DEMO_DIR:-runs/demo_$(date +%Y-%m-%d_%H-%M-%S)}"
 ghgs train -m experiment=demo ablation=full,no_unprojection,no_semantic,neither "hydra.sweep.dir=$out"
 ghgs table runs="$out" illustration=true "hydra.run.dir=$out/table"
 
+full="$(dirname "$(dirname "$(grep -lx -e '- ablation=full' "$out"/*/.hydra/overrides.yaml)")")"
+
 cat <<TEXT
 
 Table:        $out/table/table.md
-Pictures:     $out/[0-3]/pictures
-Splat:        ghgs predict checkpoint=$out/0/checkpoints/last.ckpt
+Pictures:     $out/*/pictures
+Splat:        ghgs predict checkpoint=$full/checkpoints/last.ckpt
 TensorBoard:  tensorboard --logdir $out
 (the commands are in .venv/bin: source .venv/bin/activate)
 TEXT

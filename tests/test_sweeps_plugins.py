@@ -1,5 +1,6 @@
 """Hydra's launchers and sweepers that come as extras, on sweeps without training."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -59,3 +60,38 @@ def test_an_optuna_study_is_kept_in_the_sweep(monkeypatch, tmp_path):
     # The second call begins as the first one did, finds those runs done, and runs none of them again.
     assert len(executed(tmp_path)) == len({t.params["optimizer.lr"] for t in study.trials}) == 2
     assert sys.modules["optuna"].__version__.startswith("2.")
+
+
+# What submitit calls, for jobs that run at once on this machine.
+FAKES = {
+    "sbatch": """#!/bin/bash
+export SLURM_ARRAY_JOB_ID=7 SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0
+export SLURM_JOB_NUM_NODES=1 SLURM_JOB_NODELIST=here
+for i in 0 1; do SLURM_JOB_ID=$((7 + i)) SLURM_ARRAY_TASK_ID=$i bash "$1" > /dev/null 2>&1 & done
+echo "Submitted batch job 7"
+""",
+    "srun": """#!/bin/bash
+while [[ "$1" == -* ]]; do if [[ "$1" == --output || "$1" == --error ]]; then shift; fi; shift; done
+exec "$@"
+""",
+    "sacct": "#!/bin/bash\necho 'JobID|State'\nfor i in 0 1; do echo \"7_$i|RUNNING\"; done\n",
+}
+
+
+def test_the_slurm_example_submits_what_is_missing(monkeypatch, tmp_path):
+    pytest.importorskip(
+        "hydra_plugins.hydra_submitit_launcher",
+        reason="the extra cluster is not installed",
+        exc_type=ImportError,
+    )
+    for name, text in FAKES.items():
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    sweep = tmp_path / "sweep"
+    hydra_app(monkeypatch, "-m", "hydra/launcher=slurm", f"hydra.sweep.dir={sweep}", "seed=1,2")
+    names = executed(sweep)
+    assert len(names) == len(set(names)) == 2
+    (script,) = sweep.glob(".submitit/*/*.sh")
+    assert "#SBATCH --gpus-per-node=1" in script.read_text()
