@@ -83,13 +83,15 @@ def test_baselines_are_rows_that_do_not_compete(tmp_path):
 def test_other_methods_join_the_table_that_they_fit(tmp_path):
     write_run(tmp_path / "runs" / "0", "full", 20.0)
     write_run(tmp_path / "runs" / "1", "full", 20.0, targets="midway")
-    rows = [a_row(subject="a", psnr=24.0), a_row(subject="b", psnr=26.5), a_row(views=5, psnr=27.0)]
+    rows = [a_row(subject="a", psnr=24.0), a_row(subject="b", psnr=26.5)]
+    rows.append(a_row(views=5, psnr=27.0, subjects=9))
     others = read_others(others_file(tmp_path, rows))
     release, midway = tables_of(tmp_path / "runs", "table2", others=others, reported=False)
     rows, _ = body(to_markdown(release))
     assert rows["GHG"] == ["-"] * 3 + ["**25.25**", "0.8000", "-", "**27.00**", "0.8000", "-"]
     assert rows["Ours"][3:5] == ["24.00", "**0.9000**"]
-    assert "GHG: their code; means only where untested." in to_markdown(release)
+    assert "GHG: their code; means only where untested; of 9 subjects." in to_markdown(release)
+    assert "seeds" not in release.caption
     assert "GHG" not in to_markdown(midway)
     assert "other,GHG" in to_csv([release])
 

@@ -59,7 +59,7 @@ def write_caption(table: Table) -> str:
     records: list[Record] = table.about["records"]
     first, names = records[0], list(dict.fromkeys(r.setting.data for r in records))
     counts = sorted({cell.count for cell in _measured(table) if cell.count})
-    seeds = {seed for cell in _measured(table) for seed in cell.seeds}
+    seeds = max((len(cell.seeds) for cell in _measured(table)), default=0)
     setting = first.setting
     said = [
         f"Data {' and '.join(f'`{name}`' for name in names)}",
@@ -73,7 +73,7 @@ def write_caption(table: Table) -> str:
     views = {group.views for group in table.groups}
     if table.layout.heading != "views" and len(views) == 1:
         said.append(f"{views.pop()} input views")
-    spread = f" ± deviation over {len(seeds)} seeds" if len(seeds) > 1 else ""
+    spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
     return f"{', '.join(said)}; mean over subjects{spread}, best of the measured methods in bold."
 
 
@@ -100,12 +100,16 @@ def write_notes(table: Table, test: PairedTest, illustration: bool = False) -> l
 
 
 def _about_others(table: Table) -> list[str]:
+    """Where other methods' numbers are from, and whether they are of other subjects than ours."""
     said = []
+    own = {r.count for r in table.about["records"] if r.variant.kind == "model"}
     for line in table.lines:
         if line.variant.kind == "other":
             records = [r for r in table.about["records"] if r.variant == line.variant]
             untested = "" if all(r.subjects for r in records) else "; means only where untested"
-            said.append(f"{line.variant.name}: {records[0].about['source']}{untested}.")
+            counts = sorted({r.count for r in records if r.count} - own)
+            fewer = f"; of {' or '.join(map(str, counts))} subjects" if counts else ""
+            said.append(f"{line.variant.name}: {records[0].about['source']}{untested}{fewer}.")
     return said
 
 
@@ -122,9 +126,9 @@ def _about_test(table: Table, test: PairedTest) -> list[str]:
         full = [line for line in table.lines if line.variant.kind == "model"]
         full = [line for line in full if line.variant.switches == (True, True)]
         against = "the row of the whole method" if len(full) == 1 and full[0].cells else against
-    few = too_few(counts[0], len(known), test)
+    few = too_few(counts[-1], len(known), test)
     about = f"{KINDS[test.kind]} against {against}, n = {n} subjects (each averaged over seeds)"
-    if few and too_few(counts[-1], len(known), test):
+    if few:
         return [f"No differences are marked: n = {n} subjects are too few for a {KINDS[test.kind]} ({few})."]
     marks = f"{MARK} differs beyond chance: {about}, two-sided, Holm's correction over the {len(known)}"
     return [f"{marks} comparisons of this table, p < {test.alpha:g}."]
