@@ -98,7 +98,7 @@ RENDERED = {
     ),
     "mask empty": (
         lambda f: Image.new("RGB", (SIZE, SIZE)).save(f / f"root/train/mask/{VIEW}.png"),
-        r"train/mask/0000_002/3\.png: expected a subject in the mask; found 'none'",
+        r"train/mask/0000_002/3\.png: expected a subject in the mask; found none$",
     ),
     "mask of another size": (
         lambda f: Image.new("L", (32, 16), 255).save(f / f"root/train/mask/{VIEW}.png"),
@@ -184,7 +184,7 @@ RAW = {
     ),
     "fit without translation": (
         lambda f: without(f, "translation"),
-        r"0000/smplx_param\.pkl: expected the key 'transl'; found \['betas'",
+        r"0000/smplx_param\.pkl: expected the key 'translation'; found \['betas'",
     ),
     "fit with NaN": (
         lambda f: fit(f, translation=np.full(3, np.nan)),

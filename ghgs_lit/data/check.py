@@ -147,6 +147,7 @@ def inspect(data: PhotographsDataModule, least_iou: float = 0.5) -> Report:
         report.notes += _notes(data, phase, reader, report.phases[phase])
     if not report.problems:
         report.problems += _cannot_draw(data)
+    report.problems = list(dict.fromkeys(report.problems))
     return report
 
 

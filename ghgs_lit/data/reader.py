@@ -100,7 +100,8 @@ class Reader(ABC):
 
         def read() -> View:
             view = self.read_view(name, pid, vid, depth)
-            require(bool(view.mask.any()), self.place(name, pid, vid), "a subject in the mask", "none")
+            if not view.mask.any():
+                raise InputError(f"{self.place(name, pid, vid)}: expected a subject in the mask; found none")
             return view if self.size is None else fit(view, *self.size)
 
         return self._remember((name, pid, vid, depth), read)
@@ -281,5 +282,6 @@ def check_extrinsics(path: Path | str, extrinsics: Any) -> np.ndarray:
     extrinsics = np.concatenate((check_array(path, extrinsics, [(3, 4), (4, 4)])[:3], [[0, 0, 0, 1]]))
     rotation = extrinsics[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
-        raise InputError(f"{path}: expected a rotation in the first three columns; found {rotation.tolist()}")
+        found = np.round(rotation, 3).tolist()
+        raise InputError(f"{path}: expected a rotation in the first three columns; found {found}")
     return extrinsics

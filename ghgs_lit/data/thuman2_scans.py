@@ -56,7 +56,7 @@ def read_fit(path: Path) -> SmplxFit:
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a dictionary; found {type(content).__name__}")
     # Fits of SMPL made for the same scans call it transl.
-    moved = "translation" if "translation" in content else "transl"
+    moved = "transl" if "transl" in content else "translation"
     for name in (*_NEEDED, "scale", moved):
         if name not in content:
             raise InputError(f"{path}: expected the key {name!r}; found {sorted(map(str, content))}")
