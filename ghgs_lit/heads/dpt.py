@@ -10,10 +10,13 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import require
 from ghgs_lit.heads.guide import GuidePyramid
-from ghgs_lit.heads.position import position_embedding
+from ghgs_lit.heads.position import add_positions_
+from ghgs_lit.linear import even_parts, product
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
+#: Values of the largest map that are held where no gradient is kept.
+_LARGEST = 1 << 25
 NORM_EPS = 1e-5
 
 
@@ -23,7 +26,7 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
     """A 1x1 convolution as a linear of pixels: no copy where channels are innermost, as they are here."""
-    return F.linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
+    return product(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
 def _resize(x: Float[Tensor, "n c h w"], size: Sequence[int]) -> Float[Tensor, "n c h2 w2"]:
@@ -42,7 +45,8 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         rectified = F.relu(x)
-        return rectified + self.conv2(F.relu(self.conv1(rectified)))
+        # In place where no gradient needs what was there: what a convolution gave.
+        return self.conv2(F.relu_(self.conv1(rectified))).add_(rectified)
 
 
 class Fusion(nn.Module):
@@ -62,7 +66,7 @@ class Fusion(nn.Module):
         size: tuple[int, int],
     ) -> Float[Tensor, "n c h2 w2"]:
         if level is not None:
-            x = x + self.resConfUnit1(level)
+            x = self.resConfUnit1(level).add_(x)
         # A 1x1 convolution commutes with interpolation; before it, it costs a quarter.
         return _resize(_pointwise(self.out_conv, self.resConfUnit2(x)), size)
 
@@ -92,7 +96,8 @@ class DPTHead(nn.Module):
         hidden: channels before the last convolution (32 as published).
         guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
             sharp; 0: none, as published.
-        images_per_step: images that go through the head together where no gradient is kept (bounds memory).
+        images_per_step: images that go through the head together where no gradient is kept; by itself as
+            many as keep the largest map within 128 MB in float32.
     """
 
     def __init__(
@@ -103,7 +108,7 @@ class DPTHead(nn.Module):
         output_dim: int,
         hidden: int = 32,
         guide_channels: int = 0,
-        images_per_step: int = 2,
+        images_per_step: int | None = None,
     ):
         super().__init__()
         require(features % 8 == 0, "features", "a multiple of 8", features)
@@ -113,8 +118,9 @@ class DPTHead(nn.Module):
             "four multiples of 4",
             list(out_channels),
         )
-        require(images_per_step > 0, "images_per_step", "a positive number", images_per_step)
-        self.images_per_step = images_per_step
+        positive = images_per_step is None or images_per_step > 0
+        require(positive, "images_per_step", "a positive number", images_per_step)
+        self.images_per_step, self.full_channels = images_per_step, features // 2
         c0, c1, _, c3 = out_channels
         self.norm = nn.LayerNorm(dim_in, eps=NORM_EPS)
         self.projects = nn.ModuleList(nn.Conv2d(dim_in, c, 1) for c in out_channels)
@@ -139,24 +145,26 @@ class DPTHead(nn.Module):
         levels = self._levels(tokens)
         flat = None if guide is None else guide.flatten(0, 1)
         count = levels[0].shape[0]
-        step = count if torch.is_grad_enabled() else self.images_per_step
-        parts = []
-        for start in range(0, count, step):
-            part = slice(start, start + step)
-            parts.append(
-                self._decode(
-                    [level[part] for level in levels],
-                    tokens.patch_size,
-                    None if flat is None else flat[part],
-                )
-            )
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+        if torch.is_grad_enabled():
+            return self._decode(levels, tokens.patch_size, flat)
+        height, width = (n * tokens.patch_size for n in tokens.grid[2:])
+        step = self.images_per_step or max(1, _LARGEST // (self.full_channels * height * width))
+        maps = None
+        for part in even_parts(count, step):
+            guides = None if flat is None else flat[part]
+            found = self._decode([level[part] for level in levels], tokens.patch_size, guides)
+            if len(found) == count:
+                return found
+            if maps is None:  # channels innermost, as the parts have them
+                maps = found.new_empty(count, height, width, found.shape[1]).permute(0, 3, 1, 2)
+            maps[part] = found
+        return maps
 
     def _levels(self, tokens: Tokens) -> list[Float[Tensor, "bv c h w"]]:
         """Normalised and projected tokens on the grid; a 1x1 convolution of a map is a linear of tokens."""
         levels = []
         for latent, project in zip(tokens.latent, self.projects, strict=True):
-            projected = F.linear(self.norm(latent), project.weight.flatten(1), project.bias)
+            projected = product(self.norm(latent), project.weight.flatten(1), project.bias)
             levels.append(dataclasses.replace(tokens, latent=(projected,)).maps(0))
         return levels
 
@@ -167,7 +175,7 @@ class DPTHead(nn.Module):
         aspect = width / height
         s = self.scratch
         for i, resize in enumerate(self.resize_layers):
-            level = _add_positions(levels[i], aspect)
+            level = add_positions_(levels[i], aspect)
             levels[i] = getattr(s, f"layer{i + 1}_rn")(resize(level))
 
         if guide is not None:
@@ -183,7 +191,7 @@ class DPTHead(nn.Module):
         if guide is not None:
             x = x + _resize(half, x.shape[-2:])
         x = _resize(s.output_conv1(x), (patch_size * height, patch_size * width))
-        x = _add_positions(x, aspect)
+        x = add_positions_(x, aspect)
         if guide is not None:
             x = x + full
         x = s.output_conv2[:-1](x)
@@ -191,8 +199,3 @@ class DPTHead(nn.Module):
         last = s.output_conv2[-1]
         with torch.autocast(x.device.type, enabled=False):
             return _pointwise(last, x.to(last.weight.dtype))
-
-
-def _add_positions(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
-    """``x + 0.1 E``, in the precision of ``x``."""
-    return x + position_embedding(x.shape[1], *x.shape[-2:], aspect, x).to(x.dtype)

@@ -37,8 +37,24 @@ def position_embedding(
     The unit is half the diagonal of an image of ``aspect`` width / height; samples are cell centres.
     Waves of the two axes are cached (a few kilobytes each), their outer layout is not.
     """
+    x, y = _waves(channels, rows, columns, aspect, like)
+    return torch.cat((x.expand(-1, rows, -1), y.expand(-1, -1, columns)))
+
+
+def add_positions_(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
+    """Add ``0.1 E`` to ``x`` in place, in its precision; the embedding is never held as a map."""
+    half = x.shape[1] // 2
+    across, down = _waves(*x.shape[1:], aspect, x)
+    x[:, :half].add_(across.to(x.dtype))
+    x[:, half:].add_(down.to(x.dtype))
+    return x
+
+
+def _waves(
+    channels: int, rows: int, columns: int, aspect: float, like: Tensor
+) -> tuple[Float[Tensor, "half 1 columns"], Float[Tensor, "half rows 1"]]:
     dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
     diagonal = math.hypot(aspect, 1.0)
     x = _axis_waves(channels // 2, columns, aspect / diagonal, dtype, like.device)
     y = _axis_waves(channels // 2, rows, 1.0 / diagonal, dtype, like.device)
-    return torch.cat((x[:, None, :].expand(-1, rows, -1), y[:, :, None].expand(-1, -1, columns)))
+    return x[:, None, :], y[:, :, None]

@@ -1,0 +1,297 @@
+"""Time, peak memory and FLOPs of a forward pass by stage: ``python benchmarks/encoder.py [--size vggt_1b]``.
+
+Random weights, an ellipsoid in front of a ring of cameras, ``skip=none``: every token and every pixel.
+Rates are beside those of matrix products that are measured before and after in the same run. The
+recalibration is beside a literal version of it (gathers, each layer anew; ``--literal``).
+"""
+
+import argparse
+import ctypes
+import json
+import math
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from literal_recalibration import literal_recalibration
+from stage_scenes import make_batch
+
+from ghgs_lit.config import conf_dir
+from ghgs_lit.linear import product
+from ghgs_lit.model import GHGS
+from ghgs_lit.types import Batch, Points, Tokens
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+STATUS = Path("/proc/self/status")
+
+
+@dataclass
+class Stage:
+    """What one stage took. ``peak_gb`` counts from what the process held with weights and photographs."""
+
+    name: str
+    seconds: float
+    peak_gb: float
+    gflop: float = 0.0
+
+
+def configuration(size: str, options: list[str]) -> dict:
+    """The paper's model around an encoder of ``size``, every token and pixel taking part."""
+    overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config = compose("train", overrides=overrides)
+    keys = ["encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points"]
+    return OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
+
+
+@torch.no_grad()
+def random_model(config: dict) -> GHGS:
+    """A model of random weights, without the cost of an initialisation that is thrown away."""
+    with torch.device("meta"):
+        model = GHGS.from_config(config)
+    generator = torch.Generator().manual_seed(0)
+    for module in model.modules():
+        for name, parameter in module._parameters.items():
+            if parameter is None:
+                continue
+            value = torch.empty(parameter.shape)
+            if parameter.dim() > 1:
+                value.normal_(std=parameter[0].numel() ** -0.5, generator=generator)
+            else:
+                value.fill_(float(name in ("weight", "gamma")))
+            module._parameters[name] = nn.Parameter(value, requires_grad=False)
+    return model.eval()
+
+
+def memory_gb(field: str) -> float:
+    """``VmRSS`` (held now) or ``VmHWM`` (most since the last reset) of this process."""
+    line = next(line for line in STATUS.read_text().splitlines() if line.startswith(field + ":"))
+    return int(line.split()[1]) * 1024 / 1e9
+
+
+def reset_peak() -> None:
+    """Let ``VmHWM`` count anew from what is held now."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+class Recorder:
+    """Times stages and reads their peaks from the kernel; ``base`` is what the process holds before."""
+
+    def __init__(self) -> None:
+        ctypes.CDLL(None).malloc_trim(0)
+        self.base = memory_gb("VmRSS")
+        self.stages: list[Stage] = []
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        reset_peak()
+        start = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - start
+        self.stages.append(Stage(name, seconds, memory_gb("VmHWM") - self.base))
+
+
+def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
+    """The encoder in two stages: patch tokens (DINOv2), then alternating attention."""
+    aggregator = model.encoder.aggregator
+    embed = aggregator.patch_embed
+
+    def encode(batch: Batch, interval) -> Tokens:
+        found = []
+        kept = embed.forward
+
+        def timed(images):
+            with record("patch tokens (ViT)"):
+                found.append(kept(images))
+            reset_peak()
+            return found[0]
+
+        embed.forward = timed
+        try:
+            start = time.perf_counter()
+            tokens = model.encoder(batch.images, batch.masks, interval)
+            seconds = time.perf_counter() - start
+        finally:
+            del embed.forward
+        inner = record.stages[-1]
+        peak = memory_gb("VmHWM") - record.base
+        record.stages.append(Stage("aggregator", seconds - inner.seconds, peak))
+        return tokens
+
+    return encode
+
+
+@torch.no_grad()
+def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points]:
+    """``GHGS._predict``, stage by stage; the tokens and points that the recalibration saw."""
+    interval = model.depth_head.interval(batch)
+    tokens = _patch_tokens_first(model, record)(batch, interval)
+    with record("depth head"):
+        depth_maps = model.depth_head(tokens, batch, interval)
+    with record("unproject"):
+        points = model.unproject(depth_maps, tokens, batch)
+    with record("recalibration"):
+        recalibrated = model.recalibration(tokens, points, batch)
+    with record("Gaussian head"):
+        model.gaussian_head(recalibrated, batch, points, depth_maps)
+    return tokens, points
+
+
+def gflop_of(function: Callable) -> float:
+    with FlopCounterMode(display=False) as counter, torch.no_grad():
+        function()
+    return counter.get_total_flops() / 1e9
+
+
+def count_gflop(config: dict, model: GHGS, batch: Batch) -> dict[str, float]:
+    """What each stage needs at least, multiplications and additions: the encoder's on the meta device, the
+    dense heads' on one image."""
+    with torch.device("meta"):
+        aggregator = GHGS.from_config(config).encoder.aggregator
+    b, v, _, height, width = batch.images.shape
+    channels = next(p for p in aggregator.patch_embed.parameters() if p.dim() == 4).shape[1]
+    images = torch.empty(b, v, channels, height, width, device="meta")
+    patch = gflop_of(lambda: aggregator.patch_embed(images.flatten(0, 1)))
+    found = {"patch tokens (ViT)": patch, "aggregator": gflop_of(lambda: aggregator(images)) - patch}
+    size, c, s = model.encoder.patch_size, model.encoder.dim_latent, model.encoder.dim_semantic
+    grid = (1, 1, height // size, width // size)
+    one = math.prod(grid)
+    index = torch.arange(one)
+    place = (torch.zeros_like(index), index // grid[3], index % grid[3])
+    tokens = Tokens(tuple(torch.zeros(one, c) for _ in range(4)), torch.zeros(one, s), *place, grid, size)
+    head, block = model.gaussian_head, model.recalibration.block
+    headers = (head.offset_header, head.scale_header, head.rot_header, head.opacity_header)
+    pixel = sum(2e-9 * p.numel() for header in headers for p in header.parameters() if p.dim() == 2)
+    found["depth head"] = b * v * gflop_of(lambda: model.depth_head.dpt(tokens))
+    found["Gaussian head"] = b * v * (gflop_of(lambda: head.decoder(tokens)) + height * width * pixel)
+    k = min(model.recalibration.k, v * one)
+    linears = (block.q_proj, block.k_proj, block.v_proj, block.o_proj, block.mlp[0], block.mlp[2])
+    each = sum(2 * linear.weight.numel() for linear in linears) + 4 * k * block.q_proj.out_features
+    return found | {"recalibration": 1e-9 * b * v * one * (4 * each + 2 * k * s)}
+
+
+def best_seconds(function: Callable, repeats: int = 3) -> float:
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+@torch.no_grad()
+def product_rates(tokens: int, width: int, dtype: torch.dtype) -> dict[str, float]:
+    """GFLOP/s of matrix products: ``torch.matmul`` of squares, and ours of squares and the encoder's own."""
+
+    def rate(multiply: Callable, m: int, k: int, n: int) -> float:
+        x, weight = torch.randn(m, k, dtype=dtype), torch.randn(n, k, dtype=dtype)
+        return 2e-9 * m * k * n / best_seconds(lambda: multiply(x, weight))
+
+    def matmul(x, weight):
+        return x @ weight.T
+
+    squares = (1024, 2048, 4096)
+    shapes = [(tokens, width, part * width) for part in (1, 3, 4)] + [(tokens, 4 * width, width)]
+    return {
+        "torch.matmul, best square": max(rate(matmul, s, s, s) for s in squares),
+        "torch.matmul, the encoder's shapes": max(rate(matmul, *shape) for shape in shapes),
+        "ours, best square": max(rate(product, s, s, s) for s in squares),
+        "ours, the encoder's shapes": max(rate(product, *shape) for shape in shapes),
+    }
+
+
+@torch.no_grad()
+def literal_stage(model: GHGS, tokens: Tokens, points: Points) -> Stage:
+    """The recalibration of all layers of the first element, as the paper writes it down."""
+    record = Recorder()
+    with record("recalibration, literal"):
+        for layer in tokens.latent:
+            literal_recalibration(
+                model.recalibration.block, layer, points.tokens, tokens.semantic, model.recalibration.k
+            )
+    return record.stages[0]
+
+
+def report(stages: list[Stage], rates: dict[str, float], floor: float) -> None:
+    """Print the tables in Markdown; ``floor`` is what the process held with weights and photographs."""
+    print("| product | GFLOP/s |\n|---|---|")
+    for name, rate in rates.items():
+        print(f"| {name} | {rate:.0f} |")
+    yardstick, best = rates["torch.matmul, best square"], max(rates.values())
+    print("\n| stage | GFLOP | s | GFLOP/s | of torch.matmul | of the best product | peak GB |")
+    print("|---|---|---|---|---|---|---|")
+    whole = [stage for stage in stages if "literal" not in stage.name]
+    total = Stage(
+        "whole forward",
+        sum(s.seconds for s in whole),
+        max(s.peak_gb for s in whole),
+        sum(s.gflop for s in whole),
+    )
+    encoder = Stage("encoder", sum(s.seconds for s in stages[:2]), 0, sum(s.gflop for s in stages[:2]))
+    encoder.peak_gb = max(s.peak_gb for s in stages[:2])
+    for stage in [*stages, encoder, total]:
+        rate = stage.gflop / stage.seconds
+        share = f"{rate:.0f} | {rate / yardstick:.0%} | {rate / best:.0%}" if stage.gflop else "- | - | -"
+        print(f"| {stage.name} | {stage.gflop:.0f} | {stage.seconds:.2f} | {share} | {stage.peak_gb:.2f} |")
+    print(f"\nPeaks are above the {floor:.2f} GB that the process holds with weights and photographs.")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", default="vggt_1b", help="a member of the config group encoder")
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--side", type=int, default=518, help="of the square photographs, in pixels")
+    parser.add_argument(
+        "--dtype", choices=list(DTYPES), default="float32", help="bfloat16 runs under autocast"
+    )
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--literal", action="store_true", help="time the literal recalibration, too")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("options", nargs="*", help="further overrides of the configuration")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    dtype = DTYPES[options.dtype]
+    config = configuration(options.size, options.options)
+    batch = make_batch(1, options.views, options.side, options.side)
+    model = random_model(config)
+    gflop = count_gflop(config, model, batch)
+    width, size = model.encoder.dim_semantic, model.encoder.patch_size
+    tokens = options.views * (options.side // size) ** 2
+    rates = product_rates(tokens, width, dtype)
+    record = Recorder()
+    with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
+        seen = forward(model, batch, record)
+    for stage in record.stages:
+        stage.gflop = gflop.get(stage.name, 0.0)
+    if options.literal:
+        record.stages.append(literal_stage(model, *seen))
+        record.stages[-1].gflop = gflop["recalibration"]
+    again = product_rates(tokens, width, dtype)
+    rates = {name: max(rate, again[name]) for name, rate in rates.items()}
+    capability = torch.backends.cpu.get_cpu_capability()
+    parameters = sum(p.numel() for p in model.parameters())
+    print(f"{options.size}, {parameters / 1e6:.0f} M parameters, {options.views} views of {options.side}²,")
+    print(f"{options.dtype}, {options.threads} threads, {capability}, torch {torch.__version__}\n")
+    report(record.stages, rates, record.base)
+    if options.json:
+        facts = {"options": vars(options) | {"json": str(options.json)}, "processor": platform.processor()}
+        rows = [asdict(stage) for stage in record.stages]
+        facts |= {"capability": capability, "parameters": parameters, "rates": rates, "stages": rows}
+        options.json.write_text(json.dumps(facts | {"weights_gb": record.base}, indent=1) + "\n")
+        print(f"rows: {options.json}")
+
+
+if __name__ == "__main__":
+    main()
