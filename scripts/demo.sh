@@ -8,7 +8,7 @@ out="${GHGS_DEMO_DIR:-runs/demo_$(date +%Y-%m-%d_%H-%M-%S)}"
 ghgs train -m experiment=demo ablation=full,no_unprojection,no_semantic,neither "hydra.sweep.dir=$out"
 ghgs table runs="$out" illustration=true "hydra.run.dir=$out/table"
 
-full="$(dirname "$(dirname "$(grep -lx -e '- ablation=full' "$out"/*/.hydra/overrides.yaml)")")"
+full="$(dirname "$(dirname "$(grep -lx -e '- ablation=full' "$out"/*/.hydra/overrides.yaml | head -n 1)")")"
 
 cat <<TEXT
 

@@ -42,6 +42,7 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
     conf = found_conf(tmp_path, site)
     assert conf == (site / "ghgs_lit" / "conf").resolve()
     assert groups(conf) == groups(REPOSITORY / "conf")
+    assert (site / "hydra_plugins" / "ghgs_lit_sweeper.py").is_file()
     shipped = {p.name for p in (REPOSITORY / "ghgs_lit" / "people" / "assets").iterdir() if p.is_file()}
     assert shipped == {p.name for p in (site / "ghgs_lit" / "people" / "assets").iterdir() if p.is_file()}
 

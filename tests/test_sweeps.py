@@ -82,6 +82,7 @@ def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, 
     code, _, _ = sweep("seed=3,1,2,4")
     assert code == 130
     assert len(executed(sweep.directory)) == 1
+    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4  # tables show what is planned as missing
     _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
     assert "4 runs: 1 done, 1 partial, 1 failed, 1 missing" in out
     monkeypatch.setattr(train_verb, "train", noting)
@@ -239,6 +240,13 @@ def test_named_sweeps(name, count, data):
     assert len(combinations(cfg.hydra.sweeper.params, [f"sweep={name}"])) == count
 
 
+def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
+    there = f"hydra.sweep.dir={tmp_path}"
+    code, out, _ = call(monkeypatch, capsys, "train", "sweep=table4", "seed=1", "dry_run=true", there)
+    assert code == 0
+    assert "4 runs: 4 missing; nothing was run" in out
+
+
 def test_tables_share_runs_and_take_other_data(sweep):
     def names(*overrides):
         code, out, err = sweep("dry_run=true", "seed=1", *overrides)
@@ -278,15 +286,6 @@ def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tm
     assert started["env"]["GHGS_SWEEP_JOB"] == "skip"
     cfg.hydra.runtime.choices["hydra/launcher"] = "submitit_slurm"
     assert not work.needs_own_process({"trainer": {"devices": 2}})
-
-
-def test_unfinished_runs_are_written_down_for_the_tables(sweep, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(train_verb, "train", interrupted)
-    sweep("seed=1,2")
-    assert len(list(sweep.directory.glob("*/config.yaml"))) == 2
 
 
 def test_hash_ignores_only_what_no_number_depends_on():

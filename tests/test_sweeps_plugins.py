@@ -17,7 +17,7 @@ SETTINGS = {
         "cluster",
         ["hydra.launcher.cpus_per_task=1", "hydra.launcher.timeout_min=5"],
     ),
-    "ray": ("hydra_plugins.hydra_ray_launcher", "ray", ["hydra.launcher.ray.init.num_cpus=2"]),
+    "ray": ("hydra_plugins.hydra_ray_launcher", "ray", ["+hydra.launcher.ray.init.num_cpus=2"]),
 }
 
 

@@ -13,6 +13,7 @@ import fcntl
 import json
 import os
 import socket
+import time
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
@@ -135,6 +136,9 @@ class Run:
         handle = os.open(self.directory / ".lock", os.O_RDWR | os.O_CREAT, 0o664)
         try:
             mine = _lock(handle, fcntl.LOCK_EX, wait, self.directory)
+            if not mine:  # unless somebody only looks whether the run is locked
+                time.sleep(0.05)
+                mine = _lock(handle, fcntl.LOCK_EX, wait, self.directory)
             if mine:
                 _HELD.add(self.directory)
                 os.ftruncate(handle, 0)
