@@ -1,5 +1,6 @@
 """The CPU backend as one differentiable function of PyTorch."""
 
+import threading
 from dataclasses import dataclass
 from functools import partial
 
@@ -8,7 +9,11 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from ghgs_lit.rendering.cpu import binning, gradients, layout, pool, projection, raster, simd
+from ghgs_lit.errors import require
+from ghgs_lit.rendering.cpu import binning, layout, pool, projection, simd
+from ghgs_lit.rendering.cpu.backward import backward
+from ghgs_lit.rendering.cpu.forward import forward
+from ghgs_lit.rendering.cpu.gradients import collect
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
@@ -42,8 +47,9 @@ class _Plan:
     """What to render, without the Gaussians' values. View ``v`` shows batch element ``v // T``."""
 
     views: np.ndarray
-    first_gaussians: np.ndarray
-    counts: np.ndarray
+    edges: np.ndarray
+    shifts: np.ndarray
+    splats: int
     shape: tuple[int, int]
     height: int
     width: int
@@ -53,11 +59,15 @@ class _Plan:
 
     @classmethod
     def of(cls, gaussians, cameras, settings, near, far, regions) -> "_Plan":
-        splits, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
+        counts, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
+        firsts = np.cumsum(counts) - counts
+        # Whole vectors of splats for each view, so that threads never write to the same one.
+        sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
         return cls(
             views=_view_rows(cameras, settings, regions),
-            first_gaussians=np.repeat(np.cumsum(splits) - splits, views_each),
-            counts=np.repeat(splits, views_each),
+            edges=_part_edges(firsts, counts),
+            shifts=np.cumsum(sizes) - sizes - np.repeat(firsts, views_each),
+            splats=int(sizes.sum()),
             shape=tuple(cameras.shape),
             height=cameras.height,
             width=cameras.width,
@@ -74,6 +84,26 @@ class _Plan:
     @property
     def constants(self) -> tuple[np.float32, np.float32]:
         return np.float32(self.settings.alpha_max), np.float32(self.settings.stop)
+
+    @property
+    def parts(self) -> list[tuple[int, int, int, int, slice]]:
+        """Batch element, part of it, first and last Gaussian of the part, and the element's views."""
+        views = self.shape[1]
+        return [
+            (b, p, int(edges[p]), int(edges[p + 1]), slice(b * views, (b + 1) * views))
+            for b, edges in enumerate(self.edges)
+            for p in range(len(edges) - 1)
+            if edges[p] < edges[p + 1]
+        ]
+
+
+def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Where the parts of each element begin and end [B, P + 1]: whole vectors but for the last."""
+    threads, total = torch.get_num_threads(), int(counts.sum())
+    parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
+    steps = -(-counts // (parts * simd.DOUBLES)) * simd.DOUBLES
+    edges = np.minimum(steps[:, None] * np.arange(parts + 1), counts[:, None])
+    return edges + firsts[:, None]
 
 
 def _view_rows(cameras: Cameras, settings: RasterSettings, regions: Tensor | None) -> np.ndarray:
@@ -101,65 +131,48 @@ def _view_rows(cameras: Cameras, settings: RasterSettings, regions: Tensor | Non
 class _Splats:
     """Splats of all views, and the entries of all tiles; see ``layout``."""
 
-    shifts: np.ndarray
-    shared: np.ndarray
-    stride: int
     records: np.ndarray
-    rects: np.ndarray
+    boxes: np.ndarray
     entry_starts: np.ndarray
     tile_starts: np.ndarray
-    splats: np.ndarray
-    slots: np.ndarray
-    hits: np.ndarray
+    entries: np.ndarray
+    drawn: np.ndarray
+    reached: np.ndarray
 
 
-def _prepare(plan: _Plan, means, quaternions, scales, opacities) -> _Splats:
-    """Project all Gaussians into their views, sort them and list them by tile."""
-    settings, (tiles_x, tiles_y) = plan.settings, plan.tiles
-    views, tiles = len(plan.views), tiles_x * tiles_y
-    starts = np.cumsum(plan.counts) - plan.counts
-    total, stride = int(plan.counts.sum()), len(means) + simd.DOUBLES
-    shifts = plan.first_gaussians - starts
-    shared = np.empty(layout.SHARED * stride)
-    records = np.empty((total, layout.RECORD), np.float32)
-    depths, rects = np.empty(total, np.float32), np.empty((total, 4), np.int32)
-    tile_counts = np.zeros(views * tiles + 1, np.int64)
-    seen = np.zeros(views, np.int64)
+def _prepare(plan: _Plan, means, quaternions, scales, opacities, colors) -> _Splats:
+    """Project all Gaussians into their views and list them by tile."""
+    settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
+    (elements, views), parts = plan.shape, plan.parts
+    records = _aligned(total * layout.RECORD).reshape(total, layout.RECORD)
+    depths, boxes = np.empty((total, 1), np.float32), np.empty((total, 4), np.int32)
+    counts = np.zeros((elements, plan.edges.shape[1] - 1, views, tiles_x * tiles_y), np.int64)
+    found = np.zeros(counts.shape[:2], np.int64)
 
-    def share(first: int, last: int) -> None:
-        projection.share(
-            means, quaternions, scales, opacities, first, last, settings.alpha_min, stride, shared
-        )
-
-    def project(v: int) -> None:
-        seen[v] = projection.project(
-            plan.views[v], shared, stride, starts[v], plan.counts[v], shifts[v], plan.near, plan.far,
-            settings.low_pass, settings.extent, settings.antialiased, tiles_x, records,
-            depths, rects, tile_counts[1 + v * tiles : 1 + (v + 1) * tiles],
+    def project(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
+        found[b, p] = projection.project(
+            means, quaternions, scales, opacities, colors, first, last, plan.views[seen_by],
+            plan.shifts[seen_by], plan.near, plan.far, settings.low_pass, settings.extent, settings.alpha_min,
+            settings.antialiased, tiles_x, records, depths, boxes, counts[b, p],
         )  # fmt: skip
 
-    pool.run([partial(share, *part) for part in _parts(0, len(means))], len(means) // 8)
-    pool.run([partial(project, v) for v in range(views)], total)
-    tile_starts = np.cumsum(tile_counts)
-    entry_starts = np.zeros(total + 1, np.int64)
-    np.cumsum((rects[:, 1] - rects[:, 0]) * (rects[:, 3] - rects[:, 2]), out=entry_starts[1:])
-    splats, slots = np.empty(tile_starts[-1], np.int32), np.empty(tile_starts[-1], np.int64)
+    pool.run([partial(project, *part) for part in parts], total)
+    tile_starts = np.concatenate(([0], counts.sum(1).reshape(-1).cumsum()))
+    slots = np.cumsum(found).reshape(found.shape) - found
+    size = int(tile_starts[-1])
+    require(size < 1 << 31, "render", "fewer than 2^31 splats in tiles at once (fewer views)", size)
+    next_free = tile_starts[:-1].reshape(elements, 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
+    entries, entry_starts = np.empty((size, layout.ENTRY), np.int32), np.empty(total, np.int32)
 
-    def scatter(v: int) -> None:
+    def scatter(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
         binning.scatter(
-            depths, rects, starts[v], plan.counts[v], seen[v], tiles_x, tile_starts, v * tiles, entry_starts,
-            splats, slots,
+            first, last, plan.shifts[seen_by], depths, boxes, tiles_x, slots[b, p], entry_starts,
+            next_free[b, p], entries,
         )  # fmt: skip
 
-    pool.run([partial(scatter, v) for v in range(views)], len(splats))
-    hits = np.empty(len(splats), np.uint16)
-    return _Splats(shifts, shared, stride, records, rects, entry_starts, tile_starts, splats, slots, hits)
-
-
-def _parts(first: int, count: int) -> list[tuple[int, int]]:
-    """``count`` things from ``first`` on in a run for each thread, each but the last of whole vectors."""
-    step = -(-count // (torch.get_num_threads() * simd.DOUBLES)) * simd.DOUBLES
-    return [(a, min(a + step, first + count)) for a in range(first, first + count, max(step, 1))]
+    pool.run([partial(scatter, *part) for part in parts], size)
+    drawn, reached = np.zeros(len(tile_starts) - 1, np.int64), np.zeros(size, np.uint8)
+    return _Splats(records, boxes, entry_starts, tile_starts, entries, drawn, reached)
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
@@ -177,19 +190,19 @@ def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, colors, plan: _Plan):
-        arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities, colors)]
-        found = _prepare(plan, *arrays[:4])
+        arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
+        found = _prepare(plan, *arrays)
         channels, size = colors.shape[1], (plan.height, plan.width)
         image, alpha, depth = (_zeros(*plan.shape, planes, *size) for planes in (channels, 1, 1))
         outputs = [_flat(t) for t in (image, alpha, depth)]
         pool.run([
             partial(
-                raster.forward, tiles, *plan.tiles, *size, plan.views, found.tile_starts, found.splats,
-                found.shifts, found.records, arrays[4], _channels(channels), *plan.constants, found.hits,
+                forward, tiles, *plan.tiles, *size, plan.views, found.tile_starts, found.entries, plan.shifts,
+                found.records, arrays[4], _channels(channels), *plan.constants, found.drawn, found.reached,
                 *outputs,
             )
             for tiles in _tile_runs(found.tile_starts)
-        ], len(found.splats))  # fmt: skip
+        ], len(found.entries))  # fmt: skip
         ctx.save_for_backward(means, quaternions, scales, opacities, colors, image, alpha, depth)
         ctx.set_materialize_grads(False)
         ctx.plan, ctx.found = plan, found
@@ -200,33 +213,50 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, d_image, d_alpha, d_depth):
         *inputs, image, alpha, depth = ctx.saved_tensors
         plan, found, settings = ctx.plan, ctx.found, ctx.plan.settings
-        _, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
-        width = layout.gradient_width(colors.shape[1])
-        # PyTorch's memory starts on a cache line, as the kernels need it.
-        entries = torch.empty(len(found.splats) * width).numpy()
+        means, quaternions, scales, _, colors = (t.detach().numpy() for t in inputs)
+        gradients = _scratch(len(found.entries) * layout.gradient_width(colors.shape[1]))
         d_image = _zeros(*image.shape) if d_image is None else d_image
-        arrays = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
+        images = [_flat(t) for t in (image, alpha, depth, d_image, d_alpha, d_depth)]
         pool.run([
             partial(
-                raster.backward, tiles, *plan.tiles, plan.height, plan.width, plan.views, found.tile_starts,
-                found.splats, found.slots, found.shifts, found.records, colors, _channels(colors.shape[1]),
-                *plan.constants, found.hits, *arrays, entries,
+                backward, tiles, *plan.tiles, plan.height, plan.width, plan.views, found.tile_starts,
+                found.entries, plan.shifts, found.records, colors, _channels(colors.shape[1]),
+                *plan.constants, found.drawn, *images, gradients,
             )
             for tiles in _tile_runs(found.tile_starts)
-        ], len(found.splats))  # fmt: skip
-        results = [_zeros(*t.shape) for t in inputs]
-        views_each = plan.shape[1]
-        tasks = [
+        ], len(found.entries))  # fmt: skip
+        results = [torch.empty_like(t) for t in inputs]
+        d_means, d_quaternions, d_scales, d_opacities, d_colors = (t.numpy() for t in results)
+        pool.run([
             partial(
-                gradients.collect, quaternions, scales, plan.views, first_view, first_view + views_each,
-                *part, found.shifts, settings.low_pass, settings.antialiased, found.shared, found.stride,
-                found.records, found.rects, found.entry_starts, entries, *(t.numpy() for t in results),
+                collect, means, quaternions, scales, first, last, plan.views[seen_by], plan.shifts[seen_by],
+                settings.low_pass, settings.antialiased, found.records, found.boxes, found.entry_starts,
+                found.reached, gradients, d_means, d_quaternions, d_scales, d_opacities[:, None], d_colors,
             )
-            for first_view in range(0, len(plan.views), max(1, views_each))
-            for part in _parts(int(plan.first_gaussians[first_view]), int(plan.counts[first_view]))
-        ]  # fmt: skip
-        pool.run(tasks, len(found.splats) // 2)
+            for _, _, first, last, seen_by in plan.parts
+        ], len(found.entries) // 2)  # fmt: skip
         return *results, None
+
+
+def _aligned(count: int) -> np.ndarray:
+    """``count`` floats whose memory starts on a cache line."""
+    buffer = np.empty(count + simd.LANES, np.float32)
+    skip = -(buffer.ctypes.data // 4) % simd.LANES
+    return buffer[skip : skip + count]
+
+
+_kept = threading.local()
+# Floats of scratch memory that a thread keeps: fresh memory costs more than what is written to it.
+_KEEP = 1 << 24
+
+
+def _scratch(count: int) -> np.ndarray:
+    """``_aligned`` memory that is the caller's until this thread asks for scratch again."""
+    buffer = getattr(_kept, "buffer", None)
+    if buffer is None or len(buffer) < count:
+        buffer = _aligned(count + count // 4)
+        _kept.buffer = buffer if len(buffer) <= _KEEP else None
+    return buffer[:count]
 
 
 def _zeros(*shape: int) -> Tensor:

@@ -1,77 +1,86 @@
-"""Depth order and tile lists: a radix sort of float32 depths, then one stable scatter into the tiles."""
+"""Which splats lie in which tile, and in which order.
+
+Every part of the Gaussians scatters its splats into the tiles' lists in the order of their index; then
+each tile sorts its own list by depth with a stable sort. So neither the number of parts nor that of
+threads changes the order, and no sort is larger than a tile.
+"""
 
 import numpy as np
 
-from ghgs_lit.rendering.cpu import simd
+from ghgs_lit.rendering.cpu import layout
 from ghgs_lit.rendering.cpu.compile import helper, kernel
 
-_DIGIT = 11
+_DIGIT = 8
 _BUCKETS = 1 << _DIGIT
-# Splats between asking for one's rectangle and reading it: in depth order they lie anywhere.
-_AHEAD = 16
-
-
-@helper
-def _radix_pass(keys, order, shift, new_keys, new_order, counts):
-    """Sort stably by one digit of the keys; returns False, doing nothing, if all digits are equal."""
-    counts[:] = 0
-    for key in keys:
-        counts[(key >> shift) & (_BUCKETS - 1)] += 1
-    if counts[(keys[0] >> shift) & (_BUCKETS - 1)] == len(keys):
-        return False
-    total = 0
-    for bucket in range(_BUCKETS):
-        count = counts[bucket]
-        counts[bucket] = total
-        total += count
-    for i in range(len(keys)):
-        bucket = (keys[i] >> shift) & (_BUCKETS - 1)
-        position = counts[bucket]
-        counts[bucket] += 1
-        new_keys[position], new_order[position] = keys[i], order[i]
-    return True
-
-
-@helper
-def _depth_order(depths, rects, start, count, seen):
-    """Visible splats of a view by depth, ties by index. Bits of positive floats order as integers do."""
-    keys, order = np.empty(seen, np.uint32), np.empty(seen, np.int32)
-    new_keys, new_order = np.empty(seen, np.uint32), np.empty(seen, np.int32)
-    bits = depths.view(np.uint32)
-    k = 0
-    for s in range(start, start + count):
-        if rects[s, 0] < rects[s, 1]:
-            keys[k], order[k] = bits[s], s
-            k += 1
-    counts = np.empty(_BUCKETS, np.int64)
-    for shift in range(0, 32, _DIGIT):
-        if seen > 0 and _radix_pass(keys, order, np.uint32(shift), new_keys, new_order, counts):
-            keys, new_keys, order, new_order = new_keys, keys, new_order, order
-    return order
+# Up to this many numbers insertion beats counting.
+_FEW = 24
 
 
 @kernel
-def scatter(depths, rects, start, count, seen, tiles_x, tile_starts, first_tile, entry_starts, splats, slots):
-    """Fill the tile lists of one view.
+def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, next_free, entries):
+    """List the splats of Gaussians ``first`` to ``last`` in every tile that they touch.
 
-    ``tile_starts[first_tile + t]`` is where tile ``t``'s entries begin in ``splats`` and ``slots``; entry
-    ``slots[i]`` is where the gradients of entry ``i`` go, a splat's own slots being neighbours.
+    ``next_free`` [T, tiles] is where this part's next entry of a tile goes; the part's slots begin with
+    ``slot``, and ``entry_starts`` receives the first slot of every splat that is seen.
     """
-    order = _depth_order(depths, rects, start, count, seen)
-    tiles = 0
-    for s in range(start, start + count):
-        tiles = max(tiles, rects[s, 3])
-    next_free = tile_starts[first_tile : first_tile + tiles * tiles_x].copy()
-    for i in range(len(order)):
-        later = order[min(i + _AHEAD, len(order) - 1)]
-        simd.prefetch(rects, later * 4)
-        simd.prefetch(entry_starts, later)
-        s = order[i]
-        slot = entry_starts[s]
-        for y in range(rects[s, 2], rects[s, 3]):
-            for x in range(rects[s, 0], rects[s, 1]):
-                tile = y * tiles_x + x
-                position = next_free[tile]
-                next_free[tile] += 1
-                splats[position], slots[position] = s, slot
-                slot += 1
+    keys = depths.view(np.int32)
+    for t in range(len(shifts)):
+        for m in range(first + shifts[t], last + shifts[t]):
+            entry_starts[m] = slot
+            for y in range(boxes[m, layout.Y0], boxes[m, layout.Y1]):
+                for x in range(boxes[m, layout.X0], boxes[m, layout.X1]):
+                    entry = next_free[t, y * tiles_x + x]
+                    next_free[t, y * tiles_x + x] = entry + 1
+                    entries[entry, layout.KEY] = keys[m, 0]
+                    entries[entry, layout.SPLAT] = m
+                    entries[entry, layout.SLOT] = slot
+                    slot += 1
+
+
+@helper
+def _insertion_sort(keys, count):
+    for i in range(1, count):
+        key, k = keys[i], i
+        while k > 0 and keys[k - 1] > key:
+            keys[k] = keys[k - 1]
+            k -= 1
+        keys[k] = key
+
+
+@helper
+def _radix_pass(keys, new_keys, count, shift, places):
+    """Sort stably by one digit of the keys into ``new_keys``."""
+    places[:] = 0
+    for i in range(count):
+        places[(keys[i] >> shift) & (_BUCKETS - 1)] += 1
+    total = 0
+    for bucket in range(_BUCKETS):
+        size = places[bucket]
+        places[bucket] = total
+        total += size
+    for i in range(count):
+        bucket = (keys[i] >> shift) & (_BUCKETS - 1)
+        new_keys[places[bucket]] = keys[i]
+        places[bucket] += 1
+
+
+@helper
+def depth_order(entries, start, end, keys, spare, places):
+    """The entries of one tile by depth, ties as they stand: their rows are the lower halves of the result.
+
+    The bits of positive floats order as integers do; above ``start``'s smallest few of them differ.
+    """
+    count, least, most = end - start, entries[start, layout.KEY], entries[start, layout.KEY]
+    for i in range(start, end):
+        least, most = min(least, entries[i, layout.KEY]), max(most, entries[i, layout.KEY])
+    for i in range(count):
+        keys[i] = (np.int64(entries[start + i, layout.KEY] - least) << 32) | (start + i)
+    if count <= _FEW:
+        _insertion_sort(keys, count)
+        return keys[:count]
+    span, shift = np.int64(most) - least, 0
+    while span >> shift > 0:
+        _radix_pass(keys, spare, count, 32 + shift, places)
+        keys, spare = spare, keys
+        shift += _DIGIT
+    return keys[:count]

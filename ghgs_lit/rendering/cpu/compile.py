@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numba
 
+# Kernels are called from Python only, helpers from kernels only: no other way in is compiled.
+_OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
 
 def _sources_digest() -> str:
     """Digest of every source file that the machine code of a kernel depends on."""
@@ -25,13 +28,13 @@ def kernel(function):
     of all sources of this package. Without a writable place for a cache, kernels compile in each process.
     """
     try:
-        compiled = numba.njit(nogil=True, cache=True, error_model="numpy")(function)
+        compiled = numba.njit(cache=True, **_OPTIONS)(function)
         compiled._cache._cache_file._source_stamp = _DIGEST
     except (RuntimeError, AttributeError):
-        compiled = numba.njit(nogil=True, error_model="numpy")(function)
+        compiled = numba.njit(**_OPTIONS)(function)
     return compiled
 
 
 def helper(function):
     """A function that kernels call; it is compiled into them."""
-    return numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+    return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)

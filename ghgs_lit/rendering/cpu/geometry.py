@@ -15,35 +15,41 @@ K_SCALE = math.sqrt(0.5 * TO_LOG2)
 
 
 @helper
-def gather(array, first, last, out):
-    """Rows ``first`` to ``first + 8`` of ``array`` [n, k] into rows of 8 of ``out``; ``last`` ends it."""
-    for lane in range(simd.DOUBLES):
-        n = min(first + lane, last - 1)
-        for k in range(array.shape[1]):
-            out[k * simd.DOUBLES + lane] = array[n, k]
-
-
-@helper
 def unit(quaternions):
-    """Unit quaternions and 1 / norm from rows of components; identity and 0 for the zero quaternion."""
-    one, zero = simd.full(1.0), simd.full(0.0)
-    w, x = simd.load(quaternions, 0), simd.load(quaternions, 8)
-    y, z = simd.load(quaternions, 16), simd.load(quaternions, 24)
+    """Unit quaternions and 1 / norm; identity and 0 for the zero quaternion."""
+    w, x, y, z = quaternions
     norm = simd.root(w * w + x * x + (y * y + z * z))
-    is_zero = norm == zero
-    inverse = one / simd.select(is_zero, one, norm)
-    w = simd.select(is_zero, one, w * inverse)
-    return w, x * inverse, y * inverse, z * inverse, simd.select(is_zero, zero, inverse)
+    is_zero = norm == 0.0
+    inverse = 1.0 / simd.select(is_zero, 1.0, norm)
+    w = simd.select(is_zero, 1.0, w * inverse)
+    return w, x * inverse, y * inverse, z * inverse, simd.select(is_zero, 0.0, inverse)
 
 
 @helper
 def rotation(w, x, y, z):
     """Rotation matrices of unit quaternions."""
-    one, two = simd.full(1.0), simd.full(2.0)
+    x2, y2, z2 = x + x, y + y, z + z
+    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
     return (
-        one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
-        two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
-        two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y),
+        1.0 - (yy + zz),
+        xy - wz,
+        xz + wy,
+        xy + wz,
+        1.0 - (xx + zz),
+        yz - wx,
+        xz - wy,
+        yz + wx,
+        1.0 - (xx + yy),
+    )
+
+
+@helper
+def scaled(r, s):
+    """``R S``, whose columns are the axes of Gaussians at their lengths."""
+    return (
+        r[0] * s[0], r[1] * s[1], r[2] * s[2], r[3] * s[0], r[4] * s[1], r[5] * s[2],
+        r[6] * s[0], r[7] * s[1], r[8] * s[2],
     )  # fmt: skip
 
 
@@ -53,54 +59,32 @@ def dot(a, b, c, x, y, z):
 
 
 @helper
-def camera_row(view, row, x, y, z):
-    """One coordinate in the camera of world points."""
-    first = layout.ROTATION + 3 * row
-    a, b, c = simd.full(view[first]), simd.full(view[first + 1]), simd.full(view[first + 2])
-    return dot(a, b, c, x, y, z) + simd.full(view[layout.TRANSLATION + row])
-
-
-@helper
-def camera_points(view, shared, stride, n):
-    """World points of Gaussians ``n`` to ``n + 8`` in camera axes: x / z, y / z, z and 1 / z."""
-    mean_x, mean_y = simd.load(shared, n), simd.load(shared, stride + n)
-    mean_z = simd.load(shared, 2 * stride + n)
-    z = camera_row(view, 2, mean_x, mean_y, mean_z)
-    inverse = simd.full(1.0) / z
-    x = camera_row(view, 0, mean_x, mean_y, mean_z) * inverse
-    return x, camera_row(view, 1, mean_x, mean_y, mean_z) * inverse, z, inverse
+def camera_points(view, mean):
+    """World points in camera axes: x / z, y / z, z and 1 / z."""
+    r, t = layout.ROTATION, layout.TRANSLATION
+    z = dot(view[r + 6], view[r + 7], view[r + 8], mean[0], mean[1], mean[2]) + view[t + 2]
+    inverse = 1.0 / z
+    x = dot(view[r], view[r + 1], view[r + 2], mean[0], mean[1], mean[2]) + view[t]
+    y = dot(view[r + 3], view[r + 4], view[r + 5], mean[0], mean[1], mean[2]) + view[t + 1]
+    return x * inverse, y * inverse, z, inverse
 
 
 @helper
 def held(view, x, y):
     """x / z and y / z held near the frame, as the Jacobian takes them."""
-    x = simd.minimum(simd.maximum(x, simd.full(view[layout.X_LOW])), simd.full(view[layout.X_HIGH]))
-    y = simd.minimum(simd.maximum(y, simd.full(view[layout.Y_LOW])), simd.full(view[layout.Y_HIGH]))
+    x = simd.minimum(simd.maximum(x, view[layout.X_LOW]), view[layout.X_HIGH])
+    y = simd.minimum(simd.maximum(y, view[layout.Y_LOW]), view[layout.Y_HIGH])
     return x, y
 
 
 @helper
 def affine(view, x, y, inverse):
     """``J W``, 2 x 3: the local affine map of the projection, for held ``x`` and ``y``."""
-    fx, fy = simd.full(view[layout.FX]) * inverse, simd.full(view[layout.FY]) * inverse
-    r = layout.ROTATION
-    a, b, c = simd.full(view[r + 6]), simd.full(view[r + 7]), simd.full(view[r + 8])
+    fx, fy, r = view[layout.FX] * inverse, view[layout.FY] * inverse, layout.ROTATION
+    a, b, c = view[r + 6], view[r + 7], view[r + 8]
     return (
-        fx * (simd.full(view[r]) - x * a), fx * (simd.full(view[r + 1]) - x * b),
-        fx * (simd.full(view[r + 2]) - x * c), fy * (simd.full(view[r + 3]) - y * a),
-        fy * (simd.full(view[r + 4]) - y * b), fy * (simd.full(view[r + 5]) - y * c),
-    )  # fmt: skip
-
-
-@helper
-def load_root(shared, stride, n):
-    """``R(q) S`` of Gaussians ``n`` to ``n + 8``."""
-    at = layout.ROOT * stride + n
-    return (
-        simd.load(shared, at), simd.load(shared, at + stride), simd.load(shared, at + 2 * stride),
-        simd.load(shared, at + 3 * stride), simd.load(shared, at + 4 * stride),
-        simd.load(shared, at + 5 * stride), simd.load(shared, at + 6 * stride),
-        simd.load(shared, at + 7 * stride), simd.load(shared, at + 8 * stride),
+        fx * (view[r] - x * a), fx * (view[r + 1] - x * b), fx * (view[r + 2] - x * c),
+        fy * (view[r + 3] - y * a), fy * (view[r + 4] - y * b), fy * (view[r + 5] - y * c),
     )  # fmt: skip
 
 

@@ -1,9 +1,10 @@
 """Where things lie in the arrays that the kernels share.
 
-A *splat* is one Gaussian seen by one camera: splat ``m`` of view ``v`` is Gaussian ``m + shift[v]``. Its
-record is 16 floats. With ``Sigma = L L^T`` its 2D covariance (low-pass included) and ``d`` the vector
-from its centre to a pixel's, the exponent of the Gaussian is ``-(p^2 + q^2) ln 2`` where
-``p = K_XX dx`` and ``q = K_YX dx + K_YY dy``: a sum of squares, which cannot cancel or turn negative.
+A *splat* is one Gaussian seen by one camera: splat ``m`` of view ``v`` is Gaussian ``m - shift[v]``; the
+splats of a view start at a multiple of eight. Its record is 16 floats. With ``Sigma = L L^T`` its 2D
+covariance (low-pass included) and ``d`` the vector from its centre to a pixel's, the exponent of the
+Gaussian is ``-(p^2 + q^2) ln 2`` where ``p = K_XX dx`` and ``q = K_YX dx + K_YY dy``: a sum of squares,
+which cannot cancel or turn negative.
 """
 
 RECORD = 16
@@ -13,18 +14,25 @@ K_XX, K_YX, K_YY = 4, 5, 6
 OPACITY, CUTOFF, DEPTH = 7, 8, 9
 # Along a column of pixels p^2 + q^2 is least at dy = SLOPE_Y dx, along a row at dx = SLOPE_X dy.
 SLOPE_X, SLOPE_Y = 10, 11
+# Then the colour, if it has no more channels than the record has room for.
+COLORS, ROOM = 12, 4
 
 TILE = 16
 BLOCK = 4
 PIXELS = TILE * TILE
 
-# What all views share of a Gaussian, in doubles, one row for each number: mean, R(q) S row by row,
-# opacity, and log2(opacity / alpha_min).
-MEAN, ROOT, SHARED_OPACITY, SHARED_CUTOFF = 0, 3, 12, 13
-SHARED = 14
+# The box of tiles that a splat touches; empty where it is unseen.
+X0, X1, Y0, Y1 = 0, 1, 2, 3
 
-# An entry is one splat in one tile. Its gradients, with ``h = dL / d ln(alpha)`` summed over pixels:
-# the moments of h in whitened coordinates, the depth's gradient, then from COLOR on the colours'.
+# An entry is one splat in one tile, a row of integers: the bits of its depth, the splat, the slot of its
+# gradients (those of one splat are neighbours). Once the tile is drawn, the splats that it shows come
+# first, front to back, with the blocks that each reaches in place of the depth.
+KEY, SPLAT, SLOT = 0, 1, 2
+BLOCKS = KEY
+ENTRY = 4
+
+# The gradients of an entry, with ``h = dL / d ln(alpha)`` summed over pixels: the moments of h in
+# whitened coordinates, the depth's gradient, then from COLOR on the colours'.
 H, H_P, H_Q, H_PP, H_PQ, H_QQ, D_DEPTH = 0, 1, 2, 3, 4, 5, 6
 COLOR = 7
 

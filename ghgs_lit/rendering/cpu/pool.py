@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 
 # Splats or entries that are worth another thread: about a millisecond's.
-_GRAIN = 8192
+GRAIN = 8192
 
 _lock = threading.Lock()
 _pool: ThreadPoolExecutor | None = None
@@ -40,7 +40,7 @@ def run(tasks: list, work: int) -> None:
 
     ``work`` counts the splats or entries that the tasks handle: for a few, no thread is woken.
     """
-    helpers = min(torch.get_num_threads(), len(tasks), 1 + work // _GRAIN) - 1
+    helpers = min(torch.get_num_threads(), len(tasks), 1 + work // GRAIN) - 1
     queue = deque(tasks)
 
     def drain() -> None:

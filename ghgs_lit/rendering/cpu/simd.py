@@ -4,22 +4,25 @@ LLVM's loop vectoriser does not see through the masked inner loop of a rasterize
 not need it to. A vector is 64 bytes, 16 floats or 8 doubles: one AVX-512 register; on AVX2 and NEON LLVM
 splits each operation into two or four of the machine's own, so the same kernels run everywhere. A mask
 is one bit per lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says.
+
+Wherever a vector is expected beside another, a number stands for that number in every lane. How vectors
+come from memory and go there is told in ``memory``.
 """
 
+import math
 import operator
 
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, overload, register_model
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 
-from ghgs_lit.rendering.cpu import layout
 from ghgs_lit.rendering.cpu.compile import helper
 
 LANES = 16
 DOUBLES = 8
-_I32, _I64 = ir.IntType(32), ir.IntType(64)
+I32, I64 = ir.IntType(32), ir.IntType(64)
 
 
 class _Lanes(types.Type):
@@ -43,7 +46,8 @@ doubles = _Floats("float64x8", ir.DoubleType(), DOUBLES)
 mask16 = _Mask("mask16", ir.IntType(1), LANES)
 mask8 = _Mask("mask8", ir.IntType(1), DOUBLES)
 _MASKS = {floats: mask16, doubles: mask8}
-_VECTORS = {types.float32: floats, types.float64: doubles}
+_SCALARS = {floats: types.float32, doubles: types.float64}
+_VECTORS = {scalar: kind for kind, scalar in _SCALARS.items()}
 _SUFFIX = {floats: "v16f32", doubles: "v8f64"}
 
 
@@ -54,61 +58,80 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.llvm)
 
 
-def _operator(function, operand, result, emit):
-    """Give a Python operator a meaning for two vectors or two masks."""
+@lower_cast(types.Number, _Floats)
+def _fill(context, builder, source, kind, value):
+    """The same number in every lane."""
+    undefined = ir.Constant(kind.llvm, ir.Undefined)
+    number = context.cast(builder, value, source, _SCALARS[kind])
+    one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
+    return builder.shuffle_vector(one, undefined, indices([0] * kind.count))
+
+
+def _common(*args):
+    """The kind of vector among the arguments, if the others are of that kind or numbers."""
+    kinds = {a for a in args if isinstance(a, _Lanes)}
+    fits = len(kinds) == 1 and all(isinstance(a, (_Lanes, types.Number)) for a in args)
+    return kinds.pop() if fits else None
+
+
+def _operator(function, family, result, emit):
+    """Give a Python operator a meaning for vectors or masks, whose kind ``result`` maps to the value's."""
 
     class Template(AbstractTemplate):
         key = function
+        # Asked before Numba's own templates, of which operators have dozens.
+        metadata = {"target": "cpu"}  # noqa: RUF012
 
         def generic(self, args, keywords):
-            return signature(result, operand, operand) if args == (operand, operand) else None
+            kind = _common(*args)
+            return signature(result(kind), kind, kind) if isinstance(kind, family) else None
 
     infer_global(function)(Template)
-    lower_builtin(function, operand, operand)(lambda context, builder, sig, args: emit(builder, *args))
+    lower_builtin(function, family, family)(lambda context, builder, sig, args: emit(builder, *args))
 
 
-for _kind, _mask in _MASKS.items():
-    _operator(operator.add, _kind, _kind, lambda builder, a, b: builder.fadd(a, b))
-    _operator(operator.sub, _kind, _kind, lambda builder, a, b: builder.fsub(a, b))
-    _operator(operator.mul, _kind, _kind, lambda builder, a, b: builder.fmul(a, b))
-    _operator(operator.truediv, _kind, _kind, lambda builder, a, b: builder.fdiv(a, b))
-    _operator(operator.le, _kind, _mask, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
-    _operator(operator.lt, _kind, _mask, lambda builder, a, b: builder.fcmp_ordered("<", a, b))
-    _operator(operator.gt, _kind, _mask, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
-    _operator(operator.ge, _kind, _mask, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
-    _operator(operator.eq, _kind, _mask, lambda builder, a, b: builder.fcmp_ordered("==", a, b))
-    _operator(operator.and_, _mask, _mask, lambda builder, a, b: builder.and_(a, b))
+def _compare(function, sign):
+    _operator(function, _Floats, _MASKS.get, lambda builder, a, b: builder.fcmp_ordered(sign, a, b))
 
 
-def _constant(kind, value: float):
+_operator(operator.add, _Floats, lambda kind: kind, lambda builder, a, b: builder.fadd(a, b))
+_operator(operator.sub, _Floats, lambda kind: kind, lambda builder, a, b: builder.fsub(a, b))
+_operator(operator.mul, _Floats, lambda kind: kind, lambda builder, a, b: builder.fmul(a, b))
+_operator(operator.truediv, _Floats, lambda kind: kind, lambda builder, a, b: builder.fdiv(a, b))
+_operator(operator.and_, _Mask, lambda kind: kind, lambda builder, a, b: builder.and_(a, b))
+_compare(operator.le, "<=")
+_compare(operator.lt, "<")
+_compare(operator.gt, ">")
+_compare(operator.ge, ">=")
+_compare(operator.eq, "==")
+
+
+def constant(kind, value: float):
     return ir.Constant(kind.llvm, [value] * kind.count)
 
 
-def _call(builder, name, kind, *args):
+def call(builder, name, kind, *args):
     """Call an LLVM intrinsic whose arguments and result are all of one kind of vector."""
     function = ir.FunctionType(kind.llvm, [kind.llvm] * len(args))
     callee = cgutils.get_or_insert_function(builder.module, function, f"llvm.{name}.{_SUFFIX[kind]}")
     return builder.call(callee, args)
 
 
-def _indices(values):
+def indices(values):
     values = list(values)
-    return ir.Constant(ir.VectorType(_I32, len(values)), values)
+    return ir.Constant(ir.VectorType(I32, len(values)), values)
+
+
+def vector_of(scalar):
+    """The kind of vector whose lanes are float32 or float64."""
+    return _VECTORS[scalar]
 
 
 @intrinsic
 def full(typing_context, value):
     """A float32 or float64 in every lane; other numbers become float64."""
-    scalar = types.float32 if value == types.float32 else types.float64
-    kind = _VECTORS[scalar]
-
-    def emit(context, builder, sig, args):
-        undefined = ir.Constant(kind.llvm, ir.Undefined)
-        number = context.cast(builder, args[0], value, scalar)
-        one = builder.insert_element(undefined, number, ir.Constant(_I32, 0))
-        return builder.shuffle_vector(one, undefined, _indices([0] * kind.count))
-
-    return kind(value), emit
+    kind = floats if value == types.float32 else doubles
+    return kind(kind), lambda context, builder, sig, args: args[0]
 
 
 @intrinsic
@@ -125,74 +148,23 @@ def lane_rows(typing_context):
     return floats(), lambda context, builder, sig, args: ir.Constant(floats.llvm, values)
 
 
-def _pointer(context, builder, array_type, array, index, index_type):
-    """Address of element ``index`` of a contiguous array as one of a vector, and its alignment.
-
-    Vectors of floats are read and written where a cache line begins, vectors of doubles anywhere.
-    """
-    kind = _VECTORS[array_type.dtype]
-    data = context.make_array(array_type)(context, builder, array).data
-    position = context.cast(builder, index, index_type, types.intp)
-    address = builder.bitcast(builder.gep(data, [position]), kind.llvm.as_pointer())
-    return address, 64 if kind is floats else 8
-
-
-@intrinsic
-def load(typing_context, array, index):
-    """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
-
-    def emit(context, builder, sig, args):
-        address, align = _pointer(context, builder, array, *args, index)
-        return builder.load(address, align=align)
-
-    return _VECTORS[array.dtype](array, index), emit
-
-
-@intrinsic
-def store(typing_context, array, index, value):
-    """Write a vector to ``array[index]`` and after; alignment as for ``load``."""
-
-    def emit(context, builder, sig, args):
-        address, align = _pointer(context, builder, array, *args[:2], index)
-        builder.store(args[2], address, align=align)
-        return context.get_dummy_value()
-
-    return types.void(array, index, value), emit
-
-
-@intrinsic
-def prefetch(typing_context, array, index):
-    """Ask for the cache line of element ``index`` of a contiguous array, counted in its flat order."""
-
-    def emit(context, builder, sig, args):
-        data = context.make_array(array)(context, builder, args[0]).data
-        position = context.cast(builder, args[1], index, types.intp)
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), _I32, _I32, _I32])
-        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        address = builder.bitcast(builder.gep(data, [position]), ir.IntType(8).as_pointer())
-        # For reading, into all levels, as data.
-        builder.call(callee, [address, ir.Constant(_I32, 0), ir.Constant(_I32, 3), ir.Constant(_I32, 1)])
-        return context.get_dummy_value()
-
-    return types.void(array, index), emit
-
-
 @intrinsic
 def fma(typing_context, a, b, c):
     """``a * b + c``, fused where the machine can."""
-    return a(a, a, a), lambda context, builder, sig, args: _call(builder, "fmuladd", a, *args)
+    kind = _common(a, b, c)
+    return kind(kind, kind, kind), lambda context, builder, sig, args: call(builder, "fmuladd", kind, *args)
 
 
 @intrinsic
 def root(typing_context, a):
     """Square root, lane by lane; NaN of negative numbers."""
-    return a(a), lambda context, builder, sig, args: _call(builder, "sqrt", a, *args)
+    return a(a), lambda context, builder, sig, args: call(builder, "sqrt", a, *args)
 
 
 @intrinsic
 def floor(typing_context, a):
     """The largest whole number that is not larger, lane by lane."""
-    return a(a), lambda context, builder, sig, args: _call(builder, "floor", a, *args)
+    return a(a), lambda context, builder, sig, args: call(builder, "floor", a, *args)
 
 
 @intrinsic
@@ -202,7 +174,8 @@ def minimum(typing_context, a, b):
     def emit(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered("<", *args), *args)
 
-    return a(a, a), emit
+    kind = _common(a, b)
+    return kind(kind, kind), emit
 
 
 @intrinsic
@@ -212,13 +185,15 @@ def maximum(typing_context, a, b):
     def emit(context, builder, sig, args):
         return builder.select(builder.fcmp_ordered(">", *args), *args)
 
-    return a(a, a), emit
+    kind = _common(a, b)
+    return kind(kind, kind), emit
 
 
 @intrinsic
 def select(typing_context, where, a, b):
     """``a`` in the lanes of the mask, ``b`` in the others."""
-    return a(where, a, a), lambda context, builder, sig, args: builder.select(*args)
+    kind = _common(a, b)
+    return kind(where, kind, kind), lambda context, builder, sig, args: builder.select(*args)
 
 
 @intrinsic
@@ -226,9 +201,19 @@ def bits(typing_context, where):
     """The mask as an integer, lane 0 in bit 0."""
 
     def emit(context, builder, sig, args):
-        return builder.zext(builder.bitcast(args[0], ir.IntType(where.count)), _I64)
+        return builder.zext(builder.bitcast(args[0], ir.IntType(where.count)), I64)
 
     return types.int64(where), emit
+
+
+@intrinsic
+def mask(typing_context, bits):
+    """The mask of eight lanes whose bits are given, lane 0 in bit 0."""
+
+    def emit(context, builder, sig, args):
+        return builder.bitcast(builder.trunc(args[0], ir.IntType(DOUBLES)), mask8.llvm)
+
+    return mask8(types.int64), emit
 
 
 @intrinsic
@@ -250,88 +235,44 @@ def exp2_minus(typing_context, x):
     """``2^-x`` of floats for ``0 <= x <= 126``, within 2 ulp."""
 
     def emit(context, builder, sig, args):
-        whole = _call(builder, "rint", floats, args[0])
+        whole = call(builder, "rint", floats, args[0])
         part = builder.fsub(whole, args[0])
-        result = _constant(floats, _EXP2[-1])
+        result = constant(floats, _EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
-            result = _call(builder, "fmuladd", floats, result, part, _constant(floats, coefficient))
-        integers = ir.VectorType(_I32, LANES)
-        shift = builder.shl(builder.fptosi(whole, integers), _indices([23] * LANES))
+            result = call(builder, "fmuladd", floats, result, part, constant(floats, coefficient))
+        integers = ir.VectorType(I32, LANES)
+        shift = builder.shl(builder.fptosi(whole, integers), indices([23] * LANES))
         return builder.bitcast(builder.sub(builder.bitcast(result, integers), shift), floats.llvm)
 
     return floats(floats), emit
 
 
-def _fold(builder, first, second, width):
-    """Add the two halves of every group of ``width`` lanes of two vectors into one vector."""
-    low = [i for i in range(2 * LANES) if i % width < width // 2]
-    high = [i + width // 2 for i in low]
-    return builder.fadd(
-        builder.shuffle_vector(first, second, _indices(low)),
-        builder.shuffle_vector(first, second, _indices(high)),
-    )
+# log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2, sqrt 2).
+_LOG2 = [2 / math.log(2) / k for k in range(1, 19, 2)]
+# Subtracted from the bits of x, so that the mantissa that is left lies in [1/sqrt 2, sqrt 2).
+_ROOT_HALF = int(np.float64(math.sqrt(0.5)).view(np.int64))
 
 
 @intrinsic
-def row_sums(typing_context, array, index, count):
-    """Sums of the 16 rows of 16 floats from ``index`` on: row ``k``'s in lane ``k``, by a fixed tree.
-
-    Where ``count`` is a tuple, rows from ``COLOR + len(count)`` on are taken for zero.
-    """
-    used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
+def log2(typing_context, x):
+    """Binary logarithm of positive, normal doubles, within 1e-13; of others anything."""
 
     def emit(context, builder, sig, args):
-        rows = []
-        for k in range(min(used, LANES)):
-            position = builder.add(args[1], ir.Constant(args[1].type, k * LANES))
-            address, align = _pointer(context, builder, array, args[0], position, index)
-            rows.append(builder.load(address, align=align))
-        rows += [_constant(floats, 0.0)] * (LANES - len(rows))
-        width = LANES
-        while len(rows) > 1:
-            rows = [_fold(builder, a, b, width) for a, b in zip(rows[::2], rows[1::2], strict=True)]
-            width //= 2
-        return rows[0]
+        integers = ir.VectorType(I64, DOUBLES)
+        number = builder.bitcast(args[0], integers)
+        shift = ir.Constant(integers, [52] * DOUBLES)
+        offset = builder.sub(number, ir.Constant(integers, [_ROOT_HALF] * DOUBLES))
+        exponent = builder.ashr(offset, shift)
+        mantissa = builder.bitcast(builder.sub(number, builder.shl(exponent, shift)), doubles.llvm)
+        one = constant(doubles, 1.0)
+        s = builder.fdiv(builder.fsub(mantissa, one), builder.fadd(mantissa, one))
+        squared = builder.fmul(s, s)
+        result = constant(doubles, _LOG2[-1])
+        for coefficient in _LOG2[-2::-1]:
+            result = call(builder, "fmuladd", doubles, result, squared, constant(doubles, coefficient))
+        return call(builder, "fmuladd", doubles, result, s, builder.sitofp(exponent, doubles.llvm))
 
-    return floats(array, index, count), emit
-
-
-def _block_rows(context, builder, array_type, array, index, stride, index_type):
-    """Addresses of the four rows of four floats of a block whose first pixel is ``array[index]``."""
-    data = context.make_array(array_type)(context, builder, array).data
-    position, step = (context.cast(builder, value, index_type, types.intp) for value in (index, stride))
-    kind = ir.VectorType(ir.FloatType(), 4).as_pointer()
-    addresses = []
-    for _ in range(4):
-        addresses.append(builder.bitcast(builder.gep(data, [position]), kind))
-        position = builder.add(position, step)
-    return addresses
-
-
-@intrinsic
-def load_block(typing_context, array, index, stride):
-    """The 4 x 4 pixels of a flat image that start at ``index``; its rows are ``stride`` floats apart."""
-
-    def emit(context, builder, sig, args):
-        rows = _block_rows(context, builder, array, *args, index)
-        a, b, c, d = (builder.load(row, align=4) for row in rows)
-        upper, lower = (builder.shuffle_vector(x, y, _indices(range(8))) for x, y in ((a, b), (c, d)))
-        return builder.shuffle_vector(upper, lower, _indices(range(16)))
-
-    return floats(array, index, index), emit
-
-
-@intrinsic
-def store_block(typing_context, array, index, stride, value):
-    """Write a vector to 4 x 4 pixels of a flat image."""
-
-    def emit(context, builder, sig, args):
-        for k, row in enumerate(_block_rows(context, builder, array, *args[:3], index)):
-            part = builder.shuffle_vector(args[3], args[3], _indices(range(4 * k, 4 * k + 4)))
-            builder.store(part, row, align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, index, index, value), emit
+    return doubles(doubles), emit
 
 
 def length(values):

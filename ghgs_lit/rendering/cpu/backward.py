@@ -1,0 +1,148 @@
+"""Gradients of pixels to those of splats, one tile at a time.
+
+The backward pass replays the forward pass front to back: with ``v_i`` the gradient's product with splat
+``i``'s colour, depth and one, and ``S`` the sum of ``w_j v_j`` over the splats behind, ``dL/d alpha_i =
+T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the pixel's own total and shrinks: one number a pixel.
+"""
+
+import numpy as np
+
+from ghgs_lit.rendering.cpu import layout, memory, simd, tiles
+from ghgs_lit.rendering.cpu.compile import helper, kernel
+from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ONE, ZERO
+
+# Entries between asking for a splat and reading it.
+_AHEAD = 8
+
+
+@helper
+def _read(image, first, width, rows, columns, block):
+    """One block of a tile whose first pixel is ``image[first]``; zero beyond ``rows`` x ``columns``."""
+    y, x = block // 4 * 4, block % 4 * 4
+    if y + 4 <= rows and x + 4 <= columns:
+        return memory.load_block(image, first + y * width + x, width)
+    edge = np.zeros(LANES, np.float32)
+    for i in range(y, min(y + 4, rows)):
+        for j in range(x, min(x + 4, columns)):
+            edge[(i - y) * 4 + j - x] = image[first + i * width + j]
+    return memory.load_block(edge, 0, 4)
+
+
+@helper
+def _read_gradients(
+    view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha, d_depth,
+    upstream, suffix,
+):  # fmt: skip
+    """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
+
+    Gradients of alpha and depth may be absent (of size 0). With depth = D / A, ``dL/dD = g / A`` and
+    ``dL/dA = -g depth / A``; so D's and A's shares of ``S`` cancel.
+    """
+    channels, start = simd.length(count), view * height * width + first
+    for block in range(BLOCKS):
+        at = block * LANES
+        total, d_sum, d_total = simd.full(ZERO), simd.full(ZERO), simd.full(ZERO)
+        for c in range(channels):
+            plane = (view * channels + c) * height * width + first
+            slope = _read(d_image, plane, width, rows, columns, block)
+            total = simd.fma(slope, _read(image, plane, width, rows, columns, block), total)
+            memory.store(upstream, c * layout.PIXELS + at, slope)
+        seen = _read(alpha, start, width, rows, columns, block)
+        if len(d_alpha) > 0:
+            d_total = _read(d_alpha, start, width, rows, columns, block)
+            total = simd.fma(d_total, seen, total)
+        if len(d_depth) > 0:
+            slope = _read(d_depth, start, width, rows, columns, block)
+            d_sum = slope / simd.maximum(seen, LEAST_ALPHA)
+            product = slope * _read(depth, start, width, rows, columns, block)
+            free = seen > LEAST_ALPHA
+            d_total = simd.select(free, d_total - product / seen, d_total)
+            total = simd.select(free, total, total + product)
+        memory.store(upstream, channels * layout.PIXELS + at, d_sum)
+        memory.store(upstream, (channels + 1) * layout.PIXELS + at, d_total)
+        memory.store(suffix, at, total)
+
+
+@helper
+def _differentiate_splat(
+    records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
+):
+    """Sum one splat's gradients over a tile into the rows of ``sums``."""
+    channels, zero = simd.length(count), simd.full(ZERO)
+    numbers, depth = tiles.splat(records[s], np.float32(x0), np.float32(y0)), records[s, layout.DEPTH]
+    h, h_p, h_q, h_pp, h_pq, h_qq, d_depth = zero, zero, zero, zero, zero, zero, zero
+    for c in range(channels):
+        memory.store(sums, (layout.COLOR + c) * LANES, zero)
+    while hit != 0:
+        block = simd.trailing_zeros(hit)
+        hit &= hit - 1
+        at = block * LANES
+        dx = numbers[0] + memory.load(pixels, at)
+        dy = numbers[1] + memory.load(pixels, layout.PIXELS + at)
+        p, q = tiles.whiten(numbers, dx, dy)
+        before = memory.load(transmittance, at)
+        raw, alpha, _, seen, _, left = tiles.blend(numbers, p, q, before, alpha_max, stop)
+        memory.store(transmittance, at, left)
+        weight = simd.select(seen, before * alpha, ZERO)
+        d_sum = memory.load(upstream, channels * layout.PIXELS + at)
+        value = simd.fma(d_sum, depth, memory.load(upstream, (channels + 1) * layout.PIXELS + at))
+        d_depth = simd.fma(weight, d_sum, d_depth)
+        for c in range(channels):
+            slope = memory.load(upstream, c * layout.PIXELS + at)
+            value = simd.fma(slope, tiles.color(records, s, colors, n, c, count), value)
+            row = (layout.COLOR + c) * LANES
+            memory.store(sums, row, simd.fma(weight, slope, memory.load(sums, row)))
+        rest = memory.load(suffix, at) - simd.select(seen, weight * value, ZERO)
+        memory.store(suffix, at, rest)
+        # dL / d ln(alpha), where alpha is not clamped.
+        slope = alpha * (before * value - rest / (ONE - alpha))
+        slope = simd.select(seen & (raw < alpha_max), slope, ZERO)
+        s_p, s_q = slope * p, slope * q
+        h, h_p, h_q = h + slope, h_p + s_p, h_q + s_q
+        h_pp, h_pq, h_qq = simd.fma(s_p, p, h_pp), simd.fma(s_p, q, h_pq), simd.fma(s_q, q, h_qq)
+    memory.store(sums, layout.H * LANES, h)
+    memory.store(sums, layout.H_P * LANES, h_p)
+    memory.store(sums, layout.H_Q * LANES, h_q)
+    memory.store(sums, layout.H_PP * LANES, h_pp)
+    memory.store(sums, layout.H_PQ * LANES, h_pq)
+    memory.store(sums, layout.H_QQ * LANES, h_qq)
+    memory.store(sums, layout.D_DEPTH * LANES, d_depth)
+
+
+@kernel
+def backward(
+    some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
+    alpha_max, stop, drawn, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
+):  # fmt: skip
+    """Gradients of the drawn entries of the given tiles into ``gradients`` [slots x gradient_width].
+
+    ``gradients`` is flat and starts on a cache line; images and their gradients are flat as in
+    ``forward``.
+    """
+    channels = simd.length(count)
+    transmittance, suffix = simd.aligned(layout.PIXELS), simd.aligned(layout.PIXELS)
+    upstream = simd.aligned((channels + 2) * layout.PIXELS)
+    stride = (layout.COLOR + channels + LANES - 1) // LANES * LANES
+    sums, pixels = simd.aligned(stride * LANES), tiles.grid()
+    sums[:] = ZERO
+    for tile in some_tiles:
+        view, x0, y0, rows, columns, first = tiles.place(tile, tiles_x, tiles_y, height, width)
+        _read_gradients(
+            view, first, height, width, rows, columns, count, image, alpha, depth, d_image, d_alpha,
+            d_depth, upstream, suffix,
+        )  # fmt: skip
+        tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
+        start, end = tile_starts[tile], tile_starts[tile] + drawn[tile]
+        for entry in range(start, end):
+            later = min(entry + _AHEAD, end - 1)
+            s = entries[later, layout.SPLAT]
+            tiles.prefetch(records, s, colors, s - shifts[view])
+            memory.prefetch(gradients, entries[later, layout.SLOT] * stride)
+            s, hit = entries[entry, layout.SPLAT], np.int64(entries[entry, layout.BLOCKS])
+            _differentiate_splat(
+                records, s, colors, s - shifts[view], count, x0, y0, hit, pixels, transmittance, upstream,
+                suffix, sums, alpha_max, stop,
+            )  # fmt: skip
+            slot = entries[entry, layout.SLOT] * stride
+            for k in range(0, stride, LANES):
+                memory.store(gradients, slot + k, memory.row_sums(sums, k * LANES, count))

@@ -1,0 +1,196 @@
+"""Splats to pixels, one tile at a time, front to back."""
+
+import numpy as np
+
+from ghgs_lit.rendering.cpu import binning, layout, memory, simd, tiles
+from ghgs_lit.rendering.cpu.compile import helper, kernel
+from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ZERO
+
+# Entries that are drawn block after block before the next are looked at: as many as an integer has bits.
+_CHUNK = 64
+# Where depth and colours lie in a gathered row, after the numbers of ``tiles.splat``.
+_DEPTH, _COLOR = 7, 8
+
+
+@helper
+def _touches(numbers, slope_x, slope_y, block):
+    """Which of 16 splats have an ellipse that meets a block, as bits.
+
+    A convex function that is least at the centre is least over a box either where the box's column
+    nearest to the centre crosses the valley along it, or the same for rows. Compared with a hair more
+    than the cutoff, since it only saves work.
+    """
+    side = np.float32(layout.BLOCK - 1)
+    left, top = numbers[0] + np.float32(block % 4 * 4), numbers[1] + np.float32(block // 4 * 4)
+    right, bottom = left + side, top + side
+    near_x = simd.minimum(simd.maximum(left, ZERO), right)
+    near_y = simd.minimum(simd.maximum(top, ZERO), bottom)
+    along_x = simd.minimum(simd.maximum(left, near_y * slope_x), right)
+    along_y = simd.minimum(simd.maximum(top, near_x * slope_y), bottom)
+    p, q = tiles.whiten(numbers, near_x, along_y)
+    u, v = tiles.whiten(numbers, along_x, near_y)
+    least = simd.minimum(simd.fma(p, p, q * q), simd.fma(u, u, v * v))
+    return simd.bits(least <= numbers[6] * np.float32(1.001) + np.float32(0.001))
+
+
+@helper
+def _fetch(order, i, entries, shift, records, colors, splats):
+    """The splats of a chunk, the last repeated to whole vectors; asks for the records of the next chunk."""
+    for k in range(_CHUNK):
+        splats[k] = entries[order[min(i + k, len(order) - 1)] & 0xFFFFFFFF, layout.SPLAT]
+        if i + k + _CHUNK < len(order):
+            later = entries[order[i + k + _CHUNK] & 0xFFFFFFFF, layout.SPLAT]
+            tiles.prefetch(records, later, colors, later - shift)
+
+
+@helper
+def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo):
+    """Gather the numbers of ``count`` splats into ``rows``; list for each block those that touch it, as bits.
+
+    ``rows`` holds a run of ``_CHUNK`` for each number of ``tiles.splat``, the depth, and each channel.
+    """
+    todo[:] = 0
+    for i in range(0, count, LANES):
+        record = memory.gather_lines(records, splats, i)
+        numbers = tiles.splat(record, np.float32(x0), np.float32(y0))
+        memory.store(rows, i, numbers[0])
+        memory.store(rows, _CHUNK + i, numbers[1])
+        memory.store(rows, 2 * _CHUNK + i, numbers[2])
+        memory.store(rows, 3 * _CHUNK + i, numbers[3])
+        memory.store(rows, 4 * _CHUNK + i, numbers[4])
+        memory.store(rows, 5 * _CHUNK + i, numbers[5])
+        memory.store(rows, 6 * _CHUNK + i, numbers[6])
+        memory.store(rows, _DEPTH * _CHUNK + i, record[layout.DEPTH])
+        here = (1 << min(LANES, count - i)) - 1
+        blocks = live
+        while blocks != 0:
+            block = simd.trailing_zeros(blocks)
+            blocks &= blocks - 1
+            touching = _touches(numbers, record[layout.SLOPE_X], record[layout.SLOPE_Y], block)
+            todo[block] |= (touching & here) << i
+        for c in range(min(colors.shape[1], layout.ROOM)):
+            memory.store(rows, (_COLOR + c) * _CHUNK + i, record[layout.COLORS + c])
+    if colors.shape[1] > layout.ROOM:
+        for i in range(count):
+            for c in range(colors.shape[1]):
+                rows[(_COLOR + c) * _CHUNK + i] = colors[splats[i] - shift, c]
+
+
+@helper
+def _add(planes, position, value):
+    memory.store(planes, position, memory.load(planes, position) + value)
+
+
+@helper
+def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
+    """Blend the splats ``todo`` (as bits) into one block, front to back; returns whether it stays open."""
+    at, bit = block * LANES, np.int32(1) << block
+    x, y, before = (
+        memory.load(pixels, at),
+        memory.load(pixels, layout.PIXELS + at),
+        memory.load(transmittance, at),
+    )
+    while todo != 0:
+        i = simd.trailing_zeros(todo)
+        todo &= todo - 1
+        numbers = (
+            rows[i], rows[_CHUNK + i], rows[2 * _CHUNK + i], rows[3 * _CHUNK + i], rows[4 * _CHUNK + i],
+            rows[5 * _CHUNK + i], rows[6 * _CHUNK + i],
+        )  # fmt: skip
+        p, q = tiles.whiten(numbers, x + numbers[0], y + numbers[1])
+        _, alpha, reached, seen, is_open, behind = tiles.blend(numbers, p, q, before, alpha_max, stop)
+        if simd.bits(reached & (before > ZERO)) != 0:
+            hits[i] |= bit
+        weight = simd.select(seen, before * alpha, ZERO)
+        for c in range(simd.length(count)):
+            # Where the splat is not seen, a colour that is not finite must not be multiplied by zero.
+            color = simd.select(seen, weight * rows[(_COLOR + c) * _CHUNK + i], ZERO)
+            _add(planes, c * layout.PIXELS + at, color)
+        _add(planes, simd.length(count) * layout.PIXELS + at, weight * rows[_DEPTH * _CHUNK + i])
+        _add(planes, (simd.length(count) + 1) * layout.PIXELS + at, weight)
+        before = behind
+        if simd.bits(is_open) == 0:
+            break
+    memory.store(transmittance, at, before)
+    return simd.bits(before > ZERO) != 0
+
+
+@helper
+def _write(image, first, width, rows, columns, block, value):
+    """Write one block of a tile whose first pixel is ``image[first]``, cut at ``rows`` x ``columns``."""
+    y, x = block // 4 * 4, block % 4 * 4
+    if y + 4 <= rows and x + 4 <= columns:
+        memory.store_block(image, first + y * width + x, width, value)
+        return
+    edge = np.empty(LANES, np.float32)
+    memory.store_block(edge, 0, 4, value)
+    for i in range(y, min(y + 4, rows)):
+        for j in range(x, min(x + 4, columns)):
+            image[first + i * width + j] = edge[(i - y) * 4 + j - x]
+
+
+@helper
+def _write_planes(planes, view, first, height, width, rows, columns, channels, image, alpha, depth):
+    for block in range(BLOCKS):
+        at = block * LANES
+        for c in range(channels):
+            start = (view * channels + c) * height * width + first
+            _write(image, start, width, rows, columns, block, memory.load(planes, c * layout.PIXELS + at))
+        total = memory.load(planes, (channels + 1) * layout.PIXELS + at)
+        start = view * height * width + first
+        _write(alpha, start, width, rows, columns, block, total)
+        expected = memory.load(planes, channels * layout.PIXELS + at) / simd.maximum(total, LEAST_ALPHA)
+        _write(depth, start, width, rows, columns, block, expected)
+
+
+@kernel
+def forward(
+    some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
+    alpha_max, stop, drawn, reached, image, alpha, depth,
+):  # fmt: skip
+    """Draw the given tiles into flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
+
+    Leaves in ``entries`` what the backward pass needs, see ``layout``: ``drawn`` [tiles] of each tile's
+    entries, whose slots are marked in ``reached``. ``count`` is the number of channels, or a tuple of
+    that length, for which the kernel is then compiled.
+    """
+    channels, longest = simd.length(count), 1
+    for tile in some_tiles:
+        longest = max(longest, tile_starts[tile + 1] - tile_starts[tile])
+    keys, spare, places = np.empty(longest, np.int64), np.empty(longest, np.int64), np.empty(256, np.int64)
+    kept, rows = np.empty((longest, 3), np.int32), simd.aligned((_COLOR + channels) * _CHUNK)
+    splats = np.empty(_CHUNK, np.int64)
+    todo, hits = np.empty(BLOCKS, np.int64), np.empty(_CHUNK, np.int32)
+    transmittance, planes = simd.aligned(layout.PIXELS), simd.aligned((channels + 2) * layout.PIXELS)
+    pixels = tiles.grid()
+    for tile in some_tiles:
+        view, x0, y0, height_here, width_here, first = tiles.place(tile, tiles_x, tiles_y, height, width)
+        planes[:] = ZERO
+        live = tiles.open_pixels(views[view], x0, y0, pixels, transmittance)
+        start, found, shift = tile_starts[tile], 0, shifts[view]
+        order = binning.depth_order(entries, start, tile_starts[tile + 1], keys, spare, places)
+        for i in range(0, len(order), _CHUNK):
+            chunk = min(_CHUNK, len(order) - i)
+            _fetch(order, i, entries, shift, records, colors, splats)
+            _list_chunk(splats, chunk, shift, records, colors, x0, y0, live, rows, todo)
+            hits[:] = 0
+            for block in range(BLOCKS):
+                if todo[block] != 0 and not _draw_block(
+                    block, todo[block], rows, count, pixels, planes, transmittance, alpha_max, stop, hits
+                ):
+                    live &= ~(1 << block)
+            for k in range(chunk):
+                if hits[k] != 0:
+                    kept[found, 0], kept[found, 1] = hits[k], splats[k]
+                    kept[found, 2] = entries[order[i + k] & 0xFFFFFFFF, layout.SLOT]
+                    reached[kept[found, 2]] = 1
+                    found += 1
+            if live == 0:
+                break
+        for i in range(found):
+            for k in range(3):
+                entries[start + i, k] = kept[i, k]
+        drawn[tile] = found
+        _write_planes(
+            planes, view, first, height, width, height_here, width_here, channels, image, alpha, depth
+        )

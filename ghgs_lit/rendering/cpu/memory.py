@@ -1,0 +1,319 @@
+"""Vectors from memory and to it: whole, by 4 x 4 blocks of an image, by columns of a table, transposed."""
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from ghgs_lit.rendering.cpu import layout
+from ghgs_lit.rendering.cpu.simd import (
+    DOUBLES,
+    I32,
+    I64,
+    LANES,
+    constant,
+    doubles,
+    floats,
+    indices,
+    vector_of,
+)
+
+_FLOAT8, _INT8 = ir.VectorType(ir.FloatType(), DOUBLES), ir.VectorType(I32, DOUBLES)
+
+
+def _address(context, builder, array_type, array, index, index_type, kind):
+    """Address of element ``index`` of a contiguous array, counted in its flat order, as one of a vector."""
+    data = context.make_array(array_type)(context, builder, array).data
+    position = context.cast(builder, index, index_type, types.intp)
+    return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())
+
+
+def _alignment(kind) -> int:
+    """Vectors of floats are read and written where a cache line begins, vectors of doubles anywhere."""
+    return 64 if kind is floats else 8
+
+
+@intrinsic
+def load(typing_context, array, index):
+    """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
+    kind = vector_of(array.dtype)
+
+    def emit(context, builder, sig, args):
+        address = _address(context, builder, array, *args, index, kind.llvm)
+        return builder.load(address, align=_alignment(kind))
+
+    return kind(array, index), emit
+
+
+@intrinsic
+def store(typing_context, array, index, value):
+    """Write a vector to ``array[index]`` and after; alignment as for ``load``."""
+    kind = vector_of(array.dtype)
+
+    def emit(context, builder, sig, args):
+        address = _address(context, builder, array, *args[:2], index, kind.llvm)
+        builder.store(args[2], address, align=_alignment(kind))
+        return context.get_dummy_value()
+
+    return types.void(array, index, kind), emit
+
+
+@intrinsic
+def prefetch(typing_context, array, index):
+    """Ask for the cache line of element ``index`` of a contiguous array, counted in its flat order."""
+
+    def emit(context, builder, sig, args):
+        byte = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
+        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        address = _address(context, builder, array, *args, index, ir.IntType(8))
+        # For reading, into all levels, as data.
+        builder.call(callee, [address, ir.Constant(I32, 0), ir.Constant(I32, 3), ir.Constant(I32, 1)])
+        return context.get_dummy_value()
+
+    return types.void(array, index), emit
+
+
+def _block_rows(context, builder, array_type, array, index, stride, index_type):
+    """Addresses of the four rows of four floats of a block whose first pixel is ``array[index]``."""
+    data = context.make_array(array_type)(context, builder, array).data
+    position, step = (context.cast(builder, value, index_type, types.intp) for value in (index, stride))
+    kind = ir.VectorType(ir.FloatType(), 4).as_pointer()
+    addresses = []
+    for _ in range(4):
+        addresses.append(builder.bitcast(builder.gep(data, [position]), kind))
+        position = builder.add(position, step)
+    return addresses
+
+
+@intrinsic
+def load_block(typing_context, array, index, stride):
+    """The 4 x 4 pixels of a flat image that start at ``index``; its rows are ``stride`` floats apart."""
+
+    def emit(context, builder, sig, args):
+        rows = _block_rows(context, builder, array, *args, index)
+        a, b, c, d = (builder.load(row, align=4) for row in rows)
+        upper, lower = (builder.shuffle_vector(x, y, indices(range(8))) for x, y in ((a, b), (c, d)))
+        return builder.shuffle_vector(upper, lower, indices(range(16)))
+
+    return floats(array, index, index), emit
+
+
+@intrinsic
+def store_block(typing_context, array, index, stride, value):
+    """Write a vector to 4 x 4 pixels of a flat image."""
+
+    def emit(context, builder, sig, args):
+        for k, row in enumerate(_block_rows(context, builder, array, *args[:3], index)):
+            part = builder.shuffle_vector(args[3], args[3], indices(range(4 * k, 4 * k + 4)))
+            builder.store(part, row, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, index, index, floats), emit
+
+
+def _fold(builder, first, second, width):
+    """Add the two halves of every group of ``width`` lanes of two vectors into one vector."""
+    low = [i for i in range(2 * LANES) if i % width < width // 2]
+    high = [i + width // 2 for i in low]
+    return builder.fadd(
+        builder.shuffle_vector(first, second, indices(low)),
+        builder.shuffle_vector(first, second, indices(high)),
+    )
+
+
+@intrinsic
+def row_sums(typing_context, array, index, count):
+    """Sums of the 16 rows of 16 floats from ``index`` on: row ``k``'s in lane ``k``, by a fixed tree.
+
+    Where ``count`` is a tuple, rows from ``COLOR + len(count)`` on are taken for zero.
+    """
+    used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
+
+    def emit(context, builder, sig, args):
+        rows = []
+        for k in range(min(used, LANES)):
+            position = builder.add(args[1], ir.Constant(args[1].type, k * LANES))
+            address = _address(context, builder, array, args[0], position, index, floats.llvm)
+            rows.append(builder.load(address, align=64))
+        rows += [constant(floats, 0.0)] * (LANES - len(rows))
+        width = LANES
+        while len(rows) > 1:
+            rows = [_fold(builder, a, b, width) for a, b in zip(rows[::2], rows[1::2], strict=True)]
+            width //= 2
+        return rows[0]
+
+    return floats(array, index, count), emit
+
+
+def _flat_rows(context, builder, array_type, args, index_type, count, kind):
+    """Address of row ``index`` of a table with ``count`` columns."""
+    position = builder.mul(
+        context.cast(builder, args[1], index_type, types.intp), ir.Constant(args[1].type, count)
+    )
+    return _address(context, builder, array_type, args[0], position, types.intp, kind)
+
+
+def _masked(builder, name: str, kind, rows, count: int, *args):
+    """Read or write a vector of up to eight rows of ``count`` floats, the first ``rows`` of them only."""
+    wide, lanes = ir.VectorType(I64, kind.count), range(kind.count)
+    one = builder.insert_element(ir.Constant(wide, ir.Undefined), rows, ir.Constant(I32, 0))
+    limit = builder.shuffle_vector(one, one, indices([0 for _ in lanes]))
+    mask = builder.icmp_signed("<", ir.Constant(wide, [lane // count for lane in lanes]), limit)
+    values, align = [v for v in args if v.type == kind], ir.Constant(I32, 4)
+    (address,) = (v for v in args if v.type != kind)
+    operands = [*values, address, align, mask] + ([] if values else [ir.Constant(kind, [0.0] * kind.count)])
+    result = ir.VoidType() if values else kind
+    function = ir.FunctionType(result, [operand.type for operand in operands])
+    callee = cgutils.get_or_insert_function(
+        builder.module, function, f"llvm.masked.{name}.v{kind.count}f32.p0"
+    )
+    return builder.call(callee, operands)
+
+
+def _make_columns(count: int):
+    kind = ir.VectorType(ir.FloatType(), DOUBLES * count)
+
+    @intrinsic
+    def columns(typing_context, array, row, last):
+        """Rows ``row`` to ``row + 8`` of a float32 table as doubles: one vector for each of its columns.
+
+        Lanes from row ``last`` on are zero.
+        """
+
+        def emit(context, builder, sig, args):
+            address = _flat_rows(context, builder, array, args, row, count, kind)
+            lines = _masked(builder, "load", kind, builder.sub(args[2], args[1]), count, address)
+            values = []
+            for k in range(count):
+                column = builder.shuffle_vector(lines, lines, indices(range(k, DOUBLES * count, count)))
+                values.append(builder.fpext(column, doubles.llvm))
+            return context.make_tuple(builder, sig.return_type, values)
+
+        return types.UniTuple(doubles, count)(array, types.int64, types.int64), emit
+
+    @intrinsic
+    def store_columns(typing_context, array, row, last, values):
+        """Write one vector of doubles for each column to rows ``row`` to ``row + 8`` of a float32 table.
+
+        Rows from ``last`` on are left alone.
+        """
+
+        def emit(context, builder, sig, args):
+            columns = cgutils.unpack_tuple(builder, args[3], count)
+            lines = _interleave(builder, [builder.fptrunc(column, _FLOAT8) for column in columns])
+            address = _flat_rows(context, builder, array, args, row, count, kind)
+            _masked(builder, "store", kind, builder.sub(args[2], args[1]), count, lines, address)
+            return context.get_dummy_value()
+
+        return types.void(array, types.int64, types.int64, types.UniTuple(doubles, count)), emit
+
+    return columns, store_columns
+
+
+(columns1, store_columns1), (columns3, store_columns3), (columns4, store_columns4) = map(
+    _make_columns, (1, 3, 4)
+)
+
+
+def _interleave(builder, columns: list):
+    """One long vector of the first lanes of all (eight-lane) columns, then of their second lanes, ..."""
+    lines = columns[0]
+    for column in columns[1:]:
+        # A shuffle takes two vectors of one length.
+        lanes = range(lines.type.count)
+        padding = [DOUBLES] * (lines.type.count - DOUBLES)
+        column = builder.shuffle_vector(column, column, indices([*range(DOUBLES), *padding]))
+        lines = builder.shuffle_vector(
+            lines, column, indices([*lanes, *range(len(lanes), len(lanes) + DOUBLES)])
+        )
+    order = [k * DOUBLES + lane for lane in range(DOUBLES) for k in range(len(columns))]
+    return builder.shuffle_vector(lines, lines, indices(order))
+
+
+@intrinsic
+def store_boxes(typing_context, array, row, values):
+    """Write four vectors of whole doubles to rows ``row`` to ``row + 8`` of an int32 table."""
+
+    def emit(context, builder, sig, args):
+        columns = [builder.fptosi(c, _INT8) for c in cgutils.unpack_tuple(builder, args[2], 4)]
+        kind = ir.VectorType(I32, 4 * DOUBLES)
+        address = _flat_rows(context, builder, array, args, row, 4, kind)
+        builder.store(_interleave(builder, columns), address, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, row, types.UniTuple(doubles, 4)), emit
+
+
+def _transpose(builder, vectors: list):
+    """Transpose 16 vectors; of eight, transpose the two 8 x 8 matrices that their halves make."""
+    distance = len(vectors) // 2
+    while distance > 0:
+        low = [i if not i & distance else LANES + i - distance for i in range(LANES)]
+        high = [i + distance if not i & distance else LANES + i for i in range(LANES)]
+        for j in range(len(vectors)):
+            if not j & distance:
+                a, b = vectors[j], vectors[j + distance]
+                vectors[j] = builder.shuffle_vector(a, b, indices(low))
+                vectors[j + distance] = builder.shuffle_vector(a, b, indices(high))
+        distance //= 2
+    return vectors
+
+
+@intrinsic
+def gather_lines(typing_context, array, rows, index):
+    """The rows of 16 floats that ``rows[index]`` and the 15 numbers after it name: a vector a column."""
+
+    def emit(context, builder, sig, args):
+        lines = []
+        for k in range(LANES):
+            position = builder.add(args[2], ir.Constant(args[2].type, k))
+            place = _address(context, builder, rows, args[1], position, types.int64, I64)
+            line = builder.mul(builder.load(place), ir.Constant(I64, LANES))
+            address = _address(context, builder, array, args[0], line, types.int64, floats.llvm)
+            lines.append(builder.load(address, align=64))
+        return context.make_tuple(builder, sig.return_type, _transpose(builder, lines))
+
+    return types.UniTuple(floats, LANES)(array, rows, types.int64), emit
+
+
+@intrinsic
+def store_lines(typing_context, array, row, values):
+    """Write up to 16 vectors of doubles as the columns of rows ``row`` to ``row + 8`` of 16 floats each."""
+
+    def emit(context, builder, sig, args):
+        columns = [builder.fptrunc(c, _FLOAT8) for c in cgutils.unpack_tuple(builder, args[2], values.count)]
+        columns += [ir.Constant(_FLOAT8, [0.0] * DOUBLES)] * (LANES - len(columns))
+        halves = [
+            builder.shuffle_vector(columns[j], columns[j + DOUBLES], indices(range(LANES)))
+            for j in range(DOUBLES)
+        ]
+        kind = ir.ArrayType(floats.llvm, DOUBLES)
+        address = _flat_rows(context, builder, array, args, row, LANES, kind)
+        for j, line in enumerate(_transpose(builder, halves)):
+            builder.store(line, builder.gep(address, [ir.Constant(I32, 0), ir.Constant(I32, j)]), align=64)
+        return context.get_dummy_value()
+
+    return types.void(array, row, values), emit
+
+
+@intrinsic
+def load_lines(typing_context, array, row, stride):
+    """The first 16 floats of eight rows of ``stride`` floats, from ``row`` on: 16 vectors of doubles."""
+
+    def emit(context, builder, sig, args):
+        position = builder.mul(args[1], args[2])
+        lines = []
+        for _ in range(DOUBLES):
+            address = _address(context, builder, array, args[0], position, types.int64, floats.llvm)
+            lines.append(builder.load(address, align=64))
+            position = builder.add(position, args[2])
+        halves = _transpose(builder, lines)
+        values = []
+        for k in range(LANES):
+            first = k // DOUBLES * DOUBLES
+            half = halves[k % DOUBLES]
+            part = builder.shuffle_vector(half, half, indices(range(first, first + DOUBLES)))
+            values.append(builder.fpext(part, doubles.llvm))
+        return context.make_tuple(builder, sig.return_type, values)
+
+    return types.UniTuple(doubles, LANES)(array, types.int64, types.int64), emit

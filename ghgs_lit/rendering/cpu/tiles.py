@@ -1,0 +1,115 @@
+"""What drawing a tile and differentiating it share: its pixels, and one splat over a block of them.
+
+A tile is 16 x 16 pixels in 16 blocks of 4 x 4, one block a vector. Small splats are the rule (a splat
+for each input pixel), and a 4 x 4 block holds one better than a row of 16.
+
+The planes of a tile are its colour channels, then the sum of ``w z``, then the sum of ``w``.
+"""
+
+import numpy as np
+
+from ghgs_lit.rendering.cpu import layout, memory, simd
+from ghgs_lit.rendering.cpu.compile import helper
+
+LANES = simd.LANES
+BLOCKS = layout.PIXELS // LANES
+ZERO, ONE = np.float32(0), np.float32(1)
+# Gradients of the expected depth end where alpha does: its denominator is held at this.
+LEAST_ALPHA = np.float32(1e-10)
+
+
+@helper
+def grid():
+    """Columns, then rows, of a tile's pixels, block by block."""
+    pixels = simd.aligned(2 * layout.PIXELS)
+    for pixel in range(layout.PIXELS):
+        block, lane = pixel // LANES, pixel % LANES
+        pixels[pixel] = block % 4 * 4 + lane % 4
+        pixels[layout.PIXELS + pixel] = block // 4 * 4 + lane // 4
+    return pixels
+
+
+@helper
+def place(tile, tiles_x, tiles_y, height, width):
+    """View of a tile, its first column and row, the image's rows and columns in it, its first pixel."""
+    view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
+    y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
+    rows, columns = min(layout.TILE, height - y0), min(layout.TILE, width - x0)
+    return view, x0, y0, rows, columns, y0 * width + x0
+
+
+@helper
+def open_pixels(view, x0, y0, pixels, transmittance):
+    """Set T to 1 in the pixels of a tile that are wanted, else 0; returns their blocks."""
+    live = 0
+    left, right = (
+        simd.full(np.float32(view[layout.LEFT] - x0)),
+        simd.full(np.float32(view[layout.RIGHT] - x0)),
+    )
+    top, bottom = (
+        simd.full(np.float32(view[layout.TOP] - y0)),
+        simd.full(np.float32(view[layout.BOTTOM] - y0)),
+    )
+    for block in range(BLOCKS):
+        at = block * LANES
+        x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
+        within = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
+        memory.store(transmittance, at, simd.select(within, simd.full(ONE), ZERO))
+        if simd.bits(within) != 0:
+            live |= 1 << block
+    return live
+
+
+@helper
+def splat(record, x0, y0):
+    """The way from a splat's centre to the tile's first pixel, then ``K``, opacity and cutoff."""
+    return (
+        x0 - record[layout.COLUMN] + record[layout.REST_X],
+        y0 - record[layout.ROW] + record[layout.REST_Y],
+        record[layout.K_XX],
+        record[layout.K_YX],
+        record[layout.K_YY],
+        record[layout.OPACITY],
+        record[layout.CUTOFF],
+    )
+
+
+@helper
+def color(records, s, colors, n, c, count):
+    """Channel ``c`` of ``count`` of splat ``s``, which is Gaussian ``n``."""
+    if simd.length(count) <= layout.ROOM:
+        return records[s, layout.COLORS + c]
+    return colors[n, c]
+
+
+@helper
+def prefetch(records, s, colors, n):
+    """Ask for what drawing splat ``s``, Gaussian ``n``, needs: a tile's splats may lie anywhere in memory."""
+    memory.prefetch(records, s * layout.RECORD)
+    if colors.shape[1] > layout.ROOM:
+        memory.prefetch(colors, n * colors.shape[1])
+
+
+@helper
+def whiten(numbers, dx, dy):
+    """Whitened distances ``p``, ``q``."""
+    return numbers[2] * dx, simd.fma(numbers[3], dx, numbers[4] * dy)
+
+
+@helper
+def blend(numbers, p, q, before, alpha_max, stop):
+    """One splat over one block of pixels.
+
+    Returns the unclamped and the clamped alpha, the lanes that the splat reaches, those where it is
+    seen, those that stay open, and T behind it. Where T would fall to ``stop`` the splat is left out
+    and T becomes 0, which stops all that follow. Lanes are masked by zeros and stored whole: what was
+    written under a mask cannot be forwarded to the next splat's load.
+    """
+    squared = simd.fma(p, p, q * q)
+    reached = squared <= numbers[6]
+    # Lanes out of reach are held at the cutoff: denormals there would be slow.
+    raw = numbers[5] * simd.exp2_minus(simd.minimum(squared, numbers[6]))
+    alpha = simd.select(reached, simd.minimum(raw, alpha_max), ZERO)
+    behind = before - before * alpha
+    is_open = behind > stop
+    return raw, alpha, reached, reached & is_open, is_open, simd.select(is_open, behind, ZERO)
