@@ -231,7 +231,7 @@ def test_sound_data_is_clean(folder, tmp_path, capsys):
     assert [len(phase.seen) for phase in report.phases.values()] == [8, 8]
     assert min(min(phase.overlaps("iou")) for phase in report.phases.values()) > 0.7
     show(report)
-    assert "train" in capsys.readouterr().out
+    assert "2 scans or other sources were read." in capsys.readouterr().out
     written = write(report, tmp_path / "report")
     content = json.loads((written / "check.json").read_text())
     assert content["problems"] == []

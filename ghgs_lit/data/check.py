@@ -62,6 +62,7 @@ class Report:
     phases: dict[str, Phase] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    inspections: int = 0
 
 
 class _Photographs(Dataset):
@@ -130,6 +131,7 @@ def inspect(data: PhotographsDataModule, least_iou: float = 0.5) -> Report:
         data.targets = CAMERAS
     data.cache_images_mb = min(data.cache_images_mb, 4)  # a body is read once for all its photographs
     inspections = data.inspections()
+    report.inspections = len(inspections)
     if inspections:
         found = _read_all(_Inspections(inspections), data.workers, "checking files")
         report.problems += [line for line in found if line is not None]
@@ -222,7 +224,10 @@ def show(report: Report) -> None:
         broken = sum(seen.problem is not None for seen in phase.seen)
         counts = (phase.people, phase.subjects, len(phase.seen), broken, phase.bodies)
         table.add_row(name, *map(str, counts), *numbers)
-    rich.print(table)
+    if report.phases:
+        rich.print(table)
+    if report.inspections:
+        rich.print(f"{report.inspections} scans or other sources were read.")
     for title, lines in (("problem", report.problems), ("note", report.notes)):
         if lines:
             table = Table(title, "expected", "found")
@@ -247,6 +252,7 @@ def write(report: Report, folder: Path) -> Path:
     content = {
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],
         "notes": report.notes,
+        "inspections": report.inspections,
         "phases": {name: _plain(phase) for name, phase in report.phases.items()},
     }
     folder.mkdir(parents=True, exist_ok=True)
