@@ -7,6 +7,7 @@ from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
+from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.baselines import BASELINES, baseline
 from ghgs_lit.experiments.evaluation import Method, ModelMethod
@@ -44,6 +45,10 @@ def run(cfg: DictConfig) -> None:
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     methods, facts = _methods(config, device)
+    cache = attach_cache(methods["model"].model, config["feature_cache"]) if "model" in methods else None
     data = build_data(config)
     data.prepare_data()
-    announce(measure_and_write(methods, data, config, directory, device, verb="evaluate", **facts))
+    path = measure_and_write(methods, data, config, directory, device, verb="evaluate", **facts)
+    if cache is not None:
+        print(cache.report(), flush=True)
+    announce(path)

@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir, plain, write_config
 from ghgs_lit.config import build
+from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.evaluation import ModelMethod
 from ghgs_lit.experiments.results import read_results
@@ -93,6 +94,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
     L.seed_everything(config["seed"], workers=True, verbose=False)
     data = build_data(config)
     model = GHGS.from_config(config)
+    attach_cache(model, config.get("feature_cache"))
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
+from ghgs_lit.encoder.cache import FeatureCache
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
@@ -54,6 +55,19 @@ class VGGTEncoder(nn.Module):
         checkpointing: bool = False,
     ):
         super().__init__()
+        #: Set it to keep the tokens of photographs on disk.
+        self.cache: FeatureCache | None = None
+        self.options = {
+            "width": width,
+            "heads": heads,
+            "depth": depth,
+            "vit": dict(vit),
+            "layers": list(layers),
+            "patch_size": patch_size,
+            "registers": registers,
+            "mask_input": mask_input,
+            "interval_input": interval_input,
+        }
         self.patch_size, self.mask_input, self.interval_input = patch_size, mask_input, interval_input
         self.dim_latent, self.dim_semantic = 2 * width, width
         mean, std = (*IMAGENET_MEAN, *[0.5] * mask_input), (*IMAGENET_STD, *[0.5] * mask_input)
@@ -86,7 +100,7 @@ class VGGTEncoder(nn.Module):
         masks: Bool[Tensor, "..."],
         interval: Interval | None = None,
     ) -> Tokens:
-        """All patches of all views.
+        """Tokens of all views: of all patches, or of those that a feature cache keeps.
 
         Args:
             images: ``[B, V, 3, H, W]``, RGB in [0, 1], sides divisible by the patch size.
@@ -94,6 +108,14 @@ class VGGTEncoder(nn.Module):
             interval: near and far, each ``[B, V, H, W]``; read where ``interval_input`` is set.
         """
         self._check(images, masks)
+        if self.cache is not None:
+            return self.cache(self, images, masks, interval)
+        return self.encode(images, masks, interval)
+
+    def encode(
+        self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."], interval: Interval | None
+    ) -> Tokens:
+        """All patches of all views, computed."""
         b, v, _, height, width = images.shape
         grid = (b, v, height // self.patch_size, width // self.patch_size)
         pairs, patches = self.aggregator(self._normalized(images, masks, interval))
