@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset
 
@@ -213,7 +214,7 @@ class PhotographsDataModule(LightningDataModule):
             collate_fn=_as_is,
             num_workers=self.workers,
             persistent_workers=self.workers > 0,
-            pin_memory=self.pin_memory,
+            pin_memory=self.pin_memory and torch.cuda.is_available(),
             **options,
         )
 
