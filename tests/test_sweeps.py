@@ -9,6 +9,7 @@ import time
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus
 from sweep_jobs import executed, finish, hold, noting, planned_by_hand, work_through
 from test_cli import call
 
@@ -18,7 +19,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.experiments.provenance import config_hash
 from ghgs_lit.experiments.results import read_results
 from ghgs_lit.sweeps import plan, work
-from ghgs_lit.sweeps.grid import combinations
+from ghgs_lit.sweeps.grid import carry_out, combinations
 from ghgs_lit.sweeps.run import Run, State
 
 SPAWN = multiprocessing.get_context("spawn")
@@ -187,6 +188,18 @@ def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
     assert [p.read_text() for p in tmp_path.glob("seen_*")] == ["8", "8"]
     pids = {line.split()[1] for line in (tmp_path / "executed").read_text().splitlines()}
     assert len(pids) == 2
+
+
+def test_a_sweep_comes_back_to_what_others_worked_on(tmp_path):
+    items, launched = planned_by_hand(tmp_path, 2), []
+
+    def launch(jobs, first):
+        launched.append([overrides[0] for overrides in jobs])
+        values = [work.BUSY if len(launched) == 1 and name == "0" else 20.0 for (name,) in jobs]
+        return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
+
+    assert [result.return_value for result in carry_out(items, launch)] == [20.0, 20.0]
+    assert launched == [["0", "1"], ["0"]]
 
 
 def test_a_directory_of_a_single_run_is_not_shared_either(tmp_path):
