@@ -1,10 +1,16 @@
-"""The CPU backend among threads, processes and cached machine code."""
+"""The CPU backend among threads, processes, processors and cached machine code."""
 
 import importlib.util
 import multiprocessing
+import os
+import platform
+import subprocess
 import sys
 import threading
+import warnings
+from pathlib import Path
 
+import numba
 import pytest
 import torch
 from rendering_scenes import FIELDS, body, cameras, leaves
@@ -115,3 +121,44 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
             compile._DIGEST = original
 
     assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])
+def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
+    compile.warn_of_narrow_vectors.cache_clear()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            render(body(10, 8), cameras(1, 8, 8), "cpu")
+    assert sum("256 bits" in str(warning.message) for warning in caught) == warned
+
+
+_SUM = """
+import torch
+from rendering_scenes import body, cameras, leaves
+from ghgs_lit.rendering import render
+gaussians = leaves(body(300, 24))
+image = render(gaussians, cameras(1, 24, 24), "cpu").image
+image.square().sum().backward()
+print(float(image.detach().sum()), float(gaussians.scales.grad.norm()))
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="takes x86 vectors away")
+def test_the_same_image_without_wide_vectors():
+    """Compiled for a processor that has vectors of 128 bits only (the first run takes a while)."""
+
+    def run(**variables):
+        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+        environment = {**os.environ, "PYTHONPATH": path, **variables}
+        done = subprocess.run(
+            [sys.executable, "-c", _SUM], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        return [float(number) for number in done.stdout.split()], done.stderr
+
+    wanted, _ = run()
+    found, said = run(NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
+    assert found == pytest.approx(wanted, rel=1e-5)
+    assert said.count("no vectors of 256 bits") == 1

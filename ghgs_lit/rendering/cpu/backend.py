@@ -12,6 +12,7 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.rendering.cpu import binning, layout, pool, projection, simd
 from ghgs_lit.rendering.cpu.backward import backward
+from ghgs_lit.rendering.cpu.compile import warn_of_narrow_vectors
 from ghgs_lit.rendering.cpu.forward import forward
 from ghgs_lit.rendering.cpu.gradients import collect
 from ghgs_lit.rendering.settings import RasterSettings
@@ -37,6 +38,7 @@ def rasterize(
 
     Differentiable in the Gaussians, not in the cameras. The same bits with any number of threads.
     """
+    warn_of_narrow_vectors()
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = _Plan.of(gaussians, cameras, settings, near, far, regions)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))

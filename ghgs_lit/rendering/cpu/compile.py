@@ -1,8 +1,11 @@
 """Compile a kernel with Numba and keep its machine code on disk for as long as it is right."""
 
 import hashlib
+import warnings
+from functools import cache
 from pathlib import Path
 
+import llvmlite.binding
 import numba
 
 # Kernels are called from Python only, helpers from kernels only: no other way in is compiled.
@@ -38,3 +41,21 @@ def kernel(function):
 def helper(function):
     """A function that kernels call; it is compiled into them."""
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
+
+
+@cache
+def warn_of_narrow_vectors() -> None:
+    """Warn, once in a process, where vectors are narrower than 256 bits.
+
+    The kernels fall back to what the machine has: LLVM splits their vectors, and the image is the same.
+    """
+    names = numba.config.CPU_FEATURES
+    if names is None:
+        names = llvmlite.binding.get_host_cpu_features().flatten()
+    if "+avx2" not in names and "+sve" not in names:
+        warnings.warn(
+            "renderer=cpu: this processor has no vectors of 256 bits or more (AVX2, AVX-512, SVE); "
+            "the rasterizer splits its own and takes several times as long",
+            RuntimeWarning,
+            stacklevel=2,
+        )
