@@ -46,6 +46,11 @@ class Stage:
     gflop: float = 0.0
 
 
+def merged(name: str, stages: list[Stage]) -> Stage:
+    seconds, gflop = (sum(getattr(stage, field) for stage in stages) for field in ("seconds", "gflop"))
+    return Stage(name, seconds, max(stage.peak_gb for stage in stages), gflop)
+
+
 def configuration(size: str, options: list[str]) -> dict:
     """The paper's model around an encoder of ``size``, every token and pixel taking part."""
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
@@ -224,6 +229,25 @@ def literal_stage(model: GHGS, tokens: Tokens, points: Points) -> Stage:
     return record.stages[0]
 
 
+def training_stages(config: dict, batch: Batch) -> list[Stage]:
+    """One forward and backward pass of the encoder alone, all of it trained, without and with recomputing.
+
+    A whole ``vggt_1b`` takes tens of GB without: choose fewer blocks by ``encoder.depth``.
+    """
+    stages = []
+    for checkpointing in (False, True):
+        options = {**config["encoder"], "trainable": "all", "checkpointing": checkpointing}
+        model = random_model({**config, "encoder": options}).encoder.requires_grad_(True).train()
+        for parameter in model.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        record = Recorder()
+        with record("recomputed activations" if checkpointing else "kept activations"):
+            tokens = model(batch.images, batch.masks)
+            sum(layer.square().mean() for layer in tokens.latent).backward()
+        stages += record.stages
+    return stages
+
+
 def report(stages: list[Stage], rates: dict[str, float], floor: float) -> None:
     """Print the tables in Markdown; ``floor`` is what the process held with weights and photographs."""
     print("| product | GFLOP/s |\n|---|---|")
@@ -258,6 +282,7 @@ def main() -> None:
     )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--literal", action="store_true", help="time the literal recalibration, too")
+    parser.add_argument("--train", action="store_true", help="measure the encoder's training instead")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("options", nargs="*", help="further overrides of the configuration")
     options = parser.parse_args()
@@ -265,6 +290,11 @@ def main() -> None:
     dtype = DTYPES[options.dtype]
     config = configuration(options.size, options.options)
     batch = make_batch(1, options.views, options.side, options.side)
+    if options.train:
+        print("| encoder, forward and backward | s | peak GB above weights and gradients |\n|---|---|---|")
+        for stage in training_stages(config, batch):
+            print(f"| {stage.name} | {stage.seconds:.1f} | {stage.peak_gb:.2f} |", flush=True)
+        return
     model = random_model(config)
     gflop = count_gflop(config, model, batch)
     width, size = model.encoder.dim_semantic, model.encoder.patch_size

@@ -23,10 +23,9 @@ def _has_wide_convolutions() -> bool:
 _WIDE_CONVOLUTIONS = _has_wide_convolutions()
 
 
-def prefers_convolution(x: Tensor) -> bool:
-    """Whether large float32 products of ``x`` are faster as 1x1 convolutions."""
-    threads = torch.get_num_threads()
-    return _WIDE_CONVOLUTIONS and threads > 1 and x.device.type == "cpu" and x.dtype == torch.float32
+def prefers_convolution(device: torch.device) -> bool:
+    """Whether large float32 products on ``device`` are faster as 1x1 convolutions."""
+    return device.type == "cpu" and _WIDE_CONVOLUTIONS and torch.get_num_threads() > 1
 
 
 def even_parts(count: int, most: int) -> list[slice]:
@@ -37,8 +36,8 @@ def even_parts(count: int, most: int) -> list[slice]:
 
 def product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """``x @ weight.T + bias`` for ``x`` [..., k], ``weight`` [n, k] and ``bias`` [n]."""
-    large = x.numel() * len(weight) >= _LARGE and x.numel() > _PIXELS
-    if not (large and prefers_convolution(x)) or torch.is_autocast_enabled("cpu"):
+    large = x.numel() * len(weight) >= _LARGE and x.numel() > _PIXELS and x.dtype == torch.float32
+    if not (large and prefers_convolution(x.device)) or torch.is_autocast_enabled("cpu"):
         return F.linear(x, weight, bias)
     # Rows are pixels whose channels lie innermost, so neither side is copied.
     pixels = x.reshape(1, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)

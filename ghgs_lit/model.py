@@ -17,6 +17,7 @@ from ghgs_lit.geometry.points import Unprojection
 from ghgs_lit.geometry.visual_hull import Interval
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
+from ghgs_lit.precision import precision_of
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import (
@@ -73,6 +74,8 @@ class GHGS(nn.Module):
         self.unproject = unprojection or Unprojection()
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
+        #: Of the stages' products: one of :data:`ghgs_lit.precision.PRECISIONS`.
+        self.precision = "inherit"
         self.frames = [patch_padding] * (pad == "multiple") + [subject_windows] * crop
 
     def forward(self, batch: Batch) -> Prediction:
@@ -86,7 +89,8 @@ class GHGS(nn.Module):
             if frame is not None:
                 batch, interval = frame.cut_batch(batch), frame.cut_interval(interval)
                 used.append(frame)
-        prediction = self._predict(batch, interval)
+        with precision_of(self.precision, batch.images.device):
+            prediction = self._predict(batch, interval)
         for frame in reversed(used):
             prediction = frame.paste_prediction(prediction)
         return prediction

@@ -27,6 +27,7 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
     trained = config
     if path is not None:
         model = GHGS.from_checkpoint(path)
+        model.precision = config["precision"]
         trained = read_checkpoint(path)["config"]
         facts["checkpoint_config"] = trained
         facts["parameters"] = {"total": sum(p.numel() for p in model.parameters())}

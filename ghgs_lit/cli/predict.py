@@ -38,6 +38,7 @@ def run(cfg: DictConfig) -> None:
     require(isinstance(frames, int) and frames >= 0, "turntable.frames", "a number of at least 0", frames)
     device = pick_device(config["device"])
     model = GHGS.from_checkpoint(config["checkpoint"]).to(device).eval()
+    model.precision = config["precision"]
     renderer = build(config["renderer"], "renderer")
     data = build_data(config)
     data.prepare_data()

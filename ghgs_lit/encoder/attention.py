@@ -29,7 +29,7 @@ class Attention(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
         q, k, v = rearrange(self.qkv(x), "n t (s a d) -> s n a t d", s=3, a=self.heads)
-        if torch.is_grad_enabled() or not prefers_convolution(wide(x)):
+        if torch.is_grad_enabled() or x.dtype == torch.float64 or not prefers_convolution(x.device):
             q, k = self._place(q, k, rotary)
             y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
             return self.proj(rearrange(y, "n a t d -> n t (a d)"))

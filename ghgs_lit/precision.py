@@ -1,0 +1,40 @@
+"""Half precision where it is safe: products of networks; geometry and last projections stay float32."""
+
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+
+from ghgs_lit.errors import choice, require
+
+PRECISIONS = ("inherit", "float32", "bfloat16", "float16", "auto")
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies in bfloat16 by itself; elsewhere it would be slower than float32."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = torch.cpu.get_capabilities() if device.type == "cpu" else {}
+    return any(found is True for name, found in capabilities.items() if "bf16" in name)
+
+
+def precision_of(name: str, device: torch.device) -> AbstractContextManager:
+    """The autocast of a forward pass.
+
+    ``inherit`` leaves the caller's; ``auto`` is bfloat16 where the device has it, else float16 on CUDA and
+    float32 on a CPU.
+
+    Raises:
+        InputError: float16 on a CPU, or bfloat16 where the device has none.
+    """
+    choice("precision", name, PRECISIONS)
+    if name == "inherit":
+        return nullcontext()
+    if name == "auto":
+        slow = "float16" if device.type == "cuda" else "float32"
+        name = "bfloat16" if has_bfloat16(device) else slow
+    if name == "bfloat16":
+        require(has_bfloat16(device), "precision", "float32 on a device without bfloat16", name)
+    require(name != "float16" or device.type == "cuda", "precision", "float16 on CUDA only", device.type)
+    if name == "float32":
+        return torch.autocast(device.type, enabled=False)
+    return torch.autocast(device.type, getattr(torch, name))
