@@ -87,7 +87,7 @@ def run(cfg: DictConfig) -> float | str | None:
 def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> float | None:
     """Train, keep the last weights, measure them; gives the mean PSNR of the first protocol.
 
-    ``notes`` gets the steps and seconds of this session.
+    ``notes`` gets the steps and seconds that were trained here.
     """
     if rank_zero_only.rank == 0:
         write_config(config, directory)
