@@ -1,4 +1,4 @@
-"""Time the CPU rasterizer against two peers: ``python benchmarks/rasterizer.py [--quick] [--json FILE]``.
+"""Measure the CPU rasterizer: ``python benchmarks/rasterizer.py [--quick] [--json FILE] [--pictures DIR]``.
 
 The scene is a closed body of flat splats that covers 19 % of the frame, one splat's sigma to a splat's
 distance on the surface. Runs are interleaved, so that whatever else the machine does hits all alike;
@@ -19,12 +19,12 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parent))
 import peers
+import rasterizer_checks as checks
 
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Cameras, Gaussians
 
 COVERED = 0.19
-FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
 
 def scene(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
@@ -58,7 +58,7 @@ def scene(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
 
 
 def ours(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    return render(gaussians, cameras, "cpu").image[0, 0]
+    return render(gaussians, cameras, "cpu").image.view(3, cameras.height, cameras.width)
 
 
 CONTENDERS: dict[str, Callable[[Gaussians, Cameras], Tensor]] = {
@@ -71,7 +71,7 @@ CONTENDERS: dict[str, Callable[[Gaussians, Cameras], Tensor]] = {
 def time_once(name: str, threads: int, gaussians: Gaussians, cameras: Cameras, upstream: Tensor):
     """Seconds of one forward and one backward pass."""
     torch.set_num_threads(threads)
-    for field in FIELDS:
+    for field in checks.FIELDS:
         getattr(gaussians, field).grad = None
     start = time.perf_counter()
     image = CONTENDERS[name](gaussians, cameras)
@@ -130,13 +130,8 @@ def rows_of(count: int, size: int, found: dict[tuple[str, int], dict]) -> list[d
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--quick", action="store_true", help="512 x 512 only, fewer runs; under three minutes"
-    )
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    options = parser.parse_args()
+def print_times(sizes: tuple[int, ...], quick: bool) -> list[dict]:
+    """Measure and print the table of times; returns its rows."""
     rows = []
     columns = (
         "splats",
@@ -149,9 +144,9 @@ def main() -> None:
         "peer ms",
     )
     print(f"| {' | '.join(columns)} | peer / ours |\n{'|---' * 9}|")
-    for size in (512,) if options.quick else (256, 512, 1024):
+    for size in sizes:
         for count in (5_000, 50_000, 200_000):
-            found = measure(count, size, repeats(count, options.quick))
+            found = measure(count, size, repeats(count, quick))
             for row in rows_of(count, size, found):
                 peer_ms = row["peer_forward_ms"] + row["peer_backward_ms"]
                 numbers = (row["forward_ms"], row["backward_ms"], row["median_ms"])
@@ -159,8 +154,40 @@ def main() -> None:
                 cells += [f"{row['peer']} ({row['peer_threads']})", f"{peer_ms:.1f}", f"{row['ratio']:.1f}"]
                 print(f"| {' | '.join(cells)} |", flush=True)
             rows += rows_of(count, size, found)
+    return rows
+
+
+def print_checks() -> dict:
+    """Measure and print errors against float64 and the seconds of the first use; returns them."""
+    found = {
+        "body": checks.errors(*scene(1_500, 64)),
+        "person": checks.errors(*checks.person(3_000, 64, 32)),
+    }
+    print("\n| scene | image | alpha | gradient | ambiguous pixels, left out |\n|---|---|---|---|---|")
+    for name, errors in found.items():
+        cells = [f"{errors[key]:.1e}" for key in ("image", "alpha", "gradient")]
+        print(f"| {name} | {' | '.join(cells)} | {errors['ambiguous']:.2%} |")
+    compiled, cached = checks.first_use()
+    print(f"\nFirst use of a new process: {compiled:.1f} s; with cached machine code: {cached:.1f} s")
+    return {"errors": found, "first_use_s": compiled, "cached_use_s": cached}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--quick", action="store_true", help="512 x 512 only, fewer runs; under three minutes"
+    )
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--pictures", type=Path, help="only draw a person by all backends, into this folder")
+    options = parser.parse_args()
+    if options.pictures:
+        drawers = {"cpu": CONTENDERS["ours"], "box": CONTENDERS["box"], "torch": CONTENDERS["torch"]}
+        print(checks.pictures(options.pictures, drawers))
+        return
+    rows = print_times((512,) if options.quick else (256, 512, 1024), options.quick)
+    found = print_checks()
     if options.json:
-        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+        options.json.write_text(json.dumps({"rows": rows, **found}, indent=1) + "\n")
         print(f"rows: {options.json}")
 
 
