@@ -1,5 +1,6 @@
 """The CPU backend among threads, processes, processors and cached machine code."""
 
+import dataclasses
 import importlib.util
 import multiprocessing
 import os
@@ -16,7 +17,7 @@ import torch
 from rendering_scenes import FIELDS, body, cameras, leaves
 
 from ghgs_lit.rendering import render
-from ghgs_lit.rendering.cpu import compile
+from ghgs_lit.rendering.cpu import compile, pool
 
 
 @pytest.fixture(autouse=True)
@@ -27,16 +28,24 @@ def _one_thread():
     torch.set_num_threads(threads)
 
 
-def test_the_same_bits_with_one_and_two_threads():
+@pytest.mark.parametrize("splits", [(3000,), (1501, 0, 1, 1498)])
+def test_the_same_bits_with_any_number_of_threads(monkeypatch, splits):
+    """Small parts, so that several threads have work; many Gaussians of equal depth lie in several parts."""
+    monkeypatch.setattr(pool, "GRAIN", 64)
+    scene = body(3000, 64)
+    scene.means[::3, 2] = 0.1
+    scene = dataclasses.replace(scene, splits=splits)
+
     def run():
-        gaussians = leaves(body(3000, 64))
-        rendering = render(gaussians, cameras(3, 64, 64), "cpu")
+        gaussians = leaves(scene)
+        rendering = render(gaussians, cameras(2, 64, 64, batch=len(splits)), "cpu")
         (rendering.image.square().sum() + rendering.depth.sum()).backward()
         return [rendering.image.detach(), *(getattr(gaussians, name).grad for name in FIELDS)]
 
     first = run()
-    torch.set_num_threads(2)
-    assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
+    for threads in (2, 3, 7):
+        torch.set_num_threads(threads)
+        assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
 
 
 def test_two_threads_of_the_caller_at_once():
