@@ -176,7 +176,9 @@ class GaussianHead(nn.Module):
         if self.pixels == "subject":
             raw = self._raw(descriptors[image, pixel])
         else:
-            raw = tuple(value[image, pixel] for value in self._raw(descriptors))
+            # One image at a time: the networks' hidden layers are wider than the maps.
+            each = [self._raw(pixels) for pixels in descriptors]
+            raw = tuple(torch.stack(values)[image, pixel] for values in zip(*each, strict=True))
         offset, scale, rotation, opacity, *color = raw
         focal = wide(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
