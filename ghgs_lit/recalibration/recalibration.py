@@ -15,7 +15,7 @@ from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
 from ghgs_lit.types import Batch, Points, Tokens
 
 #: Cosines that are held at once.
-_SIMILARITIES = 1 << 22
+_SIMILARITIES = 1 << 21
 
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
@@ -95,8 +95,10 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
     Features are normalised once, before they are picked; a feature of length 0 has cosine 0 to all.
     """
     with torch.autocast(semantic.device.type, enabled=False):
-        unit = F.normalize(wide(semantic), dim=-1, eps=1e-12)
-        cosines = unit.new_empty(neighbors.index.shape)
+        semantic = wide(semantic)
+        # What stays is made first: behind freed features it would hold their memory.
+        cosines = semantic.new_empty(neighbors.index.shape)
+        unit = F.normalize(semantic, dim=-1, eps=1e-12)
         for rows in even_parts(len(unit), _SIMILARITIES // max(1, len(unit))):
             torch.gather(product(unit[rows], unit), 1, neighbors.index[rows], out=cosines[rows])
     return cosines
