@@ -82,6 +82,9 @@ def test_a_block_without_gradient_is_the_same_and_keeps_its_input(convolutions, 
     monkeypatch.setattr("ghgs_lit.encoder.block._HIDDEN", 200)
     torch.manual_seed(0)
     block = Block(16, 2, qk_norm, 1e-5, 0.5)
+    with torch.no_grad():
+        for parameter in block.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape))
     rotary = rotary_tables(token_positions(2, 3, 5), 8, torch.zeros(1)) if qk_norm else None
     x = torch.randn(3, 11, 16)
     kept = x.clone()
