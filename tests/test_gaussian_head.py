@@ -146,3 +146,14 @@ def test_attributes_are_wide_under_autocast():
 def test_impossible_options_are_refused(options, key):
     with pytest.raises(InputError, match=key):
         make_head(**options)
+
+
+def test_the_last_projection_is_wide_under_autocast():
+    head = shake(make_head())
+    descriptors = torch.rand(50, 32)
+    hidden = head.offset_header[:-1]
+    with torch.autocast("cpu", torch.bfloat16):
+        offset = head._raw(descriptors)[0]
+        expected = hidden(descriptors).float()
+    last = head.offset_header[-1]
+    torch.testing.assert_close(offset, torch.nn.functional.linear(expected, last.weight, last.bias))

@@ -32,6 +32,13 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+def _wide_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
+    """``mlp(x)``, its last projection wide under autocast: offsets of millimetres hang on it."""
+    hidden, last = mlp[:-1](x), mlp[-1]
+    with torch.autocast(x.device.type, enabled=False):
+        return wide(last(hidden.to(last.weight.dtype)))
+
+
 class FootprintAttributes:
     """Raw values to attributes in units of what one pixel sees; raw zeros give a splat on the surface.
 
@@ -213,5 +220,5 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.color_limit > 0:
             headers.append(self.color_header)
-        offset, scale, rotation, opacity, *color = (wide(header(descriptors)) for header in headers)
+        offset, scale, rotation, opacity, *color = (_wide_last(header, descriptors) for header in headers)
         return offset, scale, rotation, opacity[..., 0], *color
