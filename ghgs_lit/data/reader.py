@@ -273,6 +273,14 @@ def check_centre(path: Path, intrinsics: np.ndarray, height: int, width: int) ->
         )
 
 
+def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> View:
+    """A photograph of an OpenCV calibration, which puts pixel centres at integers, without its background."""
+    intrinsics = np.array(intrinsics)
+    intrinsics[:2, 2] += 0.5
+    image = np.where(mask[..., None], image, 0)
+    return View(image, mask, None, intrinsics.astype(np.float32), extrinsics.astype(np.float32))
+
+
 def check_extrinsics(path: Path | str, extrinsics: Any) -> np.ndarray:
     """Finite [4, 4] of [3, 4] or [4, 4], world to camera, with a rotation in it.
 

@@ -17,7 +17,7 @@ import numpy as np
 from ghgs_lit.data.humman.cameras import KINECTS, Calibration, read_calibration
 from ghgs_lit.data.humman.depth import surface_points
 from ghgs_lit.data.humman.smpl import Body, read_parameters
-from ghgs_lit.data.reader import Reader, View, check_centre, check_name, read_image, read_map
+from ghgs_lit.data.reader import Reader, View, check_centre, check_name, opencv_view, read_image, read_map
 from ghgs_lit.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -120,19 +120,11 @@ class HuMManReader(Reader):
     def read_view(self, name: str, pid: int, vid: int, depth: bool) -> View:
         frame = self._frames[name]
         path = _file(frame.folder, "kinect_color", pid, frame.number)
-        image = np.array(read_image(path).convert("RGB"))
+        image = np.asarray(read_image(path).convert("RGB"))
         mask = self._mask(frame, pid, image.shape[:2])
-        intrinsics = frame.cameras.intrinsics[pid].copy()
+        intrinsics = frame.cameras.intrinsics[pid]
         check_centre(path, intrinsics, *image.shape[:2])
-        image[~mask] = 0
-        intrinsics[:2, 2] += 0.5  # the calibration puts pixel centres at integers
-        return View(
-            image=image,
-            mask=mask,
-            inverse_depth=None,
-            intrinsics=intrinsics.astype(np.float32),
-            extrinsics=frame.cameras.extrinsics[pid].astype(np.float32),
-        )
+        return opencv_view(image, mask, intrinsics, frame.cameras.extrinsics[pid])
 
     def read_body(self, name: str) -> np.ndarray | None:
         frame = self._frames[name]

@@ -14,7 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.data.reader import Reader, View, check_centre, check_name, read_array, read_image, read_map
+from ghgs_lit.data.reader import (
+    Reader,
+    View,
+    check_centre,
+    check_name,
+    opencv_view,
+    read_array,
+    read_image,
+    read_map,
+)
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
 from ghgs_lit.errors import InputError, require
@@ -130,22 +139,14 @@ class ZJUMoCapReader(Reader):
         frame = self._frames[name]
         photograph = frame.annotations.frames[frame.index][pid]
         path = _find(frame.folder, photograph, photograph.suffix)
-        image = np.array(read_image(path).convert("RGB"))
+        image = np.asarray(read_image(path).convert("RGB"))
         mask = self._mask(frame.folder, photograph, image.shape[:2])
-        intrinsics = frame.annotations.intrinsics[pid].copy()
+        intrinsics = frame.annotations.intrinsics[pid]
         check_centre(path, intrinsics, *image.shape[:2])
         if self.undistorted:
             grid = undistorting_grid(intrinsics, frame.annotations.distortions[pid], *image.shape[:2])
             image, mask = undistort(image, mask, grid)
-        image[~mask] = 0
-        intrinsics[:2, 2] += 0.5  # the calibration puts pixel centres at integers
-        return View(
-            image=image,
-            mask=mask,
-            inverse_depth=None,
-            intrinsics=intrinsics.astype(np.float32),
-            extrinsics=frame.annotations.extrinsics[pid].astype(np.float32),
-        )
+        return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[pid])
 
     def read_body(self, name: str) -> np.ndarray | None:
         frame = self._frames[name]
