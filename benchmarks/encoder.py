@@ -28,6 +28,7 @@ from literal_recalibration import literal_recalibration
 from stage_scenes import make_batch
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.encoder import cpu
 from ghgs_lit.linear import product
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Points, Tokens
@@ -221,6 +222,17 @@ def product_rates(tokens: int, width: int, dtype: torch.dtype) -> dict[str, floa
 
 
 @torch.no_grad()
+def load_attention(dtype: torch.dtype) -> float | None:
+    """Seconds of the attention kernel's first use (compiled, or found on disk); None if it is not used."""
+    x = torch.zeros(1, 16, 1024, 64, dtype=dtype)
+    if not cpu.suits(x, x):
+        return None
+    start = time.perf_counter()
+    cpu.attend(*[x[:, :1, :1]] * 3)
+    return time.perf_counter() - start
+
+
+@torch.no_grad()
 def literal_stage(model: GHGS, tokens: Tokens, points: Points) -> Stage:
     """The recalibration of all layers of the first element, as the paper writes it down."""
     record = Recorder()
@@ -291,6 +303,7 @@ def main() -> None:
         for stage in training_stages(config, batch):
             print(f"| {stage.name} | {stage.seconds:.1f} | {stage.peak_gb:.2f} |", flush=True)
         return
+    loading = load_attention(dtype)
     model = random_model(config)
     gflop = count_gflop(config, model, batch)
     width, size = model.encoder.dim_semantic, model.encoder.patch_size
@@ -309,7 +322,8 @@ def main() -> None:
     capability = torch.backends.cpu.get_cpu_capability()
     parameters = sum(p.numel() for p in model.parameters())
     print(f"{options.size}, {parameters / 1e6:.0f} M parameters, {options.views} views of {options.side}²,")
-    print(f"{options.dtype}, {options.threads} threads, {capability}, torch {torch.__version__}\n")
+    print(f"{options.dtype}, {options.threads} threads, {capability}, torch {torch.__version__}")
+    print(f"attention kernel: {'not used' if loading is None else f'{loading:.1f} s on first use'}\n")
     report(record.stages, rates, record.base)
     if options.json:
         facts = {"options": vars(options) | {"json": str(options.json)}, "processor": platform.processor()}

@@ -9,11 +9,11 @@ from stage_models import ATTRIBUTES, make_model
 from stage_scenes import make_batch
 
 import ghgs_lit.linear
-from ghgs_lit.encoder import VGGTEncoder
-from ghgs_lit.encoder.attention import attend
+from ghgs_lit.encoder import VGGTEncoder, cpu
 from ghgs_lit.encoder.block import Block
 from ghgs_lit.encoder.rope import rotary_tables, token_positions
 from ghgs_lit.errors import InputError
+from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.linear import even_parts, product
 from ghgs_lit.precision import has_bfloat16, precision_of
 
@@ -26,7 +26,18 @@ def convolutions(monkeypatch):
     monkeypatch.setattr(ghgs_lit.linear, "_LARGE", 0)
     monkeypatch.setattr(ghgs_lit.linear, "_PIXELS", 0)
     monkeypatch.setattr(ghgs_lit.linear, "prefers_convolution", lambda _: True)
-    monkeypatch.setattr("ghgs_lit.encoder.attention.prefers_convolution", lambda _: True)
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """Attention of any size by the project's kernel: without 512-bit vectors it is slow, and the same."""
+    features = processor_features() | {"avx512f"}
+    monkeypatch.setattr("ghgs_lit.encoder.cpu.attention._LARGE", 0)
+    monkeypatch.setattr("ghgs_lit.encoder.cpu.attention._has", features.__contains__)
+    calls, attend = [], cpu.attend
+    monkeypatch.setattr(cpu, "attend", lambda *args: calls.append(1) or attend(*args))
+    yield
+    assert calls
 
 
 @pytest.mark.parametrize("shape", [(7, 12), (2, 5, 12), (2, 3, 4, 12), (1, 12)])
@@ -64,41 +75,30 @@ def test_even_parts_cover_all_rows():
             assert max(sizes) <= max(1, most)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_blocks_of_attention_are_attention(convolutions, monkeypatch, dtype):
-    monkeypatch.setattr("ghgs_lit.encoder.attention._SCORES", 40)
-    g = torch.Generator().manual_seed(0)
-    q, k, v = (torch.randn(13, 8, generator=g).to(dtype) for _ in range(3))
-    q = 5 * q
-    expected = F.scaled_dot_product_attention(*(t.double() for t in (q, k, v)))
-    found = torch.empty(13, 8)
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-        attend(q, k, v, out=found)
-    torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("qk_norm", [False, True])
-def test_a_block_without_gradient_is_the_same_and_keeps_its_input(convolutions, monkeypatch, qk_norm):
+def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
+    convolutions, kernels, monkeypatch, qk_norm
+):
     monkeypatch.setattr("ghgs_lit.encoder.block._HIDDEN", 200)
     torch.manual_seed(0)
-    block = Block(16, 2, qk_norm, 1e-5, 0.5)
+    block = Block(64, 2, qk_norm, 1e-5, 0.5)
     with torch.no_grad():
         for parameter in block.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape))
-    rotary = rotary_tables(token_positions(2, 3, 5), 8, torch.zeros(1)) if qk_norm else None
-    x = torch.randn(3, 11, 16)
+    rotary = rotary_tables(token_positions(2, 3, 5), 32, torch.zeros(1)) if qk_norm else None
+    x = torch.randn(3, 11, 64)
     kept = x.clone()
     with torch.no_grad():
         found = block(x, rotary)
-    assert torch.equal(x, kept)
+    assert torch.equal(x, kept)  # the input is not written to
     torch.testing.assert_close(found, block(x, rotary).detach(), atol=1e-5, rtol=1e-5)
 
 
-def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions):
+def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels):
     torch.manual_seed(0)
     vit = {"kind": "dinov2", "depth": 2, "heads": 2}
     encoder = VGGTEncoder(
-        width=32, heads=2, depth=3, layers=(0, 1, 2), vit=vit, image_size=28, layer_scale=0.5
+        width=64, heads=2, depth=3, layers=(0, 1, 2), vit=vit, image_size=28, layer_scale=0.5
     )
     images, masks = torch.rand(2, 3, 3, 28, 42), torch.ones(2, 3, 28, 42, dtype=torch.bool)
     expected = encoder(images, masks)
@@ -217,9 +217,9 @@ def test_checkpointing_keeps_fewer_bytes_and_the_same_gradients():
         assert torch.equal(plain, recomputed)
 
 
-def test_tokens_in_half_precision_weights_pass_the_fast_path(convolutions):
+def test_tokens_in_half_precision_weights_pass_the_fast_path(convolutions, kernels):
     torch.manual_seed(0)
-    encoder = VGGTEncoder(width=32, heads=2, depth=2, layers=(0, 1), vit={"kind": "conv"}, layer_scale=0.5)
+    encoder = VGGTEncoder(width=64, heads=2, depth=2, layers=(0, 1), vit={"kind": "conv"}, layer_scale=0.5)
     images, masks = torch.rand(1, 2, 3, 56, 56), torch.ones(1, 2, 56, 56, dtype=torch.bool)
     with torch.no_grad():
         exact = encoder(images, masks).latent[1]

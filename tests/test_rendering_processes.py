@@ -16,8 +16,9 @@ import pytest
 import torch
 from rendering_scenes import FIELDS, body, cameras, leaves
 
+from ghgs_lit.kernels import compile, pool
 from ghgs_lit.rendering import render
-from ghgs_lit.rendering.cpu import compile, pool
+from ghgs_lit.rendering.cpu import backend
 
 
 @pytest.fixture(autouse=True)
@@ -114,11 +115,11 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
     """A kernel cached under one digest is compiled anew under another, and found again under its own."""
     source = tmp_path / "scaled.py"
     source.write_text(
-        "from ghgs_lit.rendering.cpu import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
+        "from ghgs_lit.kernels import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
     )
 
     def hits(digest):
-        original, compile._DIGEST = compile._DIGEST, digest
+        original, compile._digest = compile._digest, lambda folder: digest
         try:
             spec = importlib.util.spec_from_file_location("scaled", source)
             module = importlib.util.module_from_spec(spec)
@@ -127,7 +128,7 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
             assert module.double(2) == 4
             return sum(module.double.stats.cache_hits.values())
         finally:
-            compile._DIGEST = original
+            compile._digest = original
 
     assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]
 
@@ -135,7 +136,7 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
 @pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])
 def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
     monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
-    compile.warn_of_narrow_vectors.cache_clear()
+    backend._warn_of_narrow_vectors.cache_clear()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(2):
@@ -147,6 +148,7 @@ _SUM = """
 import torch
 from rendering_scenes import body, cameras, leaves
 from ghgs_lit.rendering import render
+from ghgs_lit.rendering.cpu import backend
 gaussians = leaves(body(300, 24))
 image = render(gaussians, cameras(1, 24, 24), "cpu").image
 image.square().sum().backward()

@@ -6,13 +6,10 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.rope import Rotary, rotate
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.linear import Linear, even_parts, prefers_convolution, product
-
-#: Scores that :func:`attend` holds at once: 16 MB, which stay in a CPU's cache.
-_SCORES = 1 << 22
+from ghgs_lit.linear import Linear
 
 
 class Attention(nn.Module):
@@ -29,32 +26,18 @@ class Attention(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
         q, k, v = rearrange(self.qkv(x), "n t (s a d) -> s n a t d", s=3, a=self.heads)
-        if torch.is_grad_enabled() or x.dtype == torch.float64 or not prefers_convolution(x.device):
-            q, k = self._place(q, k, rotary)
-            y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
-            return self.proj(rearrange(y, "n a t d -> n t (a d)"))
-        y = torch.empty_like(v.transpose(1, 2), memory_format=torch.contiguous_format)
-        # Head by head, so that all that happens to a head happens in the cache.
-        for i in range(len(x)):
-            for a in range(self.heads):
-                attend(*self._place(q[i, a], k[i, a], rotary), v[i, a], out=y[i, :, a])
-        return self.proj(y.flatten(2))
+        q, k = self._place(q, self.q_norm, rotary), self._place(k, self.k_norm, rotary)
+        if cpu.suits(q, v):
+            return self.proj(cpu.attend(q, k, v).flatten(2))
+        y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+        return self.proj(rearrange(y, "n a t d -> n t (a d)"))
 
-    def _place(self, q: Tensor, k: Tensor, rotary: Rotary | None) -> tuple[Tensor, Tensor]:
-        """Normalise queries and keys and turn them by their positions."""
-        q, k = self.q_norm(q), self.k_norm(k)
-        return (q, k) if rotary is None else (rotate(q, rotary), rotate(k, rotary))
-
-
-def attend(
-    q: Float[Tensor, "t d"], k: Float[Tensor, "s d"], v: Float[Tensor, "s d"], out: Float[Tensor, "t d"]
-) -> None:
-    """``softmax(q k^T / sqrt(d)) v`` of one head into ``out``: on a CPU, in float32, without a gradient.
-
-    PyTorch's own runs at less than half the rate of this CPU's products, in bfloat16 at a sixth.
-    """
-    with torch.autocast("cpu", enabled=False):
-        q, k, v = wide(q) * q.shape[-1] ** -0.5, wide(k).contiguous(), wide(v).T.contiguous()
-        for rows in even_parts(len(q), _SCORES // len(k)):
-            scores = product(q[rows], k)
-            out[rows] = product(torch.softmax(scores, -1, out=scores), v)
+    def _place(self, x: Float[Tensor, "n a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
+        """Normalise queries or keys and turn them by their positions; without a gradient in place."""
+        if rotary is None:
+            return norm(x)
+        if torch.is_grad_enabled():
+            return rotate(norm(x), rotary)
+        for head in x.unbind(1):  # one by one: nothing of the size of all is held besides
+            head.copy_(rotate(norm(head), rotary))
+        return x

@@ -1,4 +1,4 @@
-"""The project's own rasterizer for CPUs: Numba kernels on explicit vectors; see ``layout`` and ``raster``."""
+"""The project's own rasterizer for CPUs: kernels on explicit vectors; ``layout`` tells of their data."""
 
 from ghgs_lit.rendering.cpu.backend import rasterize
 

@@ -1,8 +1,9 @@
 """The CPU backend as one differentiable function of PyTorch."""
 
 import threading
+import warnings
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -10,9 +11,10 @@ from jaxtyping import Int
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.rendering.cpu import binning, layout, pool, projection, simd
+from ghgs_lit.kernels import pool, simd
+from ghgs_lit.kernels.compile import processor_features
+from ghgs_lit.rendering.cpu import binning, layout, projection
 from ghgs_lit.rendering.cpu.backward import backward
-from ghgs_lit.rendering.cpu.compile import warn_of_narrow_vectors
 from ghgs_lit.rendering.cpu.forward import forward
 from ghgs_lit.rendering.cpu.gradients import collect
 from ghgs_lit.rendering.settings import RasterSettings
@@ -38,10 +40,25 @@ def rasterize(
 
     Differentiable in the Gaussians, not in the cameras. The same bits with any number of threads.
     """
-    warn_of_narrow_vectors()
+    _warn_of_narrow_vectors()
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = _Plan.of(gaussians, cameras, settings, near, far, regions)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
+
+
+@cache
+def _warn_of_narrow_vectors() -> None:
+    """Warn, once in a process, where vectors are narrower than 256 bits.
+
+    The kernels fall back to what the machine has: LLVM splits their vectors, and the image is the same.
+    """
+    if not processor_features() & {"avx2", "sve"}:
+        warnings.warn(
+            "renderer=cpu: this processor has no vectors of 256 bits or more (AVX2, AVX-512, SVE); "
+            "the rasterizer splits its own and takes several times as long",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 @dataclass(frozen=True)

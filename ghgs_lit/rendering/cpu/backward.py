@@ -7,8 +7,9 @@ T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the pixel's own total and shrinks
 
 import numpy as np
 
-from ghgs_lit.rendering.cpu import layout, memory, simd, tiles
-from ghgs_lit.rendering.cpu.compile import helper, kernel
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel
+from ghgs_lit.rendering.cpu import layout, tables, tiles
 from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ONE, ZERO
 
 # Entries between asking for a splat and reading it.
@@ -20,12 +21,12 @@ def _read(image, first, width, rows, columns, block):
     """One block of a tile whose first pixel is ``image[first]``; zero beyond ``rows`` x ``columns``."""
     y, x = block // 4 * 4, block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
-        return memory.load_block(image, first + y * width + x, width)
+        return tables.load_block(image, first + y * width + x, width)
     edge = np.zeros(LANES, np.float32)
     for i in range(y, min(y + 4, rows)):
         for j in range(x, min(x + 4, columns)):
             edge[(i - y) * 4 + j - x] = image[first + i * width + j]
-    return memory.load_block(edge, 0, 4)
+    return tables.load_block(edge, 0, 4)
 
 
 @helper
@@ -145,4 +146,4 @@ def backward(
             )  # fmt: skip
             slot = entries[entry, layout.SLOT] * stride
             for k in range(0, stride, LANES):
-                memory.store(gradients, slot + k, memory.row_sums(sums, k * LANES, count))
+                memory.store(gradients, slot + k, tables.row_sums(sums, k * LANES, count))

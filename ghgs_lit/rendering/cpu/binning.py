@@ -7,8 +7,8 @@ threads changes the order, and no sort is larger than a tile.
 
 import numpy as np
 
+from ghgs_lit.kernels.compile import helper, kernel
 from ghgs_lit.rendering.cpu import layout
-from ghgs_lit.rendering.cpu.compile import helper, kernel
 
 _DIGIT = 8
 _BUCKETS = 1 << _DIGIT

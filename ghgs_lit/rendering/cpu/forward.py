@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from ghgs_lit.rendering.cpu import binning, layout, memory, simd, tiles
-from ghgs_lit.rendering.cpu.compile import helper, kernel
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel
+from ghgs_lit.rendering.cpu import binning, layout, tables, tiles
 from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ZERO
 
 # Entries that are drawn block after block before the next are looked at: as many as an integer has bits.
@@ -51,7 +52,7 @@ def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo)
     """
     todo[:] = 0
     for i in range(0, count, LANES):
-        record = memory.gather_lines(records, splats, i)
+        record = tables.gather_lines(records, splats, i)
         numbers = tiles.splat(record, np.float32(x0), np.float32(y0))
         memory.store(rows, i, numbers[0])
         memory.store(rows, _CHUNK + i, numbers[1])
@@ -120,10 +121,10 @@ def _write(image, first, width, rows, columns, block, value):
     """Write one block of a tile whose first pixel is ``image[first]``, cut at ``rows`` x ``columns``."""
     y, x = block // 4 * 4, block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
-        memory.store_block(image, first + y * width + x, width, value)
+        tables.store_block(image, first + y * width + x, width, value)
         return
     edge = np.empty(LANES, np.float32)
-    memory.store_block(edge, 0, 4, value)
+    tables.store_block(edge, 0, 4, value)
     for i in range(y, min(y + 4, rows)):
         for j in range(x, min(x + 4, columns)):
             image[first + i * width + j] = edge[(i - y) * 4 + j - x]

@@ -6,8 +6,9 @@ cost little (once a splat, not once a pixel) and leave no finite float32 input t
 
 import math
 
-from ghgs_lit.rendering.cpu import layout, simd
-from ghgs_lit.rendering.cpu.compile import helper
+from ghgs_lit.kernels import simd
+from ghgs_lit.kernels.compile import helper
+from ghgs_lit.rendering.cpu import layout
 
 # p^2 + q^2 = sigma / ln 2, where sigma is the exponent of the Gaussian.
 TO_LOG2 = 1.0 / math.log(2.0)

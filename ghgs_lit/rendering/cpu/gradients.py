@@ -5,8 +5,9 @@ Sums run in a fixed order (entries of a splat, then views), so results do not de
 
 import numpy as np
 
-from ghgs_lit.rendering.cpu import geometry, layout, memory, simd
-from ghgs_lit.rendering.cpu.compile import helper, kernel
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel
+from ghgs_lit.rendering.cpu import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
 # Rows of 8 doubles for each Gaussian: gradients of its mean, of R S, and of its opacity.
@@ -165,8 +166,8 @@ def collect(
     lines, sums = simd.aligned(_WIDE * width), np.empty(_SUMS * _WIDE)
     lines[:] = np.float32(0)
     for n in range(first, last, _WIDE):
-        mean, scale = memory.columns3(means, n, last), memory.columns3(scales, n, last)
-        w, x, y, z, inverse = geometry.unit(memory.columns4(quaternions, n, last))
+        mean, scale = tables.columns3(means, n, last), tables.columns3(scales, n, last)
+        w, x, y, z, inverse = geometry.unit(tables.columns4(quaternions, n, last))
         rotation = geometry.rotation(w, x, y, z)
         root = geometry.scaled(rotation, scale)
         sums[:] = 0.0
@@ -178,7 +179,7 @@ def collect(
             drawn = _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines)
             if drawn == 0:
                 continue
-            moments, record = memory.load_lines(lines, 0, width), memory.load_lines(records, m, layout.RECORD)
+            moments, record = tables.load_lines(lines, 0, width), tables.load_lines(records, m, layout.RECORD)
             _splat_gradients(
                 views[t], mean, root, moments, record, simd.mask(drawn), low_pass, antialiased, sums
             )
@@ -188,14 +189,14 @@ def collect(
                 for c in range(channels):
                     d_colors[n + lane, c] += lines[lane * width + layout.COLOR + c]
         d, r = _root_rows(sums), rotation
-        memory.store_columns3(d_scales, n, last, (
+        tables.store_columns3(d_scales, n, last, (
             geometry.dot(r[0], r[3], r[6], d[0], d[3], d[6]),
             geometry.dot(r[1], r[4], r[7], d[1], d[4], d[7]),
             geometry.dot(r[2], r[5], r[8], d[2], d[5], d[8]),
         ))  # fmt: skip
         d_quaternion = _quaternion_gradient(w, x, y, z, inverse, geometry.scaled(d, scale))
-        memory.store_columns4(d_quaternions, n, last, d_quaternion)
-        memory.store_columns3(
+        tables.store_columns4(d_quaternions, n, last, d_quaternion)
+        tables.store_columns3(
             d_means, n, last, (memory.load(sums, 0), memory.load(sums, _WIDE), memory.load(sums, 2 * _WIDE))
         )
-        memory.store_columns1(d_opacities, n, last, (memory.load(sums, _OPACITY * _WIDE),))
+        tables.store_columns1(d_opacities, n, last, (memory.load(sums, _OPACITY * _WIDE),))

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from ghgs_lit.rendering.cpu import geometry, layout, memory, simd
-from ghgs_lit.rendering.cpu.compile import helper, kernel
+from ghgs_lit.kernels import simd
+from ghgs_lit.kernels.compile import helper, kernel
+from ghgs_lit.rendering.cpu import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
 # Pixels beyond which no splat can matter, and up to which float32 counts without overflow.
@@ -48,7 +49,7 @@ def _project_vector(
     visible = visible & (left <= right) & (top <= bottom)
     seen = simd.bits(visible)
     tile, zero = 1.0 / layout.TILE, simd.full(0.0)
-    memory.store_boxes(boxes, m, (
+    tables.store_boxes(boxes, m, (
         simd.select(visible, simd.floor(left * tile), zero),
         simd.select(visible, simd.floor(right * tile) + 1.0, zero),
         simd.select(visible, simd.floor(top * tile), zero),
@@ -58,8 +59,8 @@ def _project_vector(
         return seen
     column, row, inverse_a = simd.floor(u), simd.floor(v), 1.0 / a
     k_yy = geometry.K_SCALE * simd.root(a / determinant)
-    memory.store_columns1(depths, m, m + _WIDE, (z,))
-    memory.store_lines(records, m, (
+    tables.store_columns1(depths, m, m + _WIDE, (z,))
+    tables.store_lines(records, m, (
         column, row, 0.5 - (u - column), 0.5 - (v - row),
         geometry.K_SCALE * simd.root(inverse_a), 0.0 - k_yy * b * inverse_a, k_yy,
         opacity, cutoff, z, b / c, b * inverse_a,
@@ -79,8 +80,8 @@ def project(
     """
     entries = 0
     for n in range(first, last, _WIDE):
-        mean, quaternion = memory.columns3(means, n, last), memory.columns4(quaternions, n, last)
-        scale, opacity = memory.columns3(scales, n, last), memory.columns1(opacities, n, last)
+        mean, quaternion = tables.columns3(means, n, last), tables.columns4(quaternions, n, last)
+        scale, opacity = tables.columns3(scales, n, last), tables.columns1(opacities, n, last)
         w, x, y, z, _ = geometry.unit(quaternion)
         root = geometry.scaled(geometry.rotation(w, x, y, z), scale)
         for t in range(len(views)):

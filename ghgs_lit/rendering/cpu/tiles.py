@@ -8,8 +8,9 @@ The planes of a tile are its colour channels, then the sum of ``w z``, then the 
 
 import numpy as np
 
-from ghgs_lit.rendering.cpu import layout, memory, simd
-from ghgs_lit.rendering.cpu.compile import helper
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper
+from ghgs_lit.rendering.cpu import layout
 
 LANES = simd.LANES
 BLOCKS = layout.PIXELS // LANES

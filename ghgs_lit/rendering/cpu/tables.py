@@ -1,11 +1,11 @@
-"""Vectors from memory and to it: whole, by 4 x 4 blocks of an image, by columns of a table, transposed."""
+"""Vectors from memory and to it: by 4 x 4 blocks of an image, by columns of a table, transposed."""
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from ghgs_lit.rendering.cpu import layout
-from ghgs_lit.rendering.cpu.simd import (
+from ghgs_lit.kernels.memory import pointer_to
+from ghgs_lit.kernels.simd import (
     DOUBLES,
     I32,
     I64,
@@ -14,63 +14,10 @@ from ghgs_lit.rendering.cpu.simd import (
     doubles,
     floats,
     indices,
-    vector_of,
 )
+from ghgs_lit.rendering.cpu import layout
 
 _FLOAT8, _INT8 = ir.VectorType(ir.FloatType(), DOUBLES), ir.VectorType(I32, DOUBLES)
-
-
-def _address(context, builder, array_type, array, index, index_type, kind):
-    """Address of element ``index`` of a contiguous array, counted in its flat order, as one of a vector."""
-    data = context.make_array(array_type)(context, builder, array).data
-    position = context.cast(builder, index, index_type, types.intp)
-    return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())
-
-
-def _alignment(kind) -> int:
-    """Vectors of floats are read and written where a cache line begins, vectors of doubles anywhere."""
-    return 64 if kind is floats else 8
-
-
-@intrinsic
-def load(typing_context, array, index):
-    """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
-    kind = vector_of(array.dtype)
-
-    def emit(context, builder, sig, args):
-        address = _address(context, builder, array, *args, index, kind.llvm)
-        return builder.load(address, align=_alignment(kind))
-
-    return kind(array, index), emit
-
-
-@intrinsic
-def store(typing_context, array, index, value):
-    """Write a vector to ``array[index]`` and after; alignment as for ``load``."""
-    kind = vector_of(array.dtype)
-
-    def emit(context, builder, sig, args):
-        address = _address(context, builder, array, *args[:2], index, kind.llvm)
-        builder.store(args[2], address, align=_alignment(kind))
-        return context.get_dummy_value()
-
-    return types.void(array, index, kind), emit
-
-
-@intrinsic
-def prefetch(typing_context, array, index):
-    """Ask for the cache line of element ``index`` of a contiguous array, counted in its flat order."""
-
-    def emit(context, builder, sig, args):
-        byte = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
-        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        address = _address(context, builder, array, *args, index, ir.IntType(8))
-        # For reading, into all levels, as data.
-        builder.call(callee, [address, ir.Constant(I32, 0), ir.Constant(I32, 3), ir.Constant(I32, 1)])
-        return context.get_dummy_value()
-
-    return types.void(array, index), emit
 
 
 def _block_rows(context, builder, array_type, array, index, stride, index_type):
@@ -133,7 +80,7 @@ def row_sums(typing_context, array, index, count):
         rows = []
         for k in range(min(used, LANES)):
             position = builder.add(args[1], ir.Constant(args[1].type, k * LANES))
-            address = _address(context, builder, array, args[0], position, index, floats.llvm)
+            address = pointer_to(context, builder, array, args[0], position, index, floats.llvm)
             rows.append(builder.load(address, align=64))
         rows += [constant(floats, 0.0)] * (LANES - len(rows))
         width = LANES
@@ -150,7 +97,7 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
     position = builder.mul(
         context.cast(builder, args[1], index_type, types.intp), ir.Constant(args[1].type, count)
     )
-    return _address(context, builder, array_type, args[0], position, types.intp, kind)
+    return pointer_to(context, builder, array_type, args[0], position, types.intp, kind)
 
 
 def _masked(builder, name: str, kind, rows, count: int, *args):
@@ -267,9 +214,9 @@ def gather_lines(typing_context, array, rows, index):
         lines = []
         for k in range(LANES):
             position = builder.add(args[2], ir.Constant(args[2].type, k))
-            place = _address(context, builder, rows, args[1], position, types.int64, I64)
+            place = pointer_to(context, builder, rows, args[1], position, types.int64, I64)
             line = builder.mul(builder.load(place), ir.Constant(I64, LANES))
-            address = _address(context, builder, array, args[0], line, types.int64, floats.llvm)
+            address = pointer_to(context, builder, array, args[0], line, types.int64, floats.llvm)
             lines.append(builder.load(address, align=64))
         return context.make_tuple(builder, sig.return_type, _transpose(builder, lines))
 
@@ -304,7 +251,7 @@ def load_lines(typing_context, array, row, stride):
         position = builder.mul(args[1], args[2])
         lines = []
         for _ in range(DOUBLES):
-            address = _address(context, builder, array, args[0], position, types.int64, floats.llvm)
+            address = pointer_to(context, builder, array, args[0], position, types.int64, floats.llvm)
             lines.append(builder.load(address, align=64))
             position = builder.add(position, args[2])
         halves = _transpose(builder, lines)

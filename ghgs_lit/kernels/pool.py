@@ -30,7 +30,7 @@ def _workers(count: int) -> ThreadPoolExecutor:
     global _pool, _owner
     with _lock:
         if _owner != (os.getpid(), count):
-            _pool = ThreadPoolExecutor(count, thread_name_prefix="ghgs-render")
+            _pool = ThreadPoolExecutor(count, thread_name_prefix="ghgs")
             _owner = (os.getpid(), count)
         return _pool
 

@@ -18,7 +18,7 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
 
-from ghgs_lit.rendering.cpu.compile import helper
+from ghgs_lit.kernels.compile import helper
 
 LANES = 16
 DOUBLES = 8
@@ -214,6 +214,34 @@ def mask(typing_context, bits):
         return builder.bitcast(builder.trunc(args[0], ir.IntType(DOUBLES)), mask8.llvm)
 
     return mask8(types.int64), emit
+
+
+@intrinsic
+def lane_sum(typing_context, x):
+    """The sum of all lanes of floats, halves added to halves."""
+
+    def emit(context, builder, sig, args):
+        total, width = args[0], LANES
+        while width > 1:
+            width //= 2
+            low, high = (indices(range(k, k + width)) for k in (0, width))
+            halves = (builder.shuffle_vector(total, total, lanes) for lanes in (low, high))
+            total = builder.fadd(*halves)
+        return builder.extract_element(total, ir.Constant(I32, 0))
+
+    return types.float32(floats), emit
+
+
+@intrinsic
+def highest_lane(typing_context, x):
+    """The largest lane of floats; NaN is passed over."""
+
+    def emit(context, builder, sig, args):
+        kind = ir.FunctionType(ir.FloatType(), [floats.llvm])
+        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.fmax.v16f32")
+        return builder.call(callee, args)
+
+    return types.float32(floats), emit
 
 
 @intrinsic

@@ -1,0 +1,5 @@
+"""The project's own attention for CPUs with 512-bit vectors: one pass, no matrix of scores in memory."""
+
+from ghgs_lit.encoder.cpu.attention import attend, suits
+
+__all__ = ["attend", "suits"]

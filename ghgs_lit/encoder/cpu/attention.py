@@ -1,0 +1,67 @@
+"""Attention of all heads, shared out to threads."""
+
+from functools import cache, partial
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.encoder.cpu.layout import PANEL, QUERIES
+from ghgs_lit.kernels import pool
+
+# Multiplications from which the kernel pays: below, PyTorch's own takes milliseconds.
+_LARGE = 1 << 27
+
+
+def suits(q: Tensor, v: Tensor) -> bool:
+    """Whether :func:`attend` can and should take queries like ``q`` [n, a, t, d] and values like ``v``."""
+    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _features_of:
+        return False
+    n, a, t, d = q.shape
+    return d % PANEL == 0 and n * a * t * v.shape[2] * d >= _LARGE and _has(_features_of[v.dtype])
+
+
+#: What the kernel needs of a processor: registers for its tiles, and their product in bfloat16.
+_features_of = {torch.float32: "avx512f", torch.bfloat16: "avx512bf16"}
+
+
+@cache
+def _has(feature: str) -> bool:
+    from ghgs_lit.kernels.compile import processor_features  # late, like the kernel: it loads a compiler
+
+    return feature in processor_features()
+
+
+def attend(
+    q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a s d"], v: Float[Tensor, "n a s d"]
+) -> Float[Tensor, "n t a d"]:
+    """``softmax(q k^T / sqrt(d)) v`` of every head, in the type of ``v``, for what :func:`suits`.
+
+    Scores and softmax are float32. The same bits with any number of threads.
+    """
+    from ghgs_lit.encoder.cpu.kernel import attend_head
+
+    out = torch.empty(*q.transpose(1, 2).shape, dtype=v.dtype)
+    words = [_words(x.to(v.dtype)) for x in (q, k, v, out.transpose(1, 2))]
+    n, a, t, d = q.shape
+    heads = [(i, j) for i in range(n) for j in range(a)]
+    # Every task packs keys and values of its own: parts of a head only where there are too few heads.
+    parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
+    edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]
+    compiled = attend_head(words[0].dtype.type)
+    tasks = [
+        partial(compiled, *(x[head] for x in words), first, last)
+        for head in heads
+        for first, last in pairwise(edges)
+    ]
+    pool.run(tasks, work=n * a * t * d)
+    return out
+
+
+def _words(x: Tensor):
+    """As a NumPy array of the same numbers, bfloat16 in pairs as int32."""
+    x = x.detach()
+    if x.stride(-1) != 1 or (x.dtype == torch.bfloat16 and any(s % 2 for s in x.stride()[:-1])):
+        x = x.contiguous()
+    return (x.view(torch.int32) if x.dtype == torch.bfloat16 else x).numpy()

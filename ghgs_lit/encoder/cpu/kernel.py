@@ -1,0 +1,167 @@
+"""Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al., FlashAttention, 2022).
+
+Scores, exponentials and sums are float32; queries, keys, values and weights are float32 or bfloat16.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+from numba.core import types
+from numba.np.numpy_support import from_dtype
+
+from ghgs_lit.encoder.cpu.layout import KEYS, PANEL, QUERIES, ROWS
+from ghgs_lit.encoder.cpu.products import add_values, score
+from ghgs_lit.encoder.cpu.words import aligned_words, pack_line, per_word, store_numbers
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel
+
+LANES = simd.LANES
+LOWEST = np.float32(-np.inf)
+# The least weight beside the largest is 2^-126, the smallest normal float32.
+DEEPEST = np.float32(126)
+
+
+def _attend_head(q, k, v, out, first, last):
+    """``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` into ``out``.
+
+    Each is [tokens, words], float32 [t, d] or int32 [t, d / 2] of bfloat16 pairs; d is a multiple of 32.
+    """
+    tokens, steps = k.shape
+    width = steps * per_word(k)
+    scale = np.float32(math.log2(math.e) / math.sqrt(width))
+    keys, values = _packed_keys(k), _packed_values(v)
+    queries = aligned_words(q, QUERIES * steps)
+    scores, weights = simd.aligned(ROWS * KEYS), aligned_words(q, ROWS * KEYS // per_word(q))
+    totals, sums = simd.aligned(QUERIES * width), simd.aligned(QUERIES * LANES)
+    highest = np.empty(QUERIES, np.float32)
+    for start in range(first, last, QUERIES):
+        count = min(QUERIES, last - start)
+        _pack_queries(q, start, count, queries)
+        totals[:], sums[:], highest[:] = 0, 0, LOWEST
+        for key in range(0, tokens, KEYS):
+            seen = min(KEYS, tokens - key)
+            for row in range(0, count, ROWS):
+                _score(queries, row, keys, key, seen, steps, scores)
+                for r in range(row, row + ROWS):
+                    old = highest[r]
+                    top = max(old, _highest(scores, r - row, seen) * scale)
+                    if top > old:
+                        _scale_down(old - top, sums, totals, r, width)
+                        highest[r] = top
+                    _weigh(scores, r - row, seen, scale, highest[r], weights, sums, r)
+                _add_values(weights, values, key, seen, totals, row, width)
+        for r in range(count):
+            _finish(out[start + r], sums, totals, r, width)
+
+
+@cache
+def attend_head(word: type):
+    """The kernel for words of a type, ``np.float32`` or ``np.int32``, and matrices of any strides."""
+    compiled = kernel(_attend_head)
+    matrix = types.Array(from_dtype(np.dtype(word)), 2, "A")
+    compiled.compile((matrix, matrix, matrix, matrix, types.int64, types.int64))
+    compiled.disable_compile()  # for contiguous matrices once more, to no gain
+    return compiled
+
+
+@helper
+def _padded(count):
+    return -(-count // PANEL) * PANEL
+
+
+@helper
+def _packed_keys(k):
+    """Panels of ``PANEL`` keys, each [words, PANEL]; zeros for keys that are not there."""
+    tokens, steps = k.shape
+    packed = aligned_words(k, _padded(tokens) * steps)
+    for panel in range(0, tokens, PANEL):
+        count = min(PANEL, tokens - panel)
+        for t in range(steps):
+            at = panel * steps + t * PANEL
+            for i in range(count):
+                packed[at + i] = k[panel + i, t]
+            for i in range(count, PANEL):
+                packed[at + i] = 0
+    return packed
+
+
+@helper
+def _packed_values(v):
+    """Panels of ``PANEL`` channels, each [words of tokens, PANEL]; zeros for tokens that are not there."""
+    tokens, steps = v.shape
+    lines, width = _padded(tokens) // per_word(v), steps * per_word(v)
+    packed = aligned_words(v, lines * width)
+    for panel in range(0, width, PANEL):
+        for line in range(lines):
+            pack_line(v, line, panel, packed, panel * lines + line * PANEL)
+    return packed
+
+
+@helper
+def _pack_queries(q, start, count, packed):
+    """Tiles of ``ROWS`` queries, each [words, ROWS]; behind the last one, it is repeated."""
+    steps = q.shape[1]
+    for row in range(0, count, ROWS):
+        for r in range(ROWS):
+            source = start + min(row + r, count - 1)
+            for t in range(steps):
+                packed[row * steps + t * ROWS + r] = q[source, t]
+
+
+@helper
+def _score(queries, row, keys, key, seen, steps, scores):
+    """Products of ``ROWS`` queries and ``seen`` keys [ROWS, KEYS]; those behind are never the highest."""
+    for panel in range(0, seen, PANEL):
+        score(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
+    for r in range(ROWS):
+        for i in range(seen, _padded(seen)):
+            scores[r * KEYS + i] = LOWEST
+
+
+@helper
+def _highest(scores, r, seen):
+    """The highest score of a row; NaN is passed over, and will be met again in the weights."""
+    found = simd.full(LOWEST)
+    for i in range(0, seen, LANES):
+        found = simd.maximum(memory.load(scores, r * KEYS + i), found)
+    return simd.highest_lane(found)
+
+
+@helper
+def _scale_down(exponent, sums, totals, r, width):
+    """Multiply what a query has gathered by ``2^exponent``."""
+    factor = simd.exp2_minus(simd.full(min(-exponent, DEEPEST)))
+    memory.store(sums, r * LANES, memory.load(sums, r * LANES) * factor)
+    for i in range(r * width, (r + 1) * width, LANES):
+        memory.store(totals, i, memory.load(totals, i) * factor)
+
+
+@helper
+def _weigh(scores, r, seen, scale, top, weights, sums, query):
+    """Weights ``2^(scale s - top)`` of a row of scores, and their sum by lanes."""
+    total, minus, deepest = memory.load(sums, query * LANES), simd.full(-scale), simd.full(DEEPEST)
+    for i in range(0, _padded(seen), LANES):
+        depth = simd.fma(memory.load(scores, r * KEYS + i), minus, top)
+        # The second where the first is NaN: it stays.
+        weight = simd.exp2_minus(simd.minimum(deepest, depth))
+        total = total + weight
+        store_numbers(weights, (r * KEYS + i) // per_word(weights), weight)
+    memory.store(sums, query * LANES, total)
+
+
+@helper
+def _add_values(weights, values, key, seen, totals, row, width):
+    lines = len(values) // width
+    words, first = _padded(seen) // per_word(weights), key // per_word(weights) * PANEL
+    for panel in range(0, width, PANEL):
+        at = row * width + panel
+        add_values(weights, 0, values, panel * lines + first, words, totals, at, width)
+
+
+@helper
+def _finish(out, sums, totals, r, width):
+    """One query's values, over the sum of its weights, into its line of the result."""
+    share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
+    for i in range(0, width, LANES):
+        store_numbers(out, i // per_word(out), memory.load(totals, r * width + i) * simd.full(share))

@@ -1,0 +1,1 @@
+"""What the kernels of a CPU share: compilation and its cache, vectors, memory, threads."""

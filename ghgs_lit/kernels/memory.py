@@ -1,0 +1,60 @@
+"""Whole vectors from memory and to it."""
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from ghgs_lit.kernels.simd import I32, floats, vector_of
+
+
+def pointer_to(context, builder, array_type, array, index, index_type, kind):
+    """Address of element ``index`` of a contiguous array, counted in its flat order, as one of a vector."""
+    data = context.make_array(array_type)(context, builder, array).data
+    position = context.cast(builder, index, index_type, types.intp)
+    return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())
+
+
+def _alignment(kind) -> int:
+    """Vectors of floats are read and written where a cache line begins, vectors of doubles anywhere."""
+    return 64 if kind is floats else 8
+
+
+@intrinsic
+def load(typing_context, array, index):
+    """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
+    kind = vector_of(array.dtype)
+
+    def emit(context, builder, sig, args):
+        address = pointer_to(context, builder, array, *args, index, kind.llvm)
+        return builder.load(address, align=_alignment(kind))
+
+    return kind(array, index), emit
+
+
+@intrinsic
+def store(typing_context, array, index, value):
+    """Write a vector to ``array[index]`` and after; alignment as for ``load``."""
+    kind = vector_of(array.dtype)
+
+    def emit(context, builder, sig, args):
+        address = pointer_to(context, builder, array, *args[:2], index, kind.llvm)
+        builder.store(args[2], address, align=_alignment(kind))
+        return context.get_dummy_value()
+
+    return types.void(array, index, kind), emit
+
+
+@intrinsic
+def prefetch(typing_context, array, index):
+    """Ask for the cache line of element ``index`` of a contiguous array, counted in its flat order."""
+
+    def emit(context, builder, sig, args):
+        byte = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
+        callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        address = pointer_to(context, builder, array, *args, index, ir.IntType(8))
+        # For reading, into all levels, as data.
+        builder.call(callee, [address, ir.Constant(I32, 0), ir.Constant(I32, 3), ir.Constant(I32, 1)])
+        return context.get_dummy_value()
+
+    return types.void(array, index), emit
