@@ -5,10 +5,11 @@ from pathlib import Path
 
 from jaxtyping import install_import_hook
 
-_ENCODER = Path(__file__).parents[1] / "ghgs_lit" / "encoder"
-_CHECKED = ["types", "geometry", "heads", "recalibration", "losses", "metrics"]
-# Without its folder of kernels: a function that was wrapped cannot be compiled.
-_CHECKED += [f"encoder.{path.stem}" for path in _ENCODER.glob("*.py")]
+_PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
+_CHECKED = ["types", "geometry", "heads", "losses", "metrics"]
+# Of these not the folders of kernels: a function that was wrapped cannot be compiled.
+for name in ("encoder", "recalibration"):
+    _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]
 install_import_hook([f"ghgs_lit.{name}" for name in _CHECKED], "beartype.beartype")
 
 import torch  # noqa: E402

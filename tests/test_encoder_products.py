@@ -57,6 +57,17 @@ def test_product_is_the_linear_layer(convolutions, monkeypatch, shape, bias):
         torch.testing.assert_close(mine, own)
 
 
+@pytest.mark.parametrize(("rows", "calls"), [(11, 5), (12, 1), (40, 1)])
+def test_weights_of_products_of_few_rows_are_copied_in_parts(convolutions, monkeypatch, rows, calls):
+    monkeypatch.setattr(ghgs_lit.linear, "_COPY", 24)
+    g = torch.Generator().manual_seed(0)
+    x, weight, b = (torch.randn(s, generator=g) for s in ((rows, 12), (9, 12), (9,)))
+    seen, convolve = [], F.conv2d
+    monkeypatch.setattr(F, "conv2d", lambda *args: seen.append(1) or convolve(*args))
+    torch.testing.assert_close(product(x, weight, b), F.linear(x, weight, b))
+    assert len(seen) == calls
+
+
 def test_product_of_other_kinds_is_left_alone(convolutions):
     x, weight = torch.randn(5, 8), torch.randn(6, 8)
     assert torch.equal(product(x.double(), weight.double()), x.double() @ weight.double().T)

@@ -274,7 +274,6 @@ def test_blocks_of_queries_change_nothing(monkeypatch):
     tokens, points, batch = scene()
     module = make(neighbors="mixed")
     expected = module(tokens, points, batch)
-    monkeypatch.setattr("ghgs_lit.recalibration.attention._SCORES", 50)
     monkeypatch.setattr("ghgs_lit.recalibration.attention._ROWS", 5)
     with torch.no_grad():
         found = module(tokens, points, batch)

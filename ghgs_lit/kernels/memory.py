@@ -14,34 +14,36 @@ def pointer_to(context, builder, array_type, array, index, index_type, kind):
     return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())
 
 
-def _alignment(kind) -> int:
-    """Vectors of floats are read and written where a cache line begins, vectors of doubles anywhere."""
-    return 64 if kind is floats else 8
+def _make_access(alignment_of):
+    @intrinsic
+    def load(typing_context, array, index):
+        """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
+        kind = vector_of(array.dtype)
+
+        def emit(context, builder, sig, args):
+            address = pointer_to(context, builder, array, *args, index, kind.llvm)
+            return builder.load(address, align=alignment_of(kind))
+
+        return kind(array, index), emit
+
+    @intrinsic
+    def store(typing_context, array, index, value):
+        """Write a vector to ``array[index]`` and after."""
+        kind = vector_of(array.dtype)
+
+        def emit(context, builder, sig, args):
+            address = pointer_to(context, builder, array, *args[:2], index, kind.llvm)
+            builder.store(args[2], address, align=alignment_of(kind))
+            return context.get_dummy_value()
+
+        return types.void(array, index, kind), emit
+
+    return load, store
 
 
-@intrinsic
-def load(typing_context, array, index):
-    """The vector that starts at ``array[index]`` of a contiguous, one-dimensional array."""
-    kind = vector_of(array.dtype)
-
-    def emit(context, builder, sig, args):
-        address = pointer_to(context, builder, array, *args, index, kind.llvm)
-        return builder.load(address, align=_alignment(kind))
-
-    return kind(array, index), emit
-
-
-@intrinsic
-def store(typing_context, array, index, value):
-    """Write a vector to ``array[index]`` and after; alignment as for ``load``."""
-    kind = vector_of(array.dtype)
-
-    def emit(context, builder, sig, args):
-        address = pointer_to(context, builder, array, *args[:2], index, kind.llvm)
-        builder.store(args[2], address, align=_alignment(kind))
-        return context.get_dummy_value()
-
-    return types.void(array, index, kind), emit
+# Vectors of floats where a cache line begins, vectors of doubles anywhere.
+load, store = _make_access(lambda kind: 64 if kind is floats else 8)
+load_anywhere, store_anywhere = _make_access(lambda kind: 4 if kind is floats else 8)
 
 
 @intrinsic

@@ -1,7 +1,7 @@
 """The recalibration stage: cross-view attention among tokens that are near to one another in space."""
 
 from ghgs_lit.recalibration.attention import SIMILARITIES, SemanticAttention
-from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors
+from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
 from ghgs_lit.recalibration.recalibration import Recalibration
 
-__all__ = ["SIMILARITIES", "Neighbors", "Recalibration", "SemanticAttention", "nearest_neighbors"]
+__all__ = ["MODES", "SIMILARITIES", "Neighbors", "Recalibration", "SemanticAttention", "nearest_neighbors"]

@@ -8,13 +8,14 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
-from ghgs_lit.linear import Linear, even_parts, product
+from ghgs_lit.linear import Linear, even_parts
+from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.neighbors import Neighbors
 
 SIMILARITIES = ("product", "product_clamped", "log", "none")
 
-#: Scores of one head, and rows of tokens, that are held at once where no gradient is kept.
-_SCORES, _ROWS = 1 << 22, 512
+#: Tokens that are handled at once where no gradient is kept.
+_ROWS = 512
 
 
 class SemanticAttention(nn.Module):
@@ -63,56 +64,48 @@ class SemanticAttention(nn.Module):
             neighbors: of the ``n_b`` tokens of each element, as indices within the element.
             cosines: ``[n_b, k_b]`` for each element; None where ``similarity`` is ``none``.
         """
-        return _by_rows(self._residual, x, self._gathered(x, neighbors, cosines))
-
-    def _gathered(
-        self, x: Float[Tensor, "N C"], neighbors: Sequence[Neighbors], cosines: Sequence[Tensor] | None
-    ) -> Float[Tensor, "N i"]:
-        """What every token takes from its neighbours."""
         counts = [len(element.index) for element in neighbors]
-        parts = zip(
-            *(t.split(counts) for t in self._queries_keys_values(x)),
-            neighbors,
-            cosines if cosines is not None else [None] * len(counts),
-            strict=True,
-        )
-        found = [self._attend(*part) for part in parts]
+        parts = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
+        found = [self._recalibrated(*part) for part in parts]
         return found[0] if len(found) == 1 else torch.cat(found)
 
-    def _queries_keys_values(self, x: Float[Tensor, "N C"]) -> list[Float[Tensor, "N i"]]:
-        def project(part: Tensor) -> Tensor:
-            normed = self.norm1(part)
-            return torch.cat([p(normed) for p in (self.q_proj, self.k_proj, self.v_proj)], dim=-1)
+    def _recalibrated(
+        self, x: Float[Tensor, "n C"], neighbors: Neighbors, cosine: Float[Tensor, "n k"] | None
+    ) -> Float[Tensor, "n C"]:
+        """One element: keys and values of all, then some tokens at a time."""
+        keys_values = _by_rows(lambda rows: self._project(x[rows], self.k_proj, self.v_proj), len(x))
+        k, v = keys_values.chunk(2, dim=-1)
 
-        return list(_by_rows(project, x).chunk(3, dim=-1))
+        def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
+            near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
+            q = self._project(x[rows], self.q_proj)
+            y = self._attend(q, k, v, near, None if cosine is None else cosine[rows])
+            residual = x[rows] + self.o_proj(y)
+            first, gelu, second = self.mlp  # one by one: what a layer has read is freed before the next
+            return residual + second(gelu(first(self.norm2(residual))))
 
-    def _residual(self, x: Float[Tensor, "N C"], y: Float[Tensor, "N i"]) -> Float[Tensor, "N C"]:
-        x = x + self.o_proj(y)
-        return x + self.mlp(self.norm2(x))
+        return _by_rows(recalibrate, len(x))
+
+    def _project(self, x: Float[Tensor, "m C"], *projections: nn.Module) -> Float[Tensor, "m _"]:
+        normed = self.norm1(x)
+        return wide(torch.cat([project(normed) for project in projections], dim=-1))
 
     def _attend(
         self,
-        q: Float[Tensor, "n c"],
-        k: Float[Tensor, "n c"],
-        v: Float[Tensor, "n c"],
+        q: Float[Tensor, "m i"],
+        k: Float[Tensor, "n i"],
+        v: Float[Tensor, "n i"],
         neighbors: Neighbors,
-        cosine: Float[Tensor, "n k"] | None,
-    ) -> Float[Tensor, "n c"]:
-        """One element, wide. All pairs are scored, then the neighbours' picked: no N x k x C is ever held."""
+        cosine: Float[Tensor, "m k"] | None,
+    ) -> Float[Tensor, "m i"]:
+        """What ``m`` tokens take from their neighbours. Elsewhere than on a CPU, all pairs are scored, then
+        the neighbours' picked: a product of all is faster than gathers, and no m x k x C is ever held."""
         with torch.autocast(q.device.type, enabled=False):
-            q, k, v = (wide(t).unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
-            if torch.is_grad_enabled():
-                return self._mix(q, k, v, neighbors, cosine).transpose(0, 1).flatten(1)
-            n = q.shape[1]
-            y = q.new_empty(n, *q.shape[::2])
-            # Head by head and block by block, so that the scores stay in a CPU's cache.
-            for a in range(self.num_heads):
-                keys, values = k[a : a + 1].contiguous(), v[a : a + 1].mT.contiguous().mT
-                for rows in even_parts(n, _SCORES // max(1, n)):
-                    near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
-                    weights = None if cosine is None else cosine[rows]
-                    y[rows, a] = self._mix(q[a : a + 1, rows], keys, values, near, weights)[0]
-            return y.flatten(1)
+            if cpu.suits(q, self.num_heads, neighbors.index.shape[1]):
+                influence = (x.expand(neighbors.index.shape) for x in self._influence(cosine))
+                return cpu.attend(q, k, v, self.num_heads, neighbors.index, neighbors.valid, *influence)
+            q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
+            return self._mix(q, k, v, neighbors, cosine).transpose(0, 1).flatten(1)
 
     def _mix(
         self,
@@ -124,7 +117,7 @@ class SemanticAttention(nn.Module):
     ) -> Float[Tensor, "a m d"]:
         """Values of the neighbours of ``m`` queries, weighed by Eq. 3."""
         index = neighbors.index[None].expand(len(q), -1, -1)
-        scores = _products(q * q.shape[-1] ** -0.5, k)
+        scores = q * q.shape[-1] ** -0.5 @ k.mT
         logits = scores.gather(2, index)
         if cosine is not None:
             logits = self._weigh(logits, cosine)
@@ -133,27 +126,29 @@ class SemanticAttention(nn.Module):
         weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
         # Invalid neighbours weigh 0 and may repeat a valid index, so weights are added, not set.
         weights = weights.scatter_add_(2, index, logits.softmax(-1))
-        return _products(weights, v.mT)
+        return weights @ v
 
     def _weigh(self, logits: Float[Tensor, "a m k"], cosine: Float[Tensor, "m k"]) -> Float[Tensor, "a m k"]:
+        factor, term = self._influence(cosine)
+        return logits * factor + term
+
+    def _influence(self, cosine: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
+        """What logits are multiplied by, and what is added to them."""
+        one = torch.ones((), device=cosine.device if cosine is not None else None)
+        if cosine is None:
+            return one, one * 0
         if self.similarity == "log":
-            return logits + cosine.clamp(min=self.s_min).log()
-        return logits * (cosine.clamp(min=0) if self.similarity == "product_clamped" else cosine)
+            return one, cosine.clamp(min=self.s_min).log()
+        return (cosine.clamp(min=0) if self.similarity == "product_clamped" else cosine), one * 0
 
 
-def _products(x: Float[Tensor, "a m d"], y: Float[Tensor, "a n d"]) -> Float[Tensor, "a m n"]:
-    """``x @ y.mT``; one head alone by the faster of a CPU's libraries."""
-    return product(x[0], y[0])[None] if len(x) == 1 else x @ y.mT
-
-
-def _by_rows(function: Callable[..., Tensor], *tensors: Float[Tensor, "N _"]) -> Float[Tensor, "N _"]:
-    """``function(*tensors)`` of all rows, some at a time where no gradient is kept (bounds memory)."""
-    count = len(tensors[0])
+def _by_rows(function: Callable[[slice], Tensor], count: int) -> Float[Tensor, "count _"]:
+    """``function`` of all rows, some at a time where no gradient is kept (bounds memory)."""
     if torch.is_grad_enabled() or count <= _ROWS:
-        return function(*tensors)
+        return function(slice(None))
     result = None
     for rows in even_parts(count, _ROWS):
-        part = function(*(t[rows] for t in tensors))
+        part = function(rows)
         if result is None:
             result = part.new_empty(count, part.shape[1])
         result[rows] = part

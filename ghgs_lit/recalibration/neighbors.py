@@ -13,7 +13,7 @@ from ghgs_lit.linear import even_parts
 MODES = ("all", "other_views", "mixed")
 
 #: Distances that are held at once: bounds memory, and keeps a block in a CPU's cache.
-_BLOCK = 1 << 18
+_BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)

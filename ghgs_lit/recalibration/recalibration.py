@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import wide
 from ghgs_lit.linear import even_parts, product
+from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
 from ghgs_lit.types import Batch, Points, Tokens
@@ -96,6 +97,8 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
     """
     with torch.autocast(semantic.device.type, enabled=False):
         semantic = wide(semantic)
+        if cpu.suits(semantic, 1, neighbors.index.shape[1]):
+            return cpu.cosines(semantic, neighbors.index)
         # What stays is made first: behind freed features it would hold their memory.
         cosines = semantic.new_empty(neighbors.index.shape)
         unit = F.normalize(semantic, dim=-1, eps=1e-12)

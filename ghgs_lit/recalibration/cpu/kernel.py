@@ -1,0 +1,111 @@
+"""Attention of tokens over their neighbours (paper, Eqs. 3 to 5), one token after the other."""
+
+import math
+from functools import cache
+
+import numpy as np
+from numba.core import types
+
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel
+
+LANES = simd.LANES
+LOWEST, DEEPEST = np.float32(-np.inf), np.float32(126)
+# Below, a feature counts as of this length: its cosine to all is 0.
+NO_LENGTH = np.float32(1e-12)
+
+
+ROWS = types.Array(types.float32, 2, "A")  # parts of larger matrices, and whole ones
+TABLE, INDEX, VALID = (types.Array(t, 2, "C") for t in (types.float32, types.int64, types.boolean))
+
+
+def _compiled(function, *arguments):
+    compiled = kernel(function)
+    compiled.compile((*arguments, types.int64, types.int64))
+    compiled.disable_compile()
+    return compiled
+
+
+@cache
+def attend_tokens():
+    """``(q, k, v, index, valid, factor, term, out, heads, first, last)``, compiled or found on disk."""
+    return _compiled(_attend_tokens, ROWS, ROWS, ROWS, INDEX, VALID, TABLE, TABLE, TABLE, types.int64)
+
+
+@cache
+def compare_tokens():
+    """``(features, index, out, first, last)``, compiled or found on disk."""
+    return _compiled(_compare_tokens, ROWS, INDEX, TABLE)
+
+
+def _attend_tokens(q, k, v, index, valid, factor, term, out, heads, first, last):
+    """Rows ``first`` to ``last`` of ``out``; see :func:`ghgs_lit.recalibration.cpu.attend`."""
+    width = q.shape[1] // heads
+    scale = np.float32(math.log2(math.e) / math.sqrt(width))
+    log2_e = np.float32(math.log2(math.e))
+    most = index.shape[1]
+    chosen = np.empty(most, np.int64)
+    factors, terms = np.empty(most, np.float32), np.empty(most, np.float32)
+    weights = simd.aligned(-(-most // LANES) * LANES)
+    for token in range(first, last):
+        count = 0
+        for j in range(most):
+            if valid[token, j]:
+                chosen[count] = index[token, j]
+                factors[count], terms[count] = scale * factor[token, j], log2_e * term[token, j]
+                count += 1
+        for head in range(heads):
+            start = head * width
+            for j in range(count):
+                logit = factors[j] * _dot(q[token], k[chosen[j]], start, width)
+                weights[j] = logit + terms[j]
+            share = np.float32(1) / _exponentials(weights, count)
+            for at in range(start, start + width, LANES):
+                total = simd.full(np.float32(0))
+                for j in range(count):
+                    total = simd.fma(memory.load_anywhere(v[chosen[j]], at), weights[j], total)
+                memory.store_anywhere(out[token], at, total * simd.full(share))
+
+
+def _compare_tokens(features, index, out, first, last):
+    """Rows ``first`` to ``last`` of ``out``; see :func:`ghgs_lit.recalibration.cpu.cosines`."""
+    width = features.shape[1]
+    unit = simd.aligned(width)
+    for token in range(first, last):
+        row = features[token]
+        share = simd.full(_inverse_length(row, width))
+        for at in range(0, width, LANES):
+            memory.store(unit, at, memory.load_anywhere(row, at) * share)
+        for j in range(index.shape[1]):
+            other = features[index[token, j]]
+            out[token, j] = _dot(unit, other, 0, width) * _inverse_length(other, width)
+
+
+@helper
+def _inverse_length(row, width):
+    return np.float32(1) / max(np.sqrt(_dot(row, row, 0, width)), NO_LENGTH)
+
+
+@helper
+def _dot(x, y, start, width):
+    total = simd.full(np.float32(0))
+    for at in range(start, start + width, LANES):
+        total = simd.fma(memory.load_anywhere(x, at), memory.load_anywhere(y, at), total)
+    return simd.lane_sum(total)
+
+
+@helper
+def _exponentials(values, count):
+    """Turn ``count`` values into powers of 2 relative to their largest, 1; returns the sum. NaN stays."""
+    for j in range(count, len(values)):
+        values[j] = LOWEST
+    highest = simd.full(LOWEST)
+    for j in range(0, count, LANES):
+        highest = simd.maximum(memory.load(values, j), highest)
+    top = simd.full(simd.highest_lane(highest))
+    total, deepest = simd.full(np.float32(0)), simd.full(DEEPEST)
+    for j in range(0, count, LANES):
+        power = simd.exp2_minus(simd.minimum(deepest, top - memory.load(values, j)))
+        total = total + power
+        memory.store(values, j, power)
+    return simd.lane_sum(total)
