@@ -12,7 +12,7 @@ from torch import Tensor, nn
 #: Multiplications of a product from which the other library's greater cost of a call pays, and inputs
 #: from which PyTorch takes oneDNN's convolution (on two threads or more).
 _LARGE, _PIXELS = 1 << 24, 20480
-#: Numbers of a weight that are copied at once where there are few rows.
+#: Numbers of a weight that are copied at once where there are fewer rows than they have channels.
 _COPY = 1 << 20
 
 
@@ -41,14 +41,19 @@ def product(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     large = x.numel() * len(weight) >= _LARGE and x.numel() > _PIXELS and x.dtype == torch.float32
     if not (large and prefers_convolution(x.device)) or torch.is_autocast_enabled("cpu"):
         return F.linear(x, weight, bias)
-    # Rows are pixels whose channels lie innermost, so neither side is copied.
+    k = x.shape[-1]
+    if x.numel() >= k * k or weight.numel() <= _COPY:
+        return _convolve(x, weight, bias)
+    # oneDNN copies the weight into an order of its own: for few rows that would take most of the memory.
+    parts = even_parts(len(weight), _COPY // k)
+    return torch.cat([_convolve(x, weight[p], None if bias is None else bias[p]) for p in parts], dim=-1)
+
+
+def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Rows are pixels whose channels lie innermost, so neither side is copied."""
     pixels = x.reshape(1, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)
-    # oneDNN copies the weight into an order of its own: for few rows in parts, or copies are the most of it.
-    few = pixels.shape[-1] < x.shape[-1]
-    parts = even_parts(len(weight), _COPY // x.shape[-1] if few else len(weight))
-    found = [F.conv2d(pixels, weight[p, :, None, None], None if bias is None else bias[p]) for p in parts]
-    joined = found[0] if len(found) == 1 else torch.cat(found, dim=1)
-    return joined.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
+    found = F.conv2d(pixels, weight[:, :, None, None], bias)
+    return found.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
 
 
 class Linear(nn.Linear):
