@@ -1,8 +1,10 @@
 """Semantic-consistency attention over given neighbours (paper, Eqs. 3 to 5)."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -15,7 +17,7 @@ from ghgs_lit.recalibration.neighbors import Neighbors
 SIMILARITIES = ("product", "product_clamped", "log", "none")
 
 #: Tokens that are handled at once where no gradient is kept.
-_ROWS = 512
+_ROWS = 424
 
 
 class SemanticAttention(nn.Module):
@@ -75,14 +77,17 @@ class SemanticAttention(nn.Module):
         """One element: keys and values of all, then some tokens at a time."""
         keys_values = _by_rows(lambda rows: self._project(x[rows], self.k_proj, self.v_proj), len(x))
         k, v = keys_values.chunk(2, dim=-1)
+        ask, answer, first, second = (
+            _ready(linear) for linear in (self.q_proj, self.o_proj, self.mlp[0], self.mlp[2])
+        )
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
-            q = self._project(x[rows], self.q_proj)
+            q = wide(ask(self.norm1(x[rows])))
             y = self._attend(q, k, v, near, None if cosine is None else cosine[rows])
-            residual = x[rows] + self.o_proj(y)
-            first, gelu, second = self.mlp  # one by one: what a layer has read is freed before the next
-            return residual + second(gelu(first(self.norm2(residual))))
+            residual = x[rows] + answer(y)
+            # Layer by layer: what one has read is freed before the next one runs.
+            return residual + second(self.mlp[1](first(self.norm2(residual))))
 
         return _by_rows(recalibrate, len(x))
 
@@ -140,6 +145,15 @@ class SemanticAttention(nn.Module):
         if self.similarity == "log":
             return one, cosine.clamp(min=self.s_min).log()
         return (cosine.clamp(min=0) if self.similarity == "product_clamped" else cosine), one * 0
+
+
+def _ready(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
+    """``linear`` with its numbers in autocast's type: cast once, not again for every part of the rows."""
+    kind = linear.weight.device.type
+    if not torch.is_autocast_enabled(kind):
+        return linear
+    dtype = torch.get_autocast_dtype(kind)
+    return partial(F.linear, weight=linear.weight.to(dtype), bias=linear.bias.to(dtype))
 
 
 def _by_rows(function: Callable[[slice], Tensor], count: int) -> Float[Tensor, "count _"]:
