@@ -75,11 +75,14 @@ class SemanticAttention(nn.Module):
         self, x: Float[Tensor, "n C"], neighbors: Neighbors, cosine: Float[Tensor, "n k"] | None
     ) -> Float[Tensor, "n C"]:
         """One element: keys and values of all, then some tokens at a time."""
-        keys_values = _by_rows(lambda rows: self._project(x[rows], self.k_proj, self.v_proj), len(x))
-        k, v = keys_values.chunk(2, dim=-1)
-        ask, answer, first, second = (
-            _ready(linear) for linear in (self.q_proj, self.o_proj, self.mlp[0], self.mlp[2])
-        )
+        linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
+        ask, key, value, answer, first, second = map(_ready, linears)
+
+        def keys_values(rows: slice) -> Float[Tensor, "m kv"]:
+            normed = self.norm1(x[rows])
+            return wide(torch.cat((key(normed), value(normed)), dim=-1))
+
+        k, v = _by_rows(keys_values, len(x)).chunk(2, dim=-1)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
@@ -90,10 +93,6 @@ class SemanticAttention(nn.Module):
             return residual + second(self.mlp[1](first(self.norm2(residual))))
 
         return _by_rows(recalibrate, len(x))
-
-    def _project(self, x: Float[Tensor, "m C"], *projections: nn.Module) -> Float[Tensor, "m _"]:
-        normed = self.norm1(x)
-        return wide(torch.cat([project(normed) for project in projections], dim=-1))
 
     def _attend(
         self,
@@ -148,7 +147,7 @@ class SemanticAttention(nn.Module):
 
 
 def _ready(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
-    """``linear`` with its numbers in autocast's type: cast once, not again for every part of the rows."""
+    """``linear`` with its numbers in autocast's type: cast once, not again for every part of the tokens."""
     kind = linear.weight.device.type
     if not torch.is_autocast_enabled(kind):
         return linear

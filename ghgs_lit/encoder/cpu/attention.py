@@ -12,18 +12,16 @@ from ghgs_lit.kernels import pool
 
 # Multiplications from which the kernel pays: below, PyTorch's own takes milliseconds.
 _LARGE = 1 << 27
+# What it needs of a processor: registers for its tiles, and their product in bfloat16.
+_FEATURE = {torch.float32: "avx512f", torch.bfloat16: "avx512bf16"}
 
 
 def suits(q: Tensor, v: Tensor) -> bool:
     """Whether :func:`attend` can and should take queries like ``q`` [n, a, t, d] and values like ``v``."""
-    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _features_of:
+    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURE:
         return False
     n, a, t, d = q.shape
-    return d % PANEL == 0 and n * a * t * v.shape[2] * d >= _LARGE and _has(_features_of[v.dtype])
-
-
-#: What the kernel needs of a processor: registers for its tiles, and their product in bfloat16.
-_features_of = {torch.float32: "avx512f", torch.bfloat16: "avx512bf16"}
+    return d % PANEL == 0 and n * a * t * v.shape[2] * d >= _LARGE and _has(_FEATURE[v.dtype])
 
 
 @cache
