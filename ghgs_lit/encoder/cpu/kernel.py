@@ -45,7 +45,7 @@ def _attend_head(q, k, v, out, first, last):
                 _score(queries, row, keys, key, seen, steps, scores)
                 for r in range(row, row + ROWS):
                     old = highest[r]
-                    top = max(old, _highest(scores, r - row, seen) * scale)
+                    top = _highest(scores, r - row, seen) * scale
                     if top > old:
                         _scale_down(old - top, sums, totals, r, width)
                         highest[r] = top
