@@ -167,26 +167,21 @@ def floor(typing_context, a):
     return a(a), lambda context, builder, sig, args: call(builder, "floor", a, *args)
 
 
-@intrinsic
-def minimum(typing_context, a, b):
-    """The smaller of two numbers, lane by lane; ``b`` where either is NaN."""
+def _make_extreme(sign: str):
+    @intrinsic
+    def extreme(typing_context, a, b):
+        """The smaller or larger of two numbers, lane by lane; ``b`` where either is NaN."""
 
-    def emit(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
+        def emit(context, builder, sig, args):
+            return builder.select(builder.fcmp_ordered(sign, *args), *args)
 
-    kind = _common(a, b)
-    return kind(kind, kind), emit
+        kind = _common(a, b)
+        return kind(kind, kind), emit
+
+    return extreme
 
 
-@intrinsic
-def maximum(typing_context, a, b):
-    """The larger of two numbers, lane by lane; ``b`` where either is NaN."""
-
-    def emit(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
-
-    kind = _common(a, b)
-    return kind(kind, kind), emit
+minimum, maximum = _make_extreme("<"), _make_extreme(">")
 
 
 @intrinsic

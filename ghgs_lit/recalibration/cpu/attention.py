@@ -49,7 +49,8 @@ def cosines(features: Float[Tensor, "n c"], index: Int[Tensor, "n k"]) -> Float[
     from ghgs_lit.recalibration.cpu.kernel import compare_tokens
 
     out = torch.empty(index.shape)
-    _run(compare_tokens(), _rows(features), index.contiguous().numpy(), out.numpy())
+    shares = 1 / features.detach().norm(dim=-1).clamp(min=1e-12)
+    _run(compare_tokens(), _rows(features), *(x.numpy() for x in (shares, index.contiguous(), out)))
     return out
 
 

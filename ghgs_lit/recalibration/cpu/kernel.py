@@ -11,11 +11,10 @@ from ghgs_lit.kernels.compile import helper, kernel
 
 LANES = simd.LANES
 LOWEST, DEEPEST = np.float32(-np.inf), np.float32(126)
-# Below, a feature counts as of this length: its cosine to all is 0.
-NO_LENGTH = np.float32(1e-12)
 
 
 ROWS = types.Array(types.float32, 2, "A")  # parts of larger matrices, and whole ones
+LINE = types.Array(types.float32, 1, "C")
 TABLE, INDEX, VALID = (types.Array(t, 2, "C") for t in (types.float32, types.int64, types.boolean))
 
 
@@ -34,8 +33,8 @@ def attend_tokens():
 
 @cache
 def compare_tokens():
-    """``(features, index, out, first, last)``, compiled or found on disk."""
-    return _compiled(_compare_tokens, ROWS, INDEX, TABLE)
+    """``(features, shares, index, out, first, last)``, compiled or found on disk."""
+    return _compiled(_compare_tokens, ROWS, LINE, INDEX, TABLE)
 
 
 def _attend_tokens(q, k, v, index, valid, factor, term, out, heads, first, last):
@@ -67,23 +66,17 @@ def _attend_tokens(q, k, v, index, valid, factor, term, out, heads, first, last)
                 memory.store_anywhere(out[token], at, total * simd.full(share))
 
 
-def _compare_tokens(features, index, out, first, last):
-    """Rows ``first`` to ``last`` of ``out``; see :func:`ghgs_lit.recalibration.cpu.cosines`."""
+def _compare_tokens(features, shares, index, out, first, last):
+    """Rows ``first`` to ``last`` of ``out``; ``shares`` are the inverse lengths of the features."""
     width = features.shape[1]
     unit = simd.aligned(width)
     for token in range(first, last):
-        row = features[token]
-        share = simd.full(_inverse_length(row, width))
+        row, share = features[token], simd.full(shares[token])
         for at in range(0, width, LANES):
             memory.store(unit, at, memory.load_anywhere(row, at) * share)
         for j in range(index.shape[1]):
-            other = features[index[token, j]]
-            out[token, j] = _dot(unit, other, 0, width) * _inverse_length(other, width)
-
-
-@helper
-def _inverse_length(row, width):
-    return np.float32(1) / max(np.sqrt(_dot(row, row, 0, width)), NO_LENGTH)
+            other = index[token, j]
+            out[token, j] = _dot(unit, features[other], 0, width) * shares[other]
 
 
 @helper
