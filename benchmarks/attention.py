@@ -54,7 +54,7 @@ def main() -> None:
         exact = pytorch(*(x[:1, :1].double() for x in qkv))[0, :, 0]
         for dtype in (torch.float32, torch.bfloat16):
             q, k, v = (x.contiguous() for x in qkv.to(dtype))
-            if not cpu.suits(q, v):
+            if not cpu.is_supported(q, v):
                 print(f"| {name} | {dtype} | not used on this processor | | | | |")
                 continue
             calls = {f: lambda f=f, x=(q, k, v): f(*x) for f in (cpu.attend, pytorch)}

@@ -29,7 +29,7 @@ from stage_scenes import make_batch
 
 from ghgs_lit import encoder, recalibration
 from ghgs_lit.config import conf_dir
-from ghgs_lit.linear import product
+from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Points, Tokens
 
@@ -216,8 +216,8 @@ def product_rates(tokens: int, width: int, dtype: torch.dtype) -> dict[str, floa
     return {
         "torch.matmul, best square": max(rate(matmul, s, s, s) for s in squares),
         "torch.matmul, the encoder's shapes": max(rate(matmul, *shape) for shape in shapes),
-        "ours, best square": max(rate(product, s, s, s) for s in squares),
-        "ours, the encoder's shapes": max(rate(product, *shape) for shape in shapes),
+        "ours, best square": max(rate(linear, s, s, s) for s in squares),
+        "ours, the encoder's shapes": max(rate(linear, *shape) for shape in shapes),
     }
 
 
@@ -226,7 +226,7 @@ def load_kernels(dtype: torch.dtype) -> float:
     """Seconds until compiled kernels of the stages are there: compiled, or found on disk."""
     start = time.perf_counter()
     x = torch.zeros(1, 16, 1024, 64, dtype=dtype)
-    if encoder.cpu.suits(x, x):
+    if encoder.cpu.is_supported(x, x):
         encoder.cpu.attend(*[x[:, :1, :1]] * 3)
     row, place = torch.ones(1, 128), torch.zeros(1, 1, dtype=torch.int64)
     recalibration.cpu.attend(row, row, row, 8, place, place == 0, row[:, :1], row[:, :1])

@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ghgs_lit.config import build, conf_dir
-from ghgs_lit.data.base import PhotographsDataModule
-from ghgs_lit.data.miniatures import thuman2
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.synthesis.miniatures import thuman2
 
 
 def build_data(overrides: list[str]) -> PhotographsDataModule:

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ghgs_lit.people import TexturedMesh, generate
 from ghgs_lit.rendering import RasterSettings, render
+from ghgs_lit.synthesis.people import TexturedMesh, generate
 from ghgs_lit.types import Cameras, Gaussians
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")

@@ -9,15 +9,15 @@ from typing import Any
 import torch
 from torch import nn
 
+from ghgs_lit.bounds.visual_hull import Interval
 from ghgs_lit.config import build
 from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.crop import patch_padding, subject_windows
-from ghgs_lit.geometry.points import Unprojection
-from ghgs_lit.geometry.visual_hull import Interval
+from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
-from ghgs_lit.precision import precision_of
+from ghgs_lit.kernels.precision import precision_of
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import (
@@ -74,7 +74,7 @@ class GHGS(nn.Module):
         self.unproject = unprojection or Unprojection()
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
-        #: Of the stages' products: one of :data:`ghgs_lit.precision.PRECISIONS`.
+        #: Of the stages' products: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`.
         self.precision = "inherit"
         self.frames = [patch_padding] * (pad == "multiple") + [subject_windows] * crop
 

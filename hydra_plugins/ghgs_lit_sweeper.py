@@ -1,4 +1,4 @@
-"""Hydra finds sweepers in ``hydra_plugins`` only; what this one does stands in ``ghgs_lit.sweeps.grid``."""
+"""Hydra finds sweepers in ``hydra_plugins`` only; what this one does stands in ``ghgs_lit.runs.grid``."""
 
 from typing import Any
 
@@ -9,6 +9,6 @@ class GridSweeper(basic_sweeper.BasicSweeper):
     """Every combination of values once, without what is done; comes back to what others worked on."""
 
     def sweep(self, arguments: list[str]) -> Any:
-        from ghgs_lit.sweeps.grid import sweep  # Hydra imports its plugins for every application
+        from ghgs_lit.runs.grid import sweep  # Hydra imports its plugins for every application
 
         return sweep(self, arguments)

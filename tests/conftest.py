@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
-_CHECKED = ["types", "geometry", "heads", "losses", "metrics"]
+_CHECKED = ["types", "bounds", "geometry", "heads", "losses", "metrics"]
 # Of these not the folders of kernels: a function that was wrapped cannot be compiled.
 for name in ("encoder", "recalibration"):
     _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]

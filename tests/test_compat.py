@@ -4,19 +4,19 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from stage_models import config, make_model
-from stage_scenes import make_batch
-from weight_files import PUBLISHED
-from weight_files import config as imported_config
 
 from ghgs_lit.config import conf_dir
-from ghgs_lit.geometry.points import Unprojection
 from ghgs_lit.geometry.projection import project
+from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import BOUNDED, DepthHead
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
 from ghgs_lit.weights import names
 from ghgs_lit.weights.switches import release_switches
+from tests.helpers.models import config, make_model
+from tests.helpers.scenes import make_batch
+from tests.helpers.weights import PUBLISHED
+from tests.helpers.weights import config as imported_config
 
 #: What a new model of the paper does, beside what the release does (docs/weights.md).
 QUIRKS = {

@@ -5,20 +5,20 @@ import sys
 
 import pytest
 import torch
-from stage_models import close, config, make_model
-from stage_scenes import CASES, fixture, make_batch
 from torch import nn
 
 import ghgs_lit
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.points import Unprojection
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
+from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.model import GHGS, check_batch
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Cameras, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
+from tests.helpers.models import close, config, make_model
+from tests.helpers.scenes import CASES, fixture, make_batch
 
 
 def element(batch, b):

@@ -43,8 +43,11 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
     assert conf == (site / "ghgs_lit" / "conf").resolve()
     assert groups(conf) == groups(REPOSITORY / "conf")
     assert (site / "hydra_plugins" / "ghgs_lit_sweeper.py").is_file()
-    shipped = {p.name for p in (REPOSITORY / "ghgs_lit" / "people" / "assets").iterdir() if p.is_file()}
-    assert shipped == {p.name for p in (site / "ghgs_lit" / "people" / "assets").iterdir() if p.is_file()}
+    assets = Path("ghgs_lit", "synthesis", "people", "assets")
+    shipped, packed = (
+        {p.name for p in (root / assets).iterdir() if p.is_file()} for root in (REPOSITORY, site)
+    )
+    assert shipped == packed
 
 
 def test_editable_install(tmp_path):

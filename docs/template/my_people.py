@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ghgs_lit.data.base import PhotographsDataModule
+from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import (
     Reader,
     View,

@@ -9,9 +9,9 @@ from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
-from ghgs_lit.experiments.baselines import BASELINES, baseline
-from ghgs_lit.experiments.evaluation import Method, ModelMethod
-from ghgs_lit.experiments.session import build_data, measure_and_write, pick_device, with_trained_data
+from ghgs_lit.evaluation.baselines import BASELINES, baseline
+from ghgs_lit.evaluation.measure import Method, ModelMethod
+from ghgs_lit.evaluation.session import build_data, measure_and_write, pick_device, with_trained_data
 from ghgs_lit.model import GHGS, read_checkpoint
 
 

@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.errors import InputError
-from ghgs_lit.sweeps.work import register_resolvers
+from ghgs_lit.runs.job import register_resolvers
 
 BAD_INPUT = (InputError, FileNotFoundError)
 register_resolvers()  # wherever a launcher brings a job

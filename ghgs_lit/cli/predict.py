@@ -9,12 +9,12 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.experiments.pictures import save_png, sheet, to_uint8
-from ghgs_lit.experiments.ply import write_ply
-from ghgs_lit.experiments.session import build_data, pick_device, with_trained_data
-from ghgs_lit.experiments.turntable import turntable
+from ghgs_lit.evaluation.session import build_data, pick_device, with_trained_data
+from ghgs_lit.export.ply import write_ply
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch
+from ghgs_lit.visualization.pictures import save_png, sheet, to_uint8
+from ghgs_lit.visualization.turntable import turntable
 
 
 def subject_batch(data: LightningDataModule, subject: str | int, split: str) -> Batch:

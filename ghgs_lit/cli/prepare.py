@@ -7,10 +7,10 @@ from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.config import build
-from ghgs_lit.data.base import PHASES, PhotographsDataModule
 from ghgs_lit.data.check import inspect, show, write
-from ghgs_lit.data.datamodule import ScansDataModule
+from ghgs_lit.data.datamodule import PHASES, PhotographsDataModule
 from ghgs_lit.errors import InputError, choice
+from ghgs_lit.synthesis.datamodules import ScansDataModule
 
 log = logging.getLogger(__name__)
 

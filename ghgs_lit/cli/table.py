@@ -8,10 +8,10 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.console import Console
 
+from ghgs_lit import tables as t
 from ghgs_lit.cli.runtime import announce, output_dir, plain
-from ghgs_lit.data.settings import from_config
+from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.experiments import tables as t
 
 
 def _listed(key: str, value: Any, kind: type) -> tuple | None:

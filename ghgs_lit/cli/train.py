@@ -15,13 +15,13 @@ from ghgs_lit.cli.runtime import announce, output_dir, plain, write_config
 from ghgs_lit.config import build
 from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
-from ghgs_lit.experiments.evaluation import ModelMethod
-from ghgs_lit.experiments.results import read_results
-from ghgs_lit.experiments.session import build_data, choices, measure_and_write, overrides
+from ghgs_lit.evaluation.measure import ModelMethod
+from ghgs_lit.evaluation.session import build_data, choices, measure_and_write, overrides
 from ghgs_lit.model import GHGS
-from ghgs_lit.sweeps.plan import print_single_plan
-from ghgs_lit.sweeps.run import Run
-from ghgs_lit.sweeps.work import going_on, in_sweep, needs_own_process, work_in_own_process, work_on
+from ghgs_lit.runs.job import going_on, in_sweep, needs_own_process, work_in_own_process, work_on
+from ghgs_lit.runs.plan import print_single_plan
+from ghgs_lit.runs.results import read_results
+from ghgs_lit.runs.run import Run
 from ghgs_lit.training import GHGSModule, loggers, start
 from ghgs_lit.training.checkpoints import WholeFiles
 

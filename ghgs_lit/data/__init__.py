@@ -1,4 +1,4 @@
-"""Photographs of people: made from meshes or read from published data sets, drawn into batches."""
+"""Photographs of people: read from published data sets, drawn into batches."""
 
 import importlib
 from typing import Any
@@ -6,10 +6,6 @@ from typing import Any
 # Looked up when asked for: rendering processes import this package too, and need no Lightning.
 _MODULES = {
     "HuMManDataModule": "humman",
-    "RenderedDataModule": "datamodule",
-    "ScansDataModule": "datamodule",
-    "SyntheticDataModule": "datamodule",
-    "THuman2DataModule": "thuman2",
     "ZJUMoCapDataModule": "zju_mocap",
 }
 

@@ -13,8 +13,8 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
-from ghgs_lit.data.base import PHASES, PhotographsDataModule
 from ghgs_lit.data.contact import Tile, draw_tile, save_sheet
+from ghgs_lit.data.datamodule import PHASES, PhotographsDataModule
 from ghgs_lit.data.overlap import overlap
 from ghgs_lit.data.reader import Reader
 from ghgs_lit.data.sampling import CAMERAS

@@ -1,23 +1,30 @@
 """Which photographs make a sample: input views and targets, in training and in evaluation.
 
-A photograph is named by its ring position ``pid`` and view ``vid`` (see :mod:`ghgs_lit.data.rig`);
+A photograph is named by its ring position ``pid`` and view ``vid`` (see :mod:`ghgs_lit.synthesis.rig`);
 inputs are ring cameras (vid 0). Every draw is a function of (seed, step, index in the batch) alone,
 so that a run goes on exactly where it stopped, whatever the number of workers.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ghgs_lit.data.rig import VIEW_IDS, subject_rng
 from ghgs_lit.errors import InputError, choice, require
 
+VIEW_IDS = (0, 1, 2, 3, 4)
 RING_VID, MIDDLE_VID = 0, 3
 # Streams of random numbers that must not repeat one another.
 _ORDER, _COUNT, _SAMPLE = 0, 1, 2
 
 Photo = tuple[int, int]
+
+
+def subject_rng(seed: int, name: str) -> np.random.Generator:
+    """Random numbers of one subject, the same whichever other subjects there are."""
+    digest = hashlib.sha256(name.encode()).digest()
+    return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
 
 
 @dataclass(frozen=True)

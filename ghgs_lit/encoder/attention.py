@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.rope import Rotary, rotate
 from ghgs_lit.errors import require
-from ghgs_lit.linear import Linear
+from ghgs_lit.kernels.linear import Linear
 
 
 class Attention(nn.Module):
@@ -27,7 +27,7 @@ class Attention(nn.Module):
     def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
         q, k, v = rearrange(self.qkv(x), "n t (s a d) -> s n a t d", s=3, a=self.heads)
         q, k = self._place(q, self.q_norm, rotary), self._place(k, self.k_norm, rotary)
-        if cpu.suits(q, v):
+        if cpu.is_supported(q, v):
             return self.proj(cpu.attend(q, k, v).flatten(2))
         y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
         return self.proj(rearrange(y, "n a t d -> n t (a d)"))

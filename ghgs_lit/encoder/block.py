@@ -8,7 +8,8 @@ from torch.utils.checkpoint import checkpoint
 
 from ghgs_lit.encoder.attention import Attention
 from ghgs_lit.encoder.rope import Rotary
-from ghgs_lit.linear import Linear, even_parts
+from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.parts import even_parts
 
 #: Values inside the MLP that are held at once where no gradient is kept.
 _HIDDEN = 1 << 23

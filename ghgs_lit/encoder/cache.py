@@ -21,8 +21,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from ghgs_lit.bounds.visual_hull import Interval
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.visual_hull import Interval
 from ghgs_lit.types import Tokens
 
 if TYPE_CHECKING:

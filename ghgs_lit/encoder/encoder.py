@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from ghgs_lit.bounds.visual_hull import Interval
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
 from ghgs_lit.encoder.cache import FeatureCache
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.geometry.relative import INTERVAL_CHANNELS, relative_interval
-from ghgs_lit.geometry.visual_hull import Interval
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.relative_depth import INTERVAL_CHANNELS, relative_interval
 from ghgs_lit.types import Tokens
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -142,7 +142,7 @@ class VGGTEncoder(nn.Module):
 
     def _normalized(self, images: Tensor, masks: Tensor, interval: Interval | None) -> Tensor:
         """Channels to zero mean and unit spread, in the precision of the weights."""
-        x = wide(images)
+        x = at_least_float32(images)
         if self.mask_input:
             x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
         x = (x - self.mean) / self.std

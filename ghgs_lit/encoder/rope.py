@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 
 BASE = 100.0
 
@@ -37,7 +37,7 @@ def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) 
     """Tables for heads of ``head_width`` channels (divisible by 4), wide enough for tokens ``like``."""
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
-    angles = angles.to(wide(like).dtype)
+    angles = angles.to(at_least_float32(like).dtype)
     cosine, sine = angles.cos(), angles.sin()
     return Rotary(
         torch.stack((cosine, cosine), dim=-2).flatten(-3), torch.stack((-sine, sine), dim=-2).flatten(-3)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 
 KINDS = ("squared", "huber", "truncated")
 
@@ -22,7 +22,7 @@ def nearest(
     On the CPU by k-d tree in float64; on an accelerator by explicit differences, ``chunk`` queries at a
     time (the matrix-product form of the distance is off by a millimetre at two metres).
     """
-    queries, references = wide(queries.detach()), wide(references.detach())
+    queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
     if queries.device.type == "cpu":
         tree = cKDTree(references.double().numpy(), balanced_tree=False, compact_nodes=False)
         index = tree.query(queries.double().numpy(), workers=torch.get_num_threads())[1]
@@ -71,7 +71,7 @@ def chamfer(
     """
     choice("chamfer.kind", kind, KINDS)
     require(scale > 0, "chamfer.scale", "a positive number of metres", scale)
-    points, references = wide(points), wide(references)
+    points, references = at_least_float32(points), at_least_float32(references)
     if not (torch.isfinite(points).all() and torch.isfinite(references).all()):
         return (points.sum() + references.sum()) * torch.nan
     if len(points) == 0 or len(references) == 0:

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.visual_hull import Interval
+from ghgs_lit.bounds.visual_hull import Interval
 from ghgs_lit.types import Batch, Points, Prediction
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from ghgs_lit.types import Cameras
 
 
-def wide(tensor: Tensor) -> Tensor:
+def at_least_float32(tensor: Tensor) -> Tensor:
     """``tensor`` in float32 or wider: what all geometry is computed in."""
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
@@ -33,7 +33,7 @@ def unproject(
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> Float[Tensor, "*batch 3"]:
     """World points of pixels ``(u, v)`` at z-depth ``depth``: ``R^T (z K^-1 [u v 1]^T - t)``."""
-    pixels, depth, intrinsics, extrinsics = map(wide, (pixels, depth, intrinsics, extrinsics))
+    pixels, depth, intrinsics, extrinsics = map(at_least_float32, (pixels, depth, intrinsics, extrinsics))
     fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
     y = (pixels[..., 1] - intrinsics[..., 1, 2]) / fy
     x = (pixels[..., 0] - intrinsics[..., 0, 2] - intrinsics[..., 0, 1] * y) / fx
@@ -47,7 +47,7 @@ def unproject_maps(
     depth: Float[Tensor, "*batch h w"], cameras: Cameras, stride: int = 1
 ) -> Float[Tensor, "*batch h w 3"]:
     """World points of a depth map whose cells are ``stride`` pixels wide."""
-    centers = pixel_centers(cameras.height, cameras.width, wide(depth), stride)
+    centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth), stride)
     return unproject(
         centers.expand(*depth.shape, 2),
         depth,
@@ -60,7 +60,7 @@ def world_to_camera(
     points: Float[Tensor, "*batch 3"], extrinsics: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*batch 3"]:
     """World points in camera axes, ``R x + t``."""
-    points, extrinsics = wide(points), wide(extrinsics)
+    points, extrinsics = at_least_float32(points), at_least_float32(extrinsics)
     return (extrinsics[..., :3, :3] * points[..., None, :]).sum(-1) + extrinsics[..., :3, 3]
 
 
@@ -71,7 +71,7 @@ def project(
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
     """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 mean nothing."""
     camera = world_to_camera(points, extrinsics)
-    intrinsics = wide(intrinsics)
+    intrinsics = at_least_float32(intrinsics)
     z = camera[..., 2]
     safe = torch.where(z > 0, z, torch.ones_like(z))
     x, y = camera[..., 0] / safe, camera[..., 1] / safe

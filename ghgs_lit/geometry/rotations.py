@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 
 
 def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -12,7 +12,7 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
 
     Scaled by the largest component first, so that norms of 1e-30 or 1e30 neither vanish nor overflow.
     """
-    q = wide(quaternions)
+    q = at_least_float32(quaternions)
     largest = q.abs().amax(-1, keepdim=True).detach()
     is_zero = largest == 0
     q = q / torch.where(is_zero, torch.ones_like(largest), largest)

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 
 
 def inverse_log(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -53,5 +53,5 @@ def split_activated(
     """
     choice("value activation", value, tuple(VALUES))
     choice("confidence activation", confidence, tuple(CONFIDENCES))
-    raw = wide(raw).permute(0, 2, 3, 1)
+    raw = at_least_float32(raw).permute(0, 2, 3, 1)
     return VALUES[value](raw[..., :-1]), CONFIDENCES[confidence](raw[..., -1])

@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ghgs_lit.bounds.visual_hull import Interval, SubjectBounds
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.agreement import photo_agreement
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.geometry.relative import INTERVAL_CHANNELS, relative_interval
-from ghgs_lit.geometry.visual_hull import Interval, SubjectBounds
+from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.relative_depth import INTERVAL_CHANNELS, relative_interval
 from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.dense import decode_views, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
-from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Tokens
 
 
@@ -53,7 +53,7 @@ class DepthHead(nn.Module):
         start: share of the way from near to far at which training starts.
         guide: let the dense head see photographs, masks and the intervals of depth at full resolution.
         agreement: at so many depths of each interval the guide also tells how well the photographs agree
-            (:func:`photo_agreement`); 0: none.
+            (:func:`photo_consistency`); 0: none.
         views: ``all``, or ``subject``: views whose mask is empty are not decoded (their depths mean nothing).
     """
 
@@ -112,9 +112,9 @@ class DepthHead(nn.Module):
         if self.dpt.guide is not None:
             maps = [] if interval is None else [relative_interval(interval, batch.masks)]
             if self.agreement:
-                maps.append(photo_agreement(batch, interval, self.agreement))
+                maps.append(photo_consistency(batch, interval, self.agreement))
             guide = photo_guide(batch, *maps)
-        raw = wide(decode_views(self.dpt, tokens, guide, wanted))
+        raw = at_least_float32(decode_views(self.dpt, tokens, guide, wanted))
         value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
         near, far = interval or (None, None)
         if interval is None:

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from ghgs_lit.errors import require
 from ghgs_lit.heads.guide import GuidePyramid
 from ghgs_lit.heads.position import add_positions_
-from ghgs_lit.linear import even_parts, product
+from ghgs_lit.kernels.linear import linear
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
@@ -26,7 +27,7 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
     """A 1x1 convolution as a linear of pixels: no copy where channels are innermost, as they are here."""
-    return product(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
+    return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
 def _resize(x: Float[Tensor, "n c h w"], size: Sequence[int]) -> Float[Tensor, "n c h2 w2"]:
@@ -164,7 +165,7 @@ class DPTHead(nn.Module):
         """Normalised and projected tokens on the grid; a 1x1 convolution of a map is a linear of tokens."""
         levels = []
         for latent, project in zip(tokens.latent, self.projects, strict=True):
-            projected = product(self.norm(latent), project.weight.flatten(1), project.bias)
+            projected = linear(self.norm(latent), project.weight.flatten(1), project.bias)
             levels.append(dataclasses.replace(tokens, latent=(projected,)).maps(0))
         return levels
 

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.agreement import photo_agreement
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.geometry.relative import relative_depth
+from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.heads.activations import unit
+from ghgs_lit.heads.dense import decode_views, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
-from ghgs_lit.heads.proportions import decode_views, proportioned_dpt
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Tokens
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -36,7 +36,7 @@ def _wide_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
     """``mlp(x)``, its last projection wide under autocast: offsets of millimetres hang on it."""
     hidden, last = mlp[:-1](x), mlp[-1]
     with torch.autocast(x.device.type, enabled=False):
-        return wide(last(hidden.to(last.weight.dtype)))
+        return at_least_float32(last(hidden.to(last.weight.dtype)))
 
 
 class FootprintAttributes:
@@ -126,7 +126,7 @@ class GaussianHead(nn.Module):
         views: ``subject`` decodes views with a pixel of the subject only, ``all`` every view.
         guide: let the dense head see photographs, masks and depths at full resolution.
         agreement: the guide also tells how well the photographs agree at the depth that was found
-            (:func:`photo_agreement`): a splat off the surface can become transparent.
+            (:func:`photo_consistency`): a splat off the surface can become transparent.
         color_limit: how far a colour may leave its pixel's, in each channel, which makes up for the blur of
             splats and for dark rims; 0: not at all (the paper).
     """
@@ -187,12 +187,14 @@ class GaussianHead(nn.Module):
             each = [self._raw(pixels) for pixels in descriptors]
             raw = tuple(torch.stack(values)[image, pixel] for values in zip(*each, strict=True))
         offset, scale, rotation, opacity, *color = raw
-        focal = wide(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
+        focal = (
+            at_least_float32(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
+        )
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
         # Without a gradient: a splat that is too large must not come nearer to become smaller.
         footprint = depth.detach() / focal
         offset, scales, quaternions, opacities = self.activate(offset, scale, rotation, opacity, footprint)
-        colors = wide(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
+        colors = at_least_float32(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
         return Gaussians(
             means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
             quaternions=quaternions,
@@ -209,10 +211,10 @@ class GaussianHead(nn.Module):
     ) -> Float[Tensor, "B V k H W"] | None:
         if self.decoder.guide is None:
             return None
-        maps = [relative_depth(wide(depth_maps.depth), points.valid)]
+        maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]
         if self.agreement:
-            depth = wide(depth_maps.depth.detach())
-            maps.append(photo_agreement(batch, (depth, depth), 1))
+            depth = at_least_float32(depth_maps.depth.detach())
+            maps.append(photo_consistency(batch, (depth, depth), 1))
         return photo_guide(batch, *maps)
 
     def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.types import Batch
 
 #: Channels of :func:`photo_guide` without further maps.
@@ -17,7 +17,7 @@ PHOTO_CHANNELS = 4
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Float[Tensor, "B V k H W"]:
     """Photographs, masks and further ``maps`` as the channels of one map."""
-    images = wide(batch.images)
+    images = at_least_float32(batch.images)
     return torch.cat((images, batch.masks.to(images.dtype)[:, :, None], *maps), dim=2)
 
 

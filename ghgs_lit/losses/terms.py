@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.chamfer import chamfer as chamfer_distance
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.types import Batch, Prediction, Rendering
 
@@ -18,7 +18,7 @@ Scalar = Float[Tensor, ""]
 
 def render_l1(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """Mean |render - photograph| over the whole image (first term of the paper's L_render)."""
-    return (wide(rendering.image) - wide(batch.targets.images)).abs().mean()
+    return (at_least_float32(rendering.image) - at_least_float32(batch.targets.images)).abs().mean()
 
 
 def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
@@ -59,6 +59,6 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
     used = batch.masks & prediction.depth_valid & (batch.depths > 0)
     truth = batch.depths[used]
-    error = (wide(prediction.depth)[used] - truth).abs()
+    error = (at_least_float32(prediction.depth)[used] - truth).abs()
     error = error / truth if relative else error
     return error.sum() / max(error.numel(), 1)

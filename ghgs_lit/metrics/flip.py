@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import correlate
 
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
@@ -137,7 +137,7 @@ def flip_map(
     """FLIP of each pixel; values outside [0, 1] are clamped first."""
     # Each image by itself: elementwise kernels round by position, and equal images must give 0.
     with torch.autocast(image.device.type, enabled=False):
-        image, target = wide(image).clamp(0, 1), wide(target).clamp(0, 1)
+        image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)
         to_xyz, _ = _constants(image)
         first, second = (_opponent(_mix(_linear(i), to_xyz)) for i in (image, target))
         color = _color_difference(first, second, pixels_per_degree)

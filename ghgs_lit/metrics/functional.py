@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 
 REGIONS = ("image", "box", "subject")
 PADDINGS = ("valid", "reflect", "zeros")
@@ -69,7 +69,7 @@ def squared_error(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
 ) -> Float[Tensor, "n h w"]:
     """Squared error of each pixel, mean over the channels."""
-    return (wide(image) - wide(target)).square().mean(1)
+    return (at_least_float32(image) - at_least_float32(target)).square().mean(1)
 
 
 def decibels(mse: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -124,7 +124,7 @@ def ssim_map(
             f"ssim: expected images of at least {window}x{window} pixels; found {tuple(image.shape[-2:])}"
         )
     with torch.autocast(image.device.type, enabled=False):
-        x, y = wide(image), wide(target)
+        x, y = at_least_float32(image), at_least_float32(target)
         if padding != "valid":
             border, mode = [window // 2] * 4, "reflect" if padding == "reflect" else "constant"
             x, y = F.pad(x, border, mode), F.pad(y, border, mode)
@@ -155,4 +155,4 @@ def depth_error_mm(
     """Mean |z - true z| in millimetres over all pixels of ``region`` with a true depth; nan without any."""
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
-    return 1000 * (wide(depth)[region] - wide(truth)[region]).abs().mean()
+    return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()

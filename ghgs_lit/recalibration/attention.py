@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.linear import Linear, even_parts
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.neighbors import Neighbors
 
@@ -80,13 +81,13 @@ class SemanticAttention(nn.Module):
 
         def keys_values(rows: slice) -> Float[Tensor, "m kv"]:
             normed = self.norm1(x[rows])
-            return wide(torch.cat((key(normed), value(normed)), dim=-1))
+            return at_least_float32(torch.cat((key(normed), value(normed)), dim=-1))
 
         k, v = _by_rows(keys_values, len(x)).chunk(2, dim=-1)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
-            q = wide(ask(self.norm1(x[rows])))
+            q = at_least_float32(ask(self.norm1(x[rows])))
             y = self._attend(q, k, v, near, None if cosine is None else cosine[rows])
             residual = x[rows] + answer(y)
             # Layer by layer: what one has read is freed before the next one runs.
@@ -105,7 +106,7 @@ class SemanticAttention(nn.Module):
         """What ``m`` tokens take from their neighbours. Elsewhere than on a CPU, all pairs are scored, then
         the neighbours' picked: a product of all is faster than gathers, and no m x k x C is ever held."""
         with torch.autocast(q.device.type, enabled=False):
-            if cpu.suits(q, self.num_heads, neighbors.index.shape[1]):
+            if cpu.is_supported(q, self.num_heads, neighbors.index.shape[1]):
                 influence = (x.expand(neighbors.index.shape) for x in self._influence(cosine))
                 return cpu.attend(q, k, v, self.num_heads, neighbors.index, neighbors.valid, *influence)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))

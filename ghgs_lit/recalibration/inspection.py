@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines
 from ghgs_lit.types import Batch, Points, Tokens
@@ -55,7 +55,7 @@ def _weights(
     normed = block.norm1(x)
     q = block.q_proj(normed[place]).unflatten(-1, (block.num_heads, -1))
     k = block.k_proj(normed[index]).unflatten(-1, (block.num_heads, -1))
-    logits = wide(torch.einsum("ad,kad->ak", q * q.shape[-1] ** -0.5, k))[:, None]
+    logits = at_least_float32(torch.einsum("ad,kad->ak", q * q.shape[-1] ** -0.5, k))[:, None]
     if cosine is not None:
         logits = block._weigh(logits, cosine[None])
     return logits[:, 0].masked_fill(~known, float("-inf")).softmax(-1)

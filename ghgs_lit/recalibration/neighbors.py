@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.linear import even_parts
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.parts import even_parts
 
 MODES = ("all", "other_views", "mixed")
 
@@ -37,7 +37,7 @@ def nearest_neighbors(
     """
     choice("recalibration.neighbors", mode, MODES)
     require(k >= 1, "recalibration.k", "1 or more", k)
-    points = wide(points)
+    points = at_least_float32(points)
     n = points.shape[0]
     # Filled, not joined: small results kept among freed distances would hold all their memory.
     index = torch.empty(n, min(k, n), dtype=torch.int64, device=points.device)

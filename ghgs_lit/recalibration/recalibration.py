@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.projection import wide
-from ghgs_lit.linear import even_parts, product
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.linear import linear
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
@@ -85,7 +86,7 @@ class Recalibration(nn.Module):
         if self.neighborhood == "xyz":
             return points.tokens.detach()
         if self.neighborhood == "feature":
-            return F.normalize(wide(tokens.semantic), dim=-1)
+            return F.normalize(at_least_float32(tokens.semantic), dim=-1)
         return (torch.stack((tokens.column, tokens.row), dim=-1) + 0.5) / max(tokens.grid[2:])
 
 
@@ -96,12 +97,12 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
     Features are normalised once, before they are picked; a feature of length 0 has cosine 0 to all.
     """
     with torch.autocast(semantic.device.type, enabled=False):
-        semantic = wide(semantic)
-        if cpu.suits(semantic, 1, neighbors.index.shape[1]):
+        semantic = at_least_float32(semantic)
+        if cpu.is_supported(semantic, 1, neighbors.index.shape[1]):
             return cpu.cosines(semantic, neighbors.index)
         # What stays is made first: behind freed features it would hold their memory.
         cosines = semantic.new_empty(neighbors.index.shape)
         unit = F.normalize(semantic, dim=-1, eps=1e-12)
         for rows in even_parts(len(unit), _SIMILARITIES // max(1, len(unit))):
-            torch.gather(product(unit[rows], unit), 1, neighbors.index[rows], out=cosines[rows])
+            torch.gather(linear(unit[rows], unit), 1, neighbors.index[rows], out=cosines[rows])
     return cosines

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.geometry.projection import wide
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.rendering import gsplat_backend
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
@@ -175,7 +175,7 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
 def _wide_gaussians(gaussians: Gaussians) -> Gaussians:
     """Gaussians in float32, or all in float64 if any of their fields are."""
     fields = ("means", "quaternions", "scales", "opacities", "colors")
-    tensors = {name: wide(getattr(gaussians, name)) for name in fields}
+    tensors = {name: at_least_float32(getattr(gaussians, name)) for name in fields}
     is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
     dtype = torch.float64 if is_double else torch.float32
     return Gaussians(**{name: t.to(dtype) for name, t in tensors.items()}, splits=gaussians.splits)

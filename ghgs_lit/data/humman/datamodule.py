@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ghgs_lit.data.base import PHASES, PhotographsDataModule
+from ghgs_lit.data.datamodule import PHASES, PhotographsDataModule
 from ghgs_lit.data.humman.cameras import read_calibration
 from ghgs_lit.data.humman.reader import BODIES, HuMManReader
 from ghgs_lit.data.reader import Reader
@@ -82,7 +82,7 @@ class HuMManDataModule(PhotographsDataModule):
         return [partial(check_world, path / "cameras.json") for path in there]
 
     def miniature(self, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-        from ghgs_lit.data.miniatures.humman import make
+        from ghgs_lit.synthesis.miniatures.humman import make
 
         require(self.root is not None, "data.root", "a folder to write to", None)
         return make(Path(self.root).expanduser(), self.split["val"], people, size, seed)

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ghgs_lit.data.base import PHASES, PhotographsDataModule
+from ghgs_lit.config.settings import from_config
+from ghgs_lit.data.datamodule import PHASES, PhotographsDataModule
 from ghgs_lit.data.reader import Reader
-from ghgs_lit.data.settings import from_config
 from ghgs_lit.data.zju_mocap.reader import Split, ZJUMoCapReader
 from ghgs_lit.errors import choice, require
 
@@ -62,7 +62,7 @@ class ZJUMoCapDataModule(PhotographsDataModule):
         return len(reader.sequences)
 
     def miniature(self, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-        from ghgs_lit.data.miniatures.zju_mocap import make
+        from ghgs_lit.synthesis.miniatures.zju_mocap import make
 
         sequences = {
             phase: [s for split in splits for s in split.sequences] for phase, splits in self.splits.items()

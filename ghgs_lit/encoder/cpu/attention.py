@@ -16,7 +16,7 @@ _LARGE = 1 << 27
 _FEATURE = {torch.float32: "avx512f", torch.bfloat16: "avx512bf16"}
 
 
-def suits(q: Tensor, v: Tensor) -> bool:
+def is_supported(q: Tensor, v: Tensor) -> bool:
     """Whether :func:`attend` can and should take queries like ``q`` [n, a, t, d] and values like ``v``."""
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURE:
         return False
@@ -34,7 +34,7 @@ def _has(feature: str) -> bool:
 def attend(
     q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a s d"], v: Float[Tensor, "n a s d"]
 ) -> Float[Tensor, "n t a d"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, in the type of ``v``, for what :func:`suits`.
+    """``softmax(q k^T / sqrt(d)) v`` of every head, in the type of ``v``, for what :func:`is_supported`.
 
     Scores and softmax are float32. The same bits with any number of threads.
     """

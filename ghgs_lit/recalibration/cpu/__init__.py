@@ -1,5 +1,5 @@
 """The project's own attention over given neighbours for CPUs: nothing is computed for other tokens."""
 
-from ghgs_lit.recalibration.cpu.attention import attend, cosines, suits
+from ghgs_lit.recalibration.cpu.attention import attend, cosines, is_supported
 
-__all__ = ["attend", "cosines", "suits"]
+__all__ = ["attend", "cosines", "is_supported"]

@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.kernels import pool
-from ghgs_lit.linear import even_parts
+from ghgs_lit.kernels.parts import even_parts
 
 # Floats of a vector; products from which the kernel pays; tokens of a task.
 _LANES, _LARGE, _TOKENS = 16, 1 << 22, 32
 
 
-def suits(x: Tensor, heads: int, k: int) -> bool:
+def is_supported(x: Tensor, heads: int, k: int) -> bool:
     """Whether the kernels can and should take queries or features ``x`` [n, c] with ``k`` neighbours each."""
     if torch.is_grad_enabled() or x.device.type != "cpu" or x.dtype != torch.float32:
         return False

@@ -1,0 +1,1 @@
+"""Near and far of each pixel, from masks and cameras."""

@@ -1,0 +1,45 @@
+"""Configurations as dotted keys, and which keys have no influence on a number."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+#: Where a run writes, what it shows and how it shares the machine: no number depends on these.
+WITHOUT_INFLUENCE = (
+    "hydra",
+    "dry_run",
+    "resume",
+    "logger",
+    "callbacks",
+    "data.cache_dir",
+    "data.cache_images_mb",
+    "data.pin_memory",
+    "data.render_workers",
+    "data.workers",
+    "encoder.weights",  # repeats the origin of init_from's weights, which counts
+    "evaluation.pictures",
+    "trainer.log_every_n_steps",
+)
+
+
+def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key; an empty mapping is a value."""
+    if not (isinstance(config, Mapping) and config):
+        return {prefix: config}
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        flat |= flatten(value, f"{prefix}.{name}" if prefix else str(name))
+    return flat
+
+
+def lookup(config: Any, key: str) -> Any:
+    """The value at a dotted key, None where there is none."""
+    for name in key.split("."):
+        if not isinstance(config, Mapping) or name not in config:
+            return None
+        config = config[name]
+    return config
+
+
+def is_below(key: str, parents: Iterable[str]) -> bool:
+    """Whether a dotted key is one of ``parents`` or lies below one."""
+    return any(key == parent or key.startswith(f"{parent}.") for parent in parents)

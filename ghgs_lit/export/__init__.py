@@ -1,0 +1,1 @@
+"""Files of Gaussians for other programs: one file a format."""

@@ -1,0 +1,1 @@
+"""Runs of sweeps: planning, carrying out, resuming, results and where they come from."""

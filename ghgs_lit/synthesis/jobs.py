@@ -1,0 +1,209 @@
+"""Rendering many people into the layout: several processes, resumable, the same for the same seed.
+
+Workers are spawned (a fork of a process that runs threads may hang): a script that calls
+:func:`render_people` needs the usual ``if __name__ == "__main__":``. Workers only write into
+workspaces; the one process that holds the lock moves finished subjects to their place.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+from ghgs_lit.config.settings import from_config, image_size
+from ghgs_lit.data.layout import View, encode_depth, position_name, write_body, write_view
+from ghgs_lit.data.progress import Progress
+from ghgs_lit.data.sampling import VIEW_IDS, subject_rng
+from ghgs_lit.errors import require
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.synthesis.photograph import Lights, Studio
+from ghgs_lit.synthesis.rig import Rig
+
+# Part of every cache key: raise it when photographs of the same settings would change.
+RENDER_VERSION = 1
+
+
+class Source(Protocol):
+    """Where people come from; must survive pickling."""
+
+    def load(self, name: str) -> Person: ...
+
+    def facing(self, name: str) -> float:
+        """Degrees about y that the first camera is turned by, to look at the front."""
+
+
+@dataclass(frozen=True)
+class SyntheticSource:
+    """Generated people, named ``p<index>``."""
+
+    seed: int
+
+    def load(self, name: str) -> Person:
+        return people.generate(self.seed, int(name[1:]))
+
+    def facing(self, name: str) -> float:
+        return 0.0
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """What is rendered of each person.
+
+    ``size``: side or (height, width) in pixels; ``samples`` x ``samples`` rays a pixel;
+    ``positions``: which of the ring (null: all). ``vids``: 0 the ring camera, 3 the exact middle to
+    the next one, 2 and 4 random between (1 repeats the next position's 0; stereo readers want it).
+    """
+
+    size: int | tuple[int, int] = 512
+    samples: int = 3
+    positions: tuple[int, ...] | None = None
+    vids: tuple[int, ...] = (0, 2, 3, 4)
+    quality: int = 98
+    lights: Lights = field(default_factory=Lights)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", image_size("data.render.size", self.size))
+        require(1 <= self.samples <= 16, "data.render.samples", "between 1 and 16", self.samples)
+        require(1 <= self.quality <= 100, "data.render.quality", "between 1 and 100", self.quality)
+        known = len(self.vids) > 0 and set(self.vids) <= set(VIEW_IDS)
+        require(known, "data.render.vids", f"some of {list(VIEW_IDS)}", list(self.vids))
+        object.__setattr__(self, "lights", from_config(Lights, "data.render.lights", self.lights))
+        object.__setattr__(self, "vids", tuple(self.vids))
+        object.__setattr__(self, "positions", None if self.positions is None else tuple(self.positions))
+
+
+@dataclass(frozen=True)
+class _Job:
+    source: Source
+    rig: Rig
+    settings: RenderSettings
+    seed: int
+    phase: str
+    name: str
+    workspace: Path
+
+
+def identity(rig: Rig, settings: RenderSettings, seed: int) -> dict:
+    """Everything that photographs of a given person depend on, as plain data."""
+    return {"version": RENDER_VERSION, "seed": seed, "rig": asdict(rig), "render": asdict(settings)}
+
+
+def render_subject(job: _Job) -> _Job:
+    """Render one subject into its workspace."""
+    rng = subject_rng(job.seed, job.name)
+    person = job.rig.place(job.source.load(job.name), rng)
+    yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), job.settings.lights.draw(rng)
+    studio = Studio(person, lights, job.settings.samples)
+    vids = job.settings.vids
+    positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions
+    for pid in positions:
+        cameras = job.rig.cameras(yaws[pid, list(vids)], *job.settings.size)
+        photographs = studio.shoot(cameras)
+        for n, vid in enumerate(vids):
+            view = View(
+                image=np.round(photographs.images[n] * 255).astype(np.uint8),
+                mask=photographs.masks[n],
+                inverse_depth=encode_depth(photographs.depths[n]),
+                intrinsics=cameras.intrinsics[n].numpy(),
+                extrinsics=cameras.extrinsics[n].numpy(),
+            )
+            write_view(job.workspace, position_name(job.name, pid), vid, view, job.settings.quality)
+    if person.body_vertices is not None:
+        write_body(job.workspace, job.name, person.body_vertices)
+    return job
+
+
+def render_people(
+    root: Path,
+    names: Mapping[str, Sequence[str]],
+    source: Source,
+    rig: Rig,
+    settings: RenderSettings,
+    seed: int,
+    workers: int | None = None,
+) -> int:
+    """Render the subjects ``names[phase]`` of ``source`` below ``root``; those already there are kept.
+
+    Returns how many were rendered now. Safe to kill, to repeat, and to start twice at once: a
+    second process waits for the first. ``workers``: processes (null: one a core; 0: this one).
+
+    Raises:
+        InputError: ``root`` holds something else, or a person is bad.
+    """
+    require(workers is None or workers >= 0, "data.render_workers", "at least 0 or null", workers)
+    positions = settings.positions
+    fits = positions is None or set(positions) <= set(range(rig.positions))
+    require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
+    progress = Progress(Path(root))
+    progress.check_settings(identity(rig, settings, seed))
+    if not any(progress.missing(phase, listed) for phase, listed in names.items()):
+        return 0
+    with progress.lock():
+        progress.check_settings(identity(rig, settings, seed))  # another process may have been faster
+        progress.clear_workspaces()
+        progress.plan(names)
+        todo = [
+            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name))
+            for phase, listed in names.items()
+            for name in progress.missing(phase, listed)
+        ]
+        with _bar() as bar:
+            task = bar.add_task(f"rendering into {root}", total=len(todo))
+            try:
+                with contextlib.closing(_run(todo, workers)) as finished:
+                    for job in finished:
+                        progress.publish(job.workspace, job.phase, job.name)
+                        bar.advance(task)
+            finally:
+                progress.clear_workspaces()
+    return len(todo)
+
+
+def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
+    """Finished jobs, in the order in which they finish."""
+    workers = min(len(jobs), os.cpu_count() or 1 if workers is None else workers)
+    if workers < 2:
+        yield from map(render_subject, jobs)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
+        try:
+            futures = [pool.submit(render_subject, job) for job in jobs]
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise RuntimeError("a rendering process died (out of memory?); run again to go on") from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _start_worker() -> None:
+    """One thread a process; Ctrl-C is the parent's to answer, and without the parent there is no work."""
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed (``kill``, ``kill -9``, the batch system) takes nobody with it by itself."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def _bar() -> Bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Bar(*columns, console=Console(stderr=True))

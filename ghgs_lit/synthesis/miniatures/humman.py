@@ -1,0 +1,138 @@
+"""A small HuMMan-Recon v1.0 of built-in people: folders, names, dtypes, units and oddities of the real one.
+
+Ten Kinects, photographs of 16:9 in front of a wall, matting with soft rims, depth maps of other cameras in
+millimetres with the floor in them, frames that are multiples of 6 with one missing, camera 0 as the world.
+Textured meshes, which nothing reads, are not made. Beside the root lies a stand-in for the licensed SMPL.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image, ImageFilter
+
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.miniatures.capture import look_at, moved, ring, studio_background, turned
+from ghgs_lit.synthesis.miniatures.smpl import parameters, write_stand_in
+from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.synthesis.photograph import LightRig, Lights, Studio
+from ghgs_lit.types import Cameras
+
+KINECTS = 10
+# Frame 12 lacks.
+FRAMES = (0, 6, 18)
+# Of a photograph with a longer side of 1920: height, width, focal length; and of a depth map.
+_COLOR, _DEPTH = (1080, 1920, 970.0), (576, 640, 504.0)
+# The depth camera looks from here, metres to the right of and below the colour camera.
+_BESIDE = np.array([0.032, 0.002, 0.0])
+
+
+def make(
+    root: Path,
+    test: Sequence[str],
+    people_of: Mapping[str, int],
+    size: int = 256,
+    seed: int = 0,
+    frames: Sequence[int] = FRAMES,
+) -> list[Path]:
+    """Write ``people_of["train"]`` sequences and the first ``people_of["val"]`` of ``test``.
+
+    The longer side of the photographs has ``size`` pixels. Returns the folders of the sequences, and last
+    that of the stand-in for SMPL, ``<root>_body_models``.
+    """
+    training = [f"p{100001 + 7 * i:06d}_a{48 + 11 * i:06d}" for i in range(people_of["train"])]
+    folders = []
+    for index, name in enumerate([*training, *test[: people_of["val"]]]):
+        folder = root / name
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_sequence(folder, size / _COLOR[1], frames, (seed, index), manual=index >= len(training))
+        folders.append(folder)
+    return [*folders, write_stand_in(root.with_name(f"{root.name}_body_models"))]
+
+
+def _write_sequence(
+    folder: Path, scale: float, frames: Sequence[int], identity: tuple[int, int], manual: bool
+) -> None:
+    rng = np.random.default_rng(identity)
+    person, lights = people.generate(*identity), Lights().draw(rng)
+    color, depth = _rig(scale, rng)
+    to_world = color.extrinsics[0].double().numpy()  # from the floor's frame to that of the first camera
+    from_world = torch.from_numpy(np.linalg.inv(to_world))
+    _write_cameras(folder, color, depth, from_world)
+    for number in frames:
+        pose = turned(4.0 * number, np.array([0.05 * np.sin(number), 0, 0.05 * np.cos(number)]))
+        fit = parameters(*identity, person, to_world @ pose)
+        (folder / "smpl_params").mkdir(exist_ok=True)
+        np.savez(folder / "smpl_params" / f"{number:06d}.npz", **fit)
+        _write_frame(folder, number, moved(person, pose), lights, color, depth, manual)
+
+
+def _rig(scale: float, rng: np.random.Generator) -> tuple[Cameras, Cameras]:
+    """Colour and depth cameras around the floor's origin, y up, pixel centres at +0.5."""
+    centers = ring(KINECTS, 2.4, 1.1, rng)
+    poses = np.stack([look_at(c, np.array([0, 0.92, 0]), np.array([0, 1.0, 0])) for c in centers])
+    beside = poses.copy()
+    beside[:, :3, 3] -= _BESIDE
+    return _cameras(_COLOR, scale, poses, rng), _cameras(_DEPTH, scale, beside, rng)
+
+
+def _cameras(
+    shape: tuple[int, int, float], scale: float, poses: np.ndarray, rng: np.random.Generator
+) -> Cameras:
+    height, width = (round(side * scale) for side in shape[:2])
+    matrices = np.zeros((len(poses), 3, 3))
+    for k in range(len(poses)):
+        focal = shape[2] * scale * rng.uniform(0.99, 1.01)
+        middle = np.array([width, height]) * rng.uniform(0.49, 0.51, 2)
+        matrices[k] = [[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]
+    return Cameras(*(torch.from_numpy(a).float() for a in (matrices, poses)), height, width)
+
+
+def _write_cameras(folder: Path, color: Cameras, depth: Cameras, from_world: torch.Tensor) -> None:
+    """``cameras.json``: centres at integers, the world in the frame of the first colour camera."""
+    content = {}
+    for kind, cameras in (("color", color), ("depth", depth)):
+        for k in range(KINECTS):
+            matrix = cameras.intrinsics[k].double()
+            matrix[:2, 2] -= 0.5
+            pose = cameras.extrinsics[k].double() @ from_world
+            content[f"kinect_{kind}_{k:03d}"] = {
+                "K": matrix.tolist(), "R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()
+            }  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps(content))
+
+
+def _write_frame(
+    folder: Path, number: int, person: Person, lights: LightRig, color: Cameras, depth: Cameras, manual: bool
+) -> None:
+    studio = Studio(person, lights, samples=1)
+    shots, depths = studio.shoot(color), studio.shoot(depth).depths
+    for k in range(KINECTS):
+        mask, wall = shots.masks[k], studio_background(color.height, color.width, 0.9 + 0.02 * k)
+        image = np.where(mask[..., None], np.round(shots.images[k] * 255), wall).astype(np.uint8)
+        hard = Image.fromarray(mask.astype(np.uint8) * 255)
+        floor = _floor_depth(depth, k)
+        metres = np.where(depths[k] > 0, depths[k], np.where(floor < 5.4, floor, 0))
+        written = {
+            "kinect_color": Image.fromarray(image),
+            "kinect_mask": hard.filter(ImageFilter.GaussianBlur(0.5)),
+            "kinect_depth": Image.fromarray(np.round(metres * 1000).astype(np.uint16)),
+        }
+        if manual:
+            written["kinect_mask_manual"] = hard
+        for kind, picture in written.items():
+            path = folder / kind / f"kinect_{k:03d}" / f"{number:06d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            picture.save(path)
+
+
+def _floor_depth(cameras: Cameras, k: int) -> np.ndarray:
+    """z [h, w] of the floor y = 0 in one camera; infinite where it is not seen."""
+    matrix, pose = cameras.intrinsics[k].double().numpy(), cameras.extrinsics[k].double().numpy()
+    rows, columns = np.mgrid[: cameras.height, : cameras.width] + 0.5
+    rays = np.stack((columns, rows, np.ones_like(rows)), -1) @ np.linalg.inv(matrix).T @ pose[:3, :3]
+    height = -(pose[:3, :3].T @ pose[:3, 3])[1]
+    down = -rays[..., 1]
+    return np.where(down > 1e-6, height / np.where(down > 1e-6, down, 1), np.inf)

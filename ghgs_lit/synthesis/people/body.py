@@ -1,0 +1,128 @@
+"""The body model: shapes as principal components, a rig, linear blend skinning.
+
+The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), baked by ``scripts/bake_body.py``. Metres,
+y up, facing +z; the person's left is +x. At rest the feet stand on y = 0 and the arms hang 45 degrees off the
+body.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import as_file, files
+
+import numpy as np
+
+BODY_VERTICES = 13380  # the skin comes first; then eyes and the helper surfaces that clothes are made of
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A quad mesh of the base mesh: vertex numbers [m, 4], its own UV numbers [m, 4]."""
+
+    quads: np.ndarray
+    uv_quads: np.ndarray
+
+
+@dataclass(frozen=True)
+class BodyModel:
+    """The baked asset.
+
+    Attributes:
+        mean: [n + b, 3] float64, vertices and then the b joints of the average adult at rest.
+        components: [k, n + b, 3] float64, for coefficients of unit variance.
+        bodies: [s, k] coefficients of plausible adults; female [s] bool, age [s] (0.67 young, 1 old).
+        bone_names, bone_parents: b names; [b] int, -1 for the root; parents come before children.
+        weights: [n, b] float64, rows sum to 1.
+        uv: [t, 2] float32, UV layout of the base mesh.
+        head_uv: [4] the island of the head in it: left, bottom, right, top.
+        head_masks: [h, w, 4] uint8 over head_uv: lips, eyelids, ears, face.
+        surfaces: body, eyes, tights, skirt.
+    """
+
+    mean: np.ndarray
+    components: np.ndarray
+    bodies: np.ndarray
+    female: np.ndarray
+    age: np.ndarray
+    bone_names: tuple[str, ...]
+    bone_parents: np.ndarray
+    weights: np.ndarray
+    uv: np.ndarray
+    head_uv: np.ndarray
+    head_masks: np.ndarray
+    surfaces: dict[str, Surface]
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.weights)
+
+    def bone(self, name: str) -> int:
+        return self.bone_names.index(name)
+
+    def rest(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [n, 3] and joints [b, 3] of a shape at rest, lowest point of the skin on y = 0."""
+        points = self.mean + np.tensordot(coefficients, self.components, 1)
+        points[:, 1] -= points[:BODY_VERTICES, 1].min()
+        return points[: self.vertex_count], points[self.vertex_count :]
+
+    def sample_shape(self, rng: np.random.Generator) -> tuple[np.ndarray, bool, float]:
+        """Draw an adult between two baked ones of one sex: coefficients [k], female, age."""
+        female = bool(rng.random() < 0.5)
+        pool = np.flatnonzero(self.female == female)
+        one, two = rng.choice(pool, 2, replace=False)
+        mix = rng.uniform(0.0, 0.35)
+        coefficients = (1 - mix) * self.bodies[one] + mix * self.bodies[two]
+        return coefficients, female, float((1 - mix) * self.age[one] + mix * self.age[two])
+
+
+@lru_cache(maxsize=1)
+def load_body() -> BodyModel:
+    """Read the asset that lies beside this module (once a process)."""
+    with as_file(files("ghgs_lit.synthesis.people") / "assets" / "body.npz") as path, np.load(path) as data:
+        asset = {name: data[name] for name in data.files}
+    weights = np.zeros((len(asset["weights"]), len(asset["bone_names"])))
+    np.put_along_axis(weights, asset["weight_bones"].astype(np.int64), asset["weights"] / 65535.0, axis=1)
+    surfaces = {
+        name: Surface(asset[f"{name}_quads"].astype(np.int64), asset[f"{name}_uv_quads"].astype(np.int64))
+        for name in ("body", "eyes", "tights", "skirt")
+    }
+    return BodyModel(
+        mean=asset["mean"].astype(np.float64),
+        components=asset["components"] * asset["component_scale"].astype(np.float64)[:, None, None],
+        bodies=asset["bodies"].astype(np.float64),
+        female=asset["female"],
+        age=asset["age"],
+        bone_names=tuple(str(name) for name in asset["bone_names"]),
+        bone_parents=asset["bone_parents"].astype(np.int64),
+        weights=weights,
+        uv=asset["uv"],
+        head_uv=asset["head_uv"],
+        head_masks=asset["head_masks"],
+        surfaces=surfaces,
+    )
+
+
+def bone_transforms(
+    parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
+) -> np.ndarray:
+    """Rest to posed, [b, 3, 4], from world-axis rotations of each bone.
+
+    Args:
+        parents: [b], -1 for the root, parents first.
+        joints: [b, 3] at rest.
+        rotations: [b, 3, 3] of each bone in the world's axes (not relative to its parent).
+        root: [3], where the root joint goes.
+    """
+    posed = np.empty_like(joints)
+    for bone, parent in enumerate(parents):
+        if parent < 0:
+            posed[bone] = root
+        else:
+            posed[bone] = posed[parent] + rotations[parent] @ (joints[bone] - joints[parent])
+    shift = posed - np.einsum("bij,bj->bi", rotations, joints)
+    return np.concatenate([rotations, shift[:, :, None]], -1)
+
+
+def skin(vertices: np.ndarray, weights: np.ndarray, transforms: np.ndarray) -> np.ndarray:
+    """Linear blend skinning of [n, 3] by [n, b] weights and [b, 3, 4] transforms."""
+    blended = (weights @ transforms.reshape(len(transforms), 12)).reshape(-1, 3, 4)
+    return np.einsum("nij,nj->ni", blended[:, :, :3], vertices) + blended[:, :, 3]

@@ -1,0 +1,300 @@
+"""Photographs of textured meshes: image, mask and metric depth from pinhole cameras.
+
+Rays are cast with Embree through every pixel of the subject's window, ``samples`` x ``samples`` of
+them a pixel, on a regular grid. Conventions: see :mod:`ghgs_lit.types`.
+
+* image: the mean colour of the samples, those that miss being black, so that a silhouette is
+  antialiased and premultiplied by its coverage (as an alpha-blended splat on black would be);
+* mask: at least half of the pixel's samples hit the subject;
+* depth: z of the hit nearest to the pixel's centre (of the centre itself when ``samples`` is odd),
+  0 outside the mask. Samples are never averaged, so that no depth lies between two surfaces.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
+from ghgs_lit.types import Cameras
+
+# Rays traced at once: what fits the processor's cache is three times as fast as a whole photograph.
+_CHUNK = 1 << 14
+# Cut-away layers (strands of hair) that a ray may pass before it counts as a miss.
+_MAX_LAYERS = 64
+# How far behind a cut-away hit the ray goes on, metres: beyond float32 error, below any real gap.
+_STEP = 2e-5
+
+
+@dataclass(frozen=True)
+class Lights:
+    """White lights around a person; the same for every camera, so that views agree.
+
+    Shading is Lambertian with soft terminators: ``ambient + sum_l w_l max((n.l + s) / (1 + s), 0)``,
+    applied to texture values as stored. ``jitter`` varies strength and elevation per person; the
+    mean over all directions of the normal is about ``exposure``.
+    """
+
+    count: int = 6
+    ambient: float = 0.5
+    softness: float = 0.3
+    exposure: float = 0.6
+    elevation: float = 30.0
+    jitter: float = 0.25
+
+    def __post_init__(self) -> None:
+        require(self.count >= 1, "lights.count", "at least 1", self.count)
+        require(0 <= self.ambient <= 1, "lights.ambient", "between 0 and 1", self.ambient)
+        require(0 <= self.softness <= 1, "lights.softness", "between 0 and 1", self.softness)
+        require(self.exposure > 0, "lights.exposure", "more than 0", self.exposure)
+        require(0 <= self.jitter < 1, "lights.jitter", "at least 0 and below 1", self.jitter)
+
+    def draw(self, rng: np.random.Generator) -> "LightRig":
+        """Lights of one person: ``count`` azimuths evenly apart, elevations within ± ``elevation``."""
+        azimuth = 2 * np.pi * (np.arange(self.count) + rng.uniform()) / self.count
+        elevation = np.radians(self.elevation) * rng.uniform(-0.3, 1.0, self.count)
+        strength = 1 + self.jitter * rng.uniform(-1, 1, self.count)
+        directions = np.stack(
+            (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)), -1
+        )
+        # Mean of max((n.l + s)/(1 + s), 0) over the sphere of normals n is (1 + s) / 4.
+        share = (1 - self.ambient) * strength / strength.sum() * 4 / (1 + self.softness)
+        return LightRig(
+            directions=directions.astype(np.float32),
+            strengths=(self.exposure * share).astype(np.float32),
+            ambient=self.exposure * self.ambient,
+            softness=self.softness,
+        )
+
+
+@dataclass(frozen=True)
+class LightRig:
+    """Drawn lights: ``directions`` [L, 3] towards the lights, ``strengths`` [L]."""
+
+    directions: np.ndarray
+    strengths: np.ndarray
+    ambient: float
+    softness: float
+
+    def shade(self, normals: np.ndarray) -> np.ndarray:
+        """Brightness [n] of surfaces with unit ``normals`` [n, 3]."""
+        cosine = normals @ self.directions.T
+        soft = np.maximum((cosine + self.softness) / (1 + self.softness), 0)
+        return self.ambient + soft @ self.strengths
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """``images`` [n, h, w, 3] float32 in [0, 1], ``masks`` [n, h, w] bool, ``depths`` [n, h, w] metres."""
+
+    images: np.ndarray
+    masks: np.ndarray
+    depths: np.ndarray
+
+
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit vertex normals [n, 3]: area-weighted over the faces that touch the same position.
+
+    Vertices that a UV seam splits share one normal. Zero where the faces around cancel.
+    """
+    _, weld = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
+    weld = weld.reshape(-1)
+    corners = vertices[faces].astype(np.float64)
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    index = weld[faces].T.reshape(-1)
+    total = np.stack(
+        [np.bincount(index, np.tile(areas[:, k], 3), minlength=weld.max() + 1) for k in range(3)], -1
+    )
+    return _unit(total)[weld].astype(np.float32)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1), 0)
+
+
+def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Bilinear lookup [n, c] in [0, 1] at ``uv`` [n, 2] (origin bottom-left, repeating).
+
+    Colours of a texture with alpha are weighted by it: what is cut away does not bleed.
+    """
+    height, width, channels = texture.shape
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    columns = np.stack((left, left + 1)).astype(np.int64) % width
+    rows = np.stack((top, top + 1)).astype(np.int64) % height
+    texels = texture.reshape(-1, channels)
+    total = np.zeros((len(uv), channels), np.float32)
+    for i, wy in enumerate((1 - fy, fy)):
+        for j, wx in enumerate((1 - fx, fx)):
+            texel = texels[rows[i] * width + columns[j]].astype(np.float32) / 255
+            if channels == 4:
+                texel[:, :3] *= texel[:, 3:]
+            total += (wx * wy)[:, None] * texel
+    if channels == 4:
+        alpha = total[:, 3:]
+        total[:, :3] = np.where(alpha > 0, total[:, :3] / np.where(alpha > 0, alpha, 1), 0)
+    return total
+
+
+def _check_part(name: str, part: TexturedMesh) -> None:
+    """Refuse what :class:`TexturedMesh` lets pass and Embree would take as garbage."""
+    if part.texture.dtype != np.uint8:
+        raise InputError(f"{name}: expected a texture of uint8; found {part.texture.dtype}")
+    if not np.isfinite(part.vertices).all() or not np.isfinite(part.uv).all():
+        raise InputError(f"{name}: expected finite vertices and texture coordinates; found NaN or infinity")
+
+
+class Studio:
+    """A person under fixed lights, to be photographed from any number of cameras.
+
+    Surfaces are double-sided: the normal is turned to the camera. Faces whose texture has an alpha
+    below the part's ``alpha_cutoff`` let rays through.
+    """
+
+    def __init__(self, person: Person, lights: LightRig, samples: int = 3) -> None:
+        require(1 <= samples <= 16, "samples", "between 1 and 16", samples)
+        parts = [part for part in person.parts if len(part.faces)]
+        if not parts:
+            raise InputError(f"{person.name}: expected a mesh with faces; found none")
+        for part in parts:
+            _check_part(person.name, part)
+        self.lights, self.samples = lights, samples
+        counts = np.cumsum([0] + [len(part.vertices) for part in parts])
+        self._vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
+        self._faces = np.concatenate([p.faces + n for p, n in zip(parts, counts, strict=False)]).astype(
+            np.int32
+        )
+        self._uv = np.concatenate([part.uv for part in parts]).astype(np.float32)
+        self._normals = np.concatenate([smooth_normals(part.vertices, part.faces) for part in parts])
+        self._part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+        self._textures = [part.texture for part in parts]
+        self._cutoff = np.array(
+            [0.0 if p.alpha_cutoff is None else p.alpha_cutoff for p in parts], np.float32
+        )
+        corners = self._vertices[self._faces].astype(np.float64)
+        sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._face_normals = _unit(sides).astype(np.float32)
+        self._scene = EmbreeScene(robust=True)
+        TriangleMesh(self._scene, self._vertices, self._faces)
+
+    def shoot(self, cameras: Cameras) -> Photographs:
+        """Photographs from ``cameras`` with one leading dimension.
+
+        Raises:
+            InputError: a camera is not finite or has no focal length.
+        """
+        intrinsics = cameras.intrinsics.double().numpy()
+        extrinsics = cameras.extrinsics.double().numpy()
+        size = (len(intrinsics), cameras.height, cameras.width)
+        images, depths = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
+        masks = np.zeros(size, bool)
+        for n, (matrix, pose) in enumerate(zip(intrinsics, extrinsics, strict=True)):
+            if not (
+                np.isfinite(matrix).all() and np.isfinite(pose).all() and min(matrix[0, 0], matrix[1, 1]) > 0
+            ):
+                raise InputError(
+                    f"camera {n}: expected finite values and focal lengths above 0; found {matrix.tolist()}"
+                )
+            top, bottom, left, right = self._window(matrix, pose, *size[1:])
+            step = max(1, _CHUNK // max(1, (right - left) * self.samples**2))
+            for row in range(top, bottom, step):
+                window = (n, slice(row, min(row + step, bottom)), slice(left, right))
+                images[window], masks[window], depths[window] = self._expose(matrix, pose, *window[1:])
+        return Photographs(images, masks, depths)
+
+    def _window(
+        self, matrix: np.ndarray, pose: np.ndarray, height: int, width: int
+    ) -> tuple[int, int, int, int]:
+        """Rows and columns (top, bottom, left, right) outside which no vertex projects."""
+        points = self._vertices @ pose[:3, :3].T + pose[:3, 3]
+        if points[:, 2].min() <= 1e-3:  # partly behind the camera: its projection has no bounds
+            return 0, height, 0, width
+        pixels = points @ matrix.T
+        low = np.floor((pixels[:, :2] / pixels[:, 2:]).min(0)).astype(int)
+        high = np.ceil((pixels[:, :2] / pixels[:, 2:]).max(0)).astype(int)
+        left, right = np.clip((low[0], high[0]), 0, width)
+        top, bottom = np.clip((low[1], high[1]), 0, height)
+        return int(top), int(bottom), int(left), int(right)
+
+    def _expose(
+        self, matrix: np.ndarray, pose: np.ndarray, rows: slice, columns: slice
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Image, mask and depth of a window."""
+        n, h, w = self.samples, rows.stop - rows.start, columns.stop - columns.start
+        y = (rows.start + (np.arange(h * n) + 0.5) / n - matrix[1, 2]) / matrix[1, 1]
+        u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
+        x = (u - matrix[0, 1] * y[:, None]) / matrix[0, 0]
+        rays = np.stack((x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)), -1)
+        # [h, n, w, n] -> one row of n * n samples a pixel; z of the ray is 1, so its length is the depth.
+        rays = rays.reshape(h, n, w, n, 3).transpose(0, 2, 1, 3, 4).reshape(-1, 3)
+        directions = (rays @ pose[:3, :3]).astype(np.float32)
+        origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
+
+        depth, face, weights = self._trace(origin, directions)
+        hit = face >= 0
+        colors = np.zeros((len(rays), 3), np.float32)
+        colors[hit] = self._shade(directions[hit], face[hit], weights[hit])
+
+        hit, depth = hit.reshape(h, w, n * n), depth.reshape(h, w, n * n)
+        offset = np.abs(np.arange(n) - (n - 1) / 2)
+        order = np.argsort(offset[:, None] ** 2 + offset**2, axis=None, kind="stable")
+        nearest = order[hit[..., order].argmax(-1)]
+        mask = 2 * hit.sum(-1) >= n * n
+        center = np.take_along_axis(depth, nearest[..., None], -1)[..., 0]
+        image = colors.reshape(h, w, n * n, 3).mean(2)
+        return np.clip(image, 0, 1), mask, np.where(mask, center, 0)
+
+    def _trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance, face (-1: none) and barycentric weights [n, 3] of the first hit that is not cut away."""
+        distance = np.zeros(len(directions), np.float32)
+        face = np.full(len(directions), -1, np.int64)
+        weights = np.zeros((len(directions), 3), np.float32)
+        active, start = np.arange(len(directions)), np.zeros(len(directions), np.float32)
+        for _ in range(_MAX_LAYERS):
+            rays = directions[active]
+            hits = self._scene.run(origin + start[:, None] * rays, rays, output=True)
+            found = np.flatnonzero(hits["primID"] >= 0)
+            active, reached = active[found], start[found] + hits["tfar"][found]
+            u, v, triangle = hits["u"][found], hits["v"][found], hits["primID"][found]
+            corners = np.stack((1 - u - v, u, v), -1)
+            solid = self._solid(triangle, corners)
+            done = active[solid]
+            distance[done], face[done], weights[done] = reached[solid], triangle[solid], corners[solid]
+            active, start = active[~solid], reached[~solid] + _STEP
+            if not len(active):
+                break
+        return distance, face, weights
+
+    def _solid(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Whether hits lie on surface that is not cut away [n]."""
+        solid = np.ones(len(face), bool)
+        part = self._part[face]
+        for k in np.flatnonzero(self._cutoff):
+            index = np.flatnonzero(part == k)
+            if len(index):
+                alpha = self._textured(k, face[index], weights[index])[:, 3]
+                solid[index] = alpha >= self._cutoff[k]
+        return solid
+
+    def _textured(self, part: int, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        uv = np.einsum("nk,nkc->nc", weights, self._uv[self._faces[face]])
+        return sample_texture(self._textures[part], uv)
+
+    def _shade(self, directions: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Colours [n, 3] of hits seen along ``directions``."""
+        colors = np.empty((len(face), 3), np.float32)
+        part = self._part[face]
+        for k in np.unique(part):
+            index = np.flatnonzero(part == k)
+            colors[index] = self._textured(k, face[index], weights[index])[:, :3]
+        flat = self._face_normals[face]
+        normals = _unit(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
+        # Both are turned to the camera by the side of the face that is seen.
+        normals = np.where((normals != 0).any(-1, keepdims=True), normals, flat)
+        behind = np.einsum("nc,nc->n", flat, directions) > 0
+        normals = np.where(behind[:, None], -normals, normals)
+        return colors * self.lights.shade(normals)[:, None]

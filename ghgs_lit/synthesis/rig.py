@@ -1,0 +1,87 @@
+"""The ring of cameras that THuman2.0 is rendered with, and how a subject is placed in it.
+
+``positions`` cameras stand evenly around the subject. At each position there are views (``vid``):
+0 the ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 random
+in the first and the second half of the step. Yaw 0 looks at a subject that faces +z from the front.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ghgs_lit.errors import require
+from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.types import Cameras
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Lengths in metres, angles in degrees; ``focal``, ``shift_y`` and sizes as fractions of the image.
+
+    ``height`` is what subjects are scaled to, ± ``height_jitter`` (null keeps their own height).
+    """
+
+    positions: int = 16
+    radius: float = 2.0
+    look_at: tuple[float, float, float] = (0.0, 0.85, 0.0)
+    pitch: float = -8.0
+    focal: float = 0.8
+    shift_y: float = 25 / 1024
+    yaw_jitter: float = 11.0
+    height: float | None = 1.80
+    height_jitter: float = 0.05
+
+    def __post_init__(self) -> None:
+        require(self.positions >= 2, "rig.positions", "at least 2", self.positions)
+        require(self.radius > 0, "rig.radius", "more than 0", self.radius)
+        require(len(self.look_at) == 3, "rig.look_at", "three coordinates", self.look_at)
+        require(-89 < self.pitch < 89, "rig.pitch", "between -89 and 89 degrees", self.pitch)
+        require(self.focal > 0, "rig.focal", "more than 0", self.focal)
+        require(self.height is None or self.height > 0, "rig.height", "more than 0 or null", self.height)
+        object.__setattr__(self, "look_at", tuple(self.look_at))
+
+    def yaws(self, rng: np.random.Generator) -> np.ndarray:
+        """Yaw [positions, 5] in degrees of every position and vid of one subject."""
+        step = 360.0 / self.positions
+        start = rng.uniform(-self.yaw_jitter, self.yaw_jitter) + step * np.arange(self.positions)
+        first, second = rng.uniform(0, 0.5, (2, self.positions))
+        offsets = np.stack((0 * first, 0 * first + 1, first, 0 * first + 0.5, 0.5 + second), -1)
+        return start[:, None] + step * offsets
+
+    def cameras(self, yaws: np.ndarray, height: int, width: int) -> Cameras:
+        """Cameras at ``yaws`` (degrees, any shape) for an image of ``height`` x ``width``; float32."""
+        yaw, pitch = np.radians(yaws)[..., None], np.radians(self.pitch)
+        zero = np.zeros_like(yaw)
+        backward = np.concatenate(
+            (np.cos(pitch) * np.sin(yaw), zero - np.sin(pitch), np.cos(pitch) * np.cos(yaw)), -1
+        )
+        right = np.concatenate((np.cos(yaw), zero, -np.sin(yaw)), -1)
+        rotation = np.stack((right, -np.cross(backward, right), -backward), -2)
+        center = np.asarray(self.look_at) + self.radius * backward
+        extrinsics = np.zeros((*np.shape(yaws), 4, 4))
+        extrinsics[..., :3, :3] = rotation
+        extrinsics[..., :3, 3] = -(rotation @ center[..., None])[..., 0]
+        extrinsics[..., 3, 3] = 1
+        focal = self.focal * height
+        intrinsics = np.zeros((*np.shape(yaws), 3, 3))
+        intrinsics[...] = [[focal, 0, width / 2], [0, focal, height / 2 + self.shift_y * height], [0, 0, 1]]
+        intrinsics, extrinsics = intrinsics.astype(np.float32), extrinsics.astype(np.float32)
+        return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(extrinsics), height, width)
+
+    def place(self, person: Person, rng: np.random.Generator) -> Person:
+        """``person`` scaled, feet at y = 0, centred; the body vertices get the same transform."""
+        jitter = self.height_jitter * rng.uniform(-1, 1)
+        low = np.min([part.vertices.min(0) for part in person.parts if len(part.vertices)], 0)
+        high = np.max([part.vertices.max(0) for part in person.parts if len(part.vertices)], 0)
+        tall = float(high[1] - low[1])
+        require(tall > 0, person.name, "a mesh with some height", tall)
+        scale = 1.0 if self.height is None else (self.height + jitter) / tall
+        origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2], np.float64)
+
+        def move(vertices: np.ndarray) -> np.ndarray:
+            return ((vertices.astype(np.float64) - origin) * scale).astype(np.float32)
+
+        parts = tuple(replace(part, vertices=move(part.vertices)) for part in person.parts)
+        body = None if person.body_vertices is None else move(person.body_vertices)
+        return replace(person, parts=parts, body_vertices=body)

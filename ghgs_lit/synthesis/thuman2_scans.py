@@ -1,0 +1,235 @@
+"""THuman2.0 as released: raw scans with SMPL-X fits::
+
+<source>/<id>/<id>.obj, material0.jpeg, material0.mtl     526 scans 0000 ... 0525, y up, units not metric
+<fits>/<id>/smplx_param.pkl, mesh_smplx.obj               the fit, in the frame of its scan
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ghgs_lit.data.pickles import load_npy, load_pickle
+from ghgs_lit.data.reader import check_array
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.synthesis.scans import ScanSource
+
+# How the folder of the fits is called in the archives and scripts that are about.
+FIT_FOLDERS = ("THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "THuman2.0_SMPLX_Paras", "smplx_2", "smplx")
+_NEEDED = ("betas", "global_orient", "body_pose")
+_MORE = ("left_hand_pose", "right_hand_pose", "jaw_pose", "leye_pose", "reye_pose", "expression")
+_FIT_SIZES = {"global_orient": (3,), "scale": (1,), "translation": (3,), "transl": (3,)}
+
+
+@dataclass(frozen=True)
+class SmplxFit:
+    """``smplx_param.pkl``: ``parameters`` of the male SMPL-X model by name [1, n], ``scale`` and
+    ``translation`` [3] from its frame to the scan's: **scale first**, ``v * scale + translation``."""
+
+    parameters: Mapping[str, np.ndarray]
+    scale: float
+    translation: np.ndarray
+
+    def to_scan(self, vertices: np.ndarray) -> np.ndarray:
+        """Vertices [n, 3] of the model in the scan's frame."""
+        return vertices * self.scale + self.translation
+
+    @property
+    def facing(self) -> float:
+        """Degrees about y from +z to where the body faces."""
+        forward = Rotation.from_rotvec(self.parameters["global_orient"][0]).as_matrix()[:, 2]
+        return float(np.degrees(np.arctan2(forward[0], forward[2])))
+
+
+def read_fit(path: Path) -> SmplxFit:
+    """The fit at ``path``; its pickle is read without running it.
+
+    Raises:
+        InputError: it is missing, no plain pickle, lacks a key, or a value is of another shape or not finite.
+    """
+    content = load_pickle(path)
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a dictionary; found {type(content).__name__}")
+    # Fits of SMPL made for the same scans call it transl.
+    moved = "transl" if "transl" in content else "translation"
+    for name in (*_NEEDED, "scale", moved):
+        if name not in content:
+            raise InputError(f"{path}: expected the key {name!r}; found {sorted(map(str, content))}")
+    values = {
+        name: check_array(f"{path}: {name}", np.ravel(content[name]), [_FIT_SIZES.get(name, (None,))])
+        for name in (*_NEEDED, "scale", moved, *(n for n in _MORE if n in content))
+    }
+    scale, translation = values.pop("scale"), values.pop(moved)
+    if scale[0] <= 0:
+        raise InputError(f"{path}: scale: expected more than 0; found {scale[0]}")
+    return SmplxFit({name: value[None] for name, value in values.items()}, float(scale[0]), translation)
+
+
+def find_fits(source: Path, fits: str | None) -> Path | None:
+    """The folder of the fits: as configured, else one of :data:`FIT_FOLDERS` in or beside ``source``.
+
+    None where there is none; each scan's own folder is looked into as well.
+
+    Raises:
+        InputError: the configured folder does not exist.
+    """
+    if fits is not None:
+        folder = Path(fits).expanduser()
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected the folder of the SMPL-X fits; found no such folder")
+        return folder
+    candidates = [place / name for place in (source, source.parent) for name in FIT_FOLDERS]
+    return next((folder for folder in candidates if folder.is_dir()), None)
+
+
+@dataclass(frozen=True)
+class THuman2Source:
+    """Raw scans with their bodies.
+
+    ``body_model``: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
+    ``smplx_param.pkl``; None reads ``mesh_smplx.obj``, which the fits bring along.
+    """
+
+    folder: Path
+    fits: Path | None
+    body_model: Path | None = None
+
+    def names(self) -> list[str]:
+        return ScanSource(self.folder).names()
+
+    def fit(self, name: str) -> Path | None:
+        """The folder of one scan's fit; None where there are no fits at all.
+
+        Raises:
+            InputError: there are fits, but none of this scan.
+        """
+        if (self.folder / name / "smplx_param.pkl").exists():
+            return self.folder / name
+        if self.fits is None:
+            return None
+        if not (self.fits / name).is_dir():
+            raise InputError(f"{self.fits / name}: expected the scan's SMPL-X fit; found no such folder")
+        return self.fits / name
+
+    def body(self, name: str) -> np.ndarray | None:
+        """Vertices [n, 3] float64 of the body in the scan's frame, None without fits.
+
+        Raises:
+            InputError: the fit is bad, or nothing says what its vertices are.
+        """
+        folder = self.fit(name)
+        if folder is None:
+            return None
+        parameters, mesh = folder / "smplx_param.pkl", folder / "mesh_smplx.obj"
+        if self.body_model is not None:
+            fit = read_fit(parameters)
+            return fit.to_scan(smplx_vertices(self.body_model, fit.parameters))
+        if not mesh.exists():
+            raise InputError(
+                f"{mesh}: expected the fitted mesh, or data.body_model with the licensed SMPL-X model to "
+                "compute it; found neither"
+            )
+        return _obj_vertices(mesh)
+
+    def load(self, name: str) -> Person:
+        """One scan with its body, both as stored.
+
+        Raises:
+            InputError: the scan or its fit is bad, or the body is somewhere else than the scan.
+        """
+        scan, body = ScanSource(self.folder).load(name), self.body(name)
+        if body is None:
+            return scan
+        _check_body(self.fit(name), scan, body)
+        return Person(name, scan.parts, body.astype(np.float32))
+
+    def check(self, name: str) -> None:
+        """Read all that rendering a scan will read.
+
+        Raises:
+            InputError: something of it is bad.
+        """
+        self.load(name)
+        self.facing(name)
+
+    def facing(self, name: str) -> float:
+        """Degrees about y that the first camera is turned by, to look at the scan's front; 0 without fit."""
+        folder = self.fit(name)
+        path = None if folder is None else folder / "smplx_param.pkl"
+        return 0.0 if path is None or not path.exists() else read_fit(path).facing
+
+
+def _obj_vertices(path: Path) -> np.ndarray:
+    """All ``v`` lines [n, 3], in order, with nothing merged."""
+    try:
+        with path.open() as lines:
+            vertices = [line.split()[1:4] for line in lines if line.startswith("v ")]
+        return check_array(path, np.array(vertices, np.float64), [(None, 3)])
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: expected lines 'v x y z'; found {error}") from error
+
+
+def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
+    """A fit without its scale, translation or in metres does not lie in its scan."""
+    points = np.concatenate([part.vertices for part in scan.parts])
+    low, high = points.min(0), points.max(0)
+    tall = high[1] - low[1]
+    outside = np.maximum(np.maximum(low - body.min(0), body.max(0) - high), 0).max()
+    ratio = np.ptp(body[:, 1]) / tall
+    if outside > 0.1 * tall or not 0.7 < ratio < 1.2:
+        raise InputError(
+            f"{folder}: expected a body in its scan's frame; found one {ratio:.2f} times as tall as the scan "
+            f"that leaves its box by {outside / tall:.2f} of its height (scale before translation?)"
+        )
+
+
+@lru_cache(maxsize=2)
+def _smplx_model(folder: Path) -> Any:
+    try:
+        import smplx
+    except ImportError as error:
+        raise InputError(
+            "data.body_model: expected the package smplx (pip install smplx); found none"
+        ) from error
+    if not folder.exists():
+        raise InputError(f"{folder}: expected the SMPL-X model (data.body_model); found no such folder")
+    try:
+        return smplx.create(str(folder), "smplx", gender="male", num_pca_comps=12, use_pca=True, num_betas=10)
+    except (AssertionError, OSError, ValueError) as error:
+        raise InputError(f"{folder}: expected smplx/SMPLX_MALE.npz; found {error}") from error
+
+
+def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Vertices [10475, 3] of the male SMPL-X model, before scale and translation.
+
+    Raises:
+        InputError: the package or the model files are not there.
+    """
+    import torch
+
+    model = _smplx_model(folder)
+    with torch.no_grad():
+        posed = model(**{name: torch.from_numpy(value).float() for name, value in parameters.items()})
+    return posed.vertices[0].double().numpy()
+
+
+def ghg_body(path: Path, vertices: np.ndarray) -> np.ndarray:
+    """Vertices of a fit moved as GHG's renderer moved the scan: its ``<id>_transform.npy``.
+
+    Raises:
+        InputError: the file is missing, or lacks a number.
+    """
+    content = load_npy(path)
+    names = ("vy_max", "vy_min", "human_height", "offset", "move_delta_axis_0", "move_delta_axis_2")
+    for name in names:
+        if not isinstance(content, dict) or name not in content:
+            raise InputError(f"{path}: expected a dictionary with {name!r}; found none")
+    high, low, tall, offset, x, z = (float(check_array(path, np.ravel(content[n]), [(1,)])[0]) for n in names)
+    return vertices * (tall / (high - low)) + np.array([x, -offset, z])

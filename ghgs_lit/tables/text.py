@@ -1,0 +1,178 @@
+"""What a table says in words: its numbers as printed, its caption, its notes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ghgs_lit.tables.differences import differing, differing_text
+from ghgs_lit.tables.layouts import Cell, Line, Table, decimals
+from ghgs_lit.tables.others import data_title, reported_source
+from ghgs_lit.tables.records import ABLATIONS, Planned, Record
+from ghgs_lit.tables.significance import KINDS, PairedTest, too_few
+
+FOOTNOTE = (
+    "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them, while its"
+    " text says that semantic consistency alone is not included. Without 3D unprojection there are no token"
+    " points: neighbours are then found on the image plane."
+)
+NO_SEMANTICS = "features carry no semantics: this encoder was never trained for semantics"
+ILLUSTRATION = "This is an illustration of the framework on a small model, not a result."
+MARK = "*"
+
+
+@dataclass(frozen=True)
+class CellText:
+    """A number's parts: ``mean`` (or what stands for it), ``spread`` and ``tail`` may be empty."""
+
+    mean: str
+    spread: str = ""
+    tail: str = ""
+    best: bool = False
+
+
+def deviation(values: Sequence[float]) -> float | None:
+    """Sample standard deviation; None for fewer than two values."""
+    if len(values) < 2:
+        return None
+    center = sum(values) / len(values)
+    return math.sqrt(sum((v - center) ** 2 for v in values) / (len(values) - 1))
+
+
+def cell_text(cell: Cell | None, line: Line, metric: str) -> CellText:
+    """Mean, deviation over seeds, and whether seeds are lacking or the row differs beyond chance."""
+    if cell is None:
+        return CellText(line.absent)
+    digits, spread = decimals(metric), deviation(list(cell.seeds.values()))
+    tail = MARK if cell.marked else ""
+    if cell.lacking:
+        tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
+    text = "" if spread is None else f"{spread:.{digits}f}"
+    return CellText(f"{cell.mean:.{digits}f}", text, tail, cell.best)
+
+
+def _measured(table: Table) -> list[Cell]:
+    return [cell for line in table.lines if line.variant.kind != "reported" for cell in line.cells.values()]
+
+
+def write_caption(table: Table) -> str:
+    """Data, protocol, model and number of runs, in one line."""
+    records: list[Record] = table.about["records"]
+    first, names = records[0], list(dict.fromkeys(r.setting.data for r in records))
+    counts = sorted({cell.count for cell in _measured(table) if cell.count})
+    seeds = max((len(cell.seeds) for cell in _measured(table)), default=0)
+    setting = first.setting
+    said = [
+        f"Data {' and '.join(f'`{name}`' for name in names)}",
+        f"{' or '.join(map(str, counts)) or 'no'} subjects of `{setting.split}`",
+        f"targets `{setting.targets}`",
+        f"metrics `{setting.protocol}`",
+    ]
+    if table.layout.rows == "ablation":
+        said += [f"model `{first.variant.model}`", f"encoder `{first.variant.encoder}`"]
+        said += [f"`{key}={value}`" for key, value in first.variant.extra]
+    views = {group.views for group in table.groups}
+    if table.layout.heading != "views" and len(views) == 1:
+        said.append(f"{views.pop()} input views")
+    spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
+    return f"{', '.join(said)}; mean over subjects{spread}, best of the measured methods in bold."
+
+
+def write_notes(table: Table, test: PairedTest, illustration: bool = False) -> list[str]:
+    """What has to be said below the table."""
+    own = [line for line in table.lines if line.variant.kind == "model"]
+    said = [f"**{ILLUSTRATION}**"] if illustration else []
+    if table.layout.rows == "ablation":
+        said.append(FOOTNOTE)
+        if not own[0].variant.has_semantics:
+            said.append(f"(a) {NO_SEMANTICS}.")
+    if "flip" in table.metrics and "lpips" not in table.metrics:
+        said.append("FLIP stands in for the paper's LPIPS, which at least one run could not compute.")
+    if table.reported_on:
+        said.append(
+            f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured by its"
+            " authors on their data, split and views. They were not measured here, and are not comparable"
+            " with figures on other data or protocols."
+        )
+    said += _about_others(table)
+    said += _about_test(table, test)
+    said += _about_runs(table)
+    return said
+
+
+def _about_others(table: Table) -> list[str]:
+    """Where other methods' numbers are from, and whether they are of other subjects than ours."""
+    said = []
+    own = {r.count for r in table.about["records"] if r.variant.kind == "model"}
+    for line in table.lines:
+        if line.variant.kind == "other":
+            records = [r for r in table.about["records"] if r.variant == line.variant]
+            untested = "" if all(r.subjects for r in records) else "; means only where untested"
+            counts = sorted({r.count for r in records if r.count} - own)
+            fewer = f"; of {' or '.join(map(str, counts))} subjects" if counts else ""
+            said.append(f"{line.variant.name}: {records[0].about['source']}{untested}{fewer}.")
+    return said
+
+
+def _about_test(table: Table, test: PairedTest) -> list[str]:
+    """Which test, over how many subjects; or why there is none."""
+    tested = [c for c in _measured(table) if c.test is not None]
+    if not tested:
+        return []
+    known = [c for c in tested if c.test.p is not None]
+    counts = sorted({c.test.n for c in tested})
+    n = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+    against = "its column's best row"
+    if test.against == "full":
+        full = [line for line in table.lines if line.variant.kind == "model"]
+        full = [line for line in full if line.variant.switches == (True, True)]
+        against = "the row of the whole method" if len(full) == 1 and full[0].cells else against
+    few = too_few(counts[-1], len(known), test)
+    about = f"{KINDS[test.kind]} against {against}, n = {n} subjects (each averaged over seeds)"
+    if few:
+        return [f"No differences are marked: n = {n} subjects are too few for a {KINDS[test.kind]} ({few})."]
+    marks = f"{MARK} differs beyond chance: {about}, two-sided, Holm's correction over the {len(known)}"
+    return [f"{marks} comparisons of this table, p < {test.alpha:g}."]
+
+
+def _run_name(planned: Planned) -> str:
+    ablation = ABLATIONS[planned.variant.switches]
+    return f"{data_title(planned.data)} {planned.variant.model} {ablation} seed {planned.seed}"
+
+
+def _about_runs(table: Table) -> list[str]:
+    """What a reader has to know about the runs behind the numbers: unfinished, unequal, of other code."""
+    said = []
+    if any(cell.lacking for cell in _measured(table)):
+        said.append("(2/3): from 2 of 3 seeds; the others have no results yet.")
+    planned: list[Planned] = table.about["planned"]
+    unfinished = list(dict.fromkeys(_run_name(p) for p in planned if not p.done))
+    if unfinished:
+        more = f" and {len(unfinished) - 4} more" if len(unfinished) > 4 else ""
+        said.append(f"No results yet (in progress or cut off): {'; '.join(unfinished[:4])}{more}.")
+    records = [r for r in table.about["records"] if r.config]
+    compared = _comparable(table, records)
+    keys = {key: values for group in compared for key, values in differing(group).items()}
+    if keys:
+        said.append(f"Runs side by side differ also in {differing_text(keys)}.")
+    states = {_git_text(r.about.get("git")) for r in table.about["records"] if r.about.get("git")}
+    if len(states) > 1:
+        said.append(f"The runs are of {len(states)} states of the code: {', '.join(sorted(states))}.")
+    return said
+
+
+def _comparable(table: Table, records: list[Record]) -> list[list]:
+    """Configurations that should be equal but for the expected keys."""
+    if table.layout.rows == "ablation":
+        return [[r.config for r in records]]
+    groups: dict[tuple, list] = {}
+    for record in records:
+        switched = record.variant.switches
+        groups.setdefault((record.variant.model, record.variant.encoder, switched, record.setting.data), [])
+        groups[record.variant.model, record.variant.encoder, switched, record.setting.data].append(
+            {k: v for k, v in record.config.items()}
+        )
+    return list(groups.values())
+
+
+def _git_text(git: dict) -> str:
+    return f"{git['commit'][:9]}{' with changes' if git.get('changed') else ''}"

@@ -1,0 +1,162 @@
+"""What to look at while a run trains: pictures, attention and point clouds of its validation subjects."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import numpy as np
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from lightning.pytorch.utilities import rank_zero_only
+
+from ghgs_lit.errors import require
+from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.recalibration.inspection import attention_of
+from ghgs_lit.types import Batch
+from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.clouds import clouds
+from ghgs_lit.visualization.pictures import save_png, sheet
+
+#: How TensorBoard shows clouds: points of two centimetres, a lens that does not distort.
+CLOUD_VIEW = {
+    "camera": {"cls": "PerspectiveCamera", "fov": 40},
+    "material": {"cls": "PointsMaterial", "size": 0.02},
+}
+
+
+class _FirstSubjects(Callback):
+    """Calls :meth:`show` for the first ``subjects`` subjects of each validation, in the first process."""
+
+    name = ""
+
+    def __init__(self, subjects: int):
+        require(subjects >= 0, f"callbacks.{self.name}.subjects", "a number of at least 0", subjects)
+        self.subjects = subjects
+        self._left = 0
+
+    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._left = 0 if trainer.sanity_checking else self.subjects
+
+    @rank_zero_only
+    def on_validation_batch_end(
+        self,
+        trainer: L.Trainer,
+        pl_module: L.LightningModule,
+        outputs: dict[str, Any],
+        batch: Batch,
+        *args: Any,
+    ) -> None:
+        for element in range(min(self._left, len(batch.images))):
+            name = batch.subjects[element] if batch.subjects else f"subject_{self.subjects - self._left}"
+            self.show(trainer, outputs, batch, element, name)
+            self._left -= 1
+
+    def show(
+        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
+    ) -> None:
+        raise NotImplementedError
+
+
+def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
+    """To ``<run>/pictures/step_<step>/<file>.png`` and to the loggers that take pictures."""
+    step = trainer.global_step
+    save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
+    for logger in trainer.loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_image(tag, picture, step, dataformats="HWC")
+        elif isinstance(logger, WandbLogger):
+            logger.log_image(tag, [picture])
+
+
+class Pictures(_FirstSubjects):
+    """Inputs, depths, targets, renders and errors side by side: ``sheet/<subject>``."""
+
+    name = "pictures"
+
+    def __init__(self, subjects: int = 2):
+        super().__init__(subjects)
+
+    def show(
+        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
+    ) -> None:
+        prediction = outputs["prediction"]
+        picture = sheet(batch, outputs["rendering"].image, element, prediction.depth, prediction.depth_valid)
+        _publish(trainer, f"sheet/{name}", picture, name)
+
+
+class Attention(_FirstSubjects):
+    """What one token attends to, drawn on the views: ``attention/<subject>``.
+
+    ``token`` is ``[view, row, column]`` on the grid of tokens that the recalibration sees (of the crop,
+    where the model crops); null: in the middle of the subject in its first view.
+    """
+
+    name = "attention"
+
+    def __init__(self, subjects: int = 1, token: Sequence[int] | None = None):
+        super().__init__(subjects)
+        require(token is None or len(token) == 3, "callbacks.attention.token", "null or 3 numbers", token)
+        self.token = None if token is None else tuple(token)
+        self._hook, self._seen = None, None
+
+    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        super().on_validation_epoch_start(trainer, pl_module)
+        stage = getattr(pl_module.model, "recalibration", None)
+        if self._left and isinstance(stage, Recalibration):
+            self._hook = stage.register_forward_pre_hook(self._see)
+
+    def _see(self, stage: Recalibration, inputs: tuple) -> None:
+        self._seen = (stage, *inputs)
+
+    def show(
+        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
+    ) -> None:
+        if self._seen is None:
+            return
+        stage, tokens, points, seen_batch = self._seen
+        token = chosen_token(tokens, points, element, self.token)
+        attention = None if token is None else attention_of(stage, tokens, points, seen_batch, token)
+        if attention is not None:
+            picture = attention_sheet(seen_batch, tokens, attention)
+            _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
+        if self._left == 1:
+            self._forget()
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
+        if self._hook is not None:
+            self._hook.remove()
+        self._hook, self._seen = None, None
+
+
+class PointClouds(_FirstSubjects):
+    """Predicted points and the body as clouds: ``<subject>/points`` and so on.
+
+    To TensorBoard's mesh tab only; ``points`` bounds each cloud.
+    """
+
+    name = "point_clouds"
+
+    def __init__(self, subjects: int = 1, points: int = 6000):
+        super().__init__(subjects)
+        require(points >= 1, "callbacks.point_clouds.points", "a number of at least 1", points)
+        self.points = points
+
+    def show(
+        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
+    ) -> None:
+        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+        if not loggers:
+            return
+        for kind, (positions, colors) in clouds(batch, outputs["prediction"], element, self.points).items():
+            for logger in loggers:
+                logger.experiment.add_mesh(
+                    f"{name}/{kind}",
+                    positions[None],
+                    (255 * colors[None]).byte(),
+                    config_dict=CLOUD_VIEW,
+                    global_step=trainer.global_step,
+                )

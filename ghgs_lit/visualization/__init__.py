@@ -1,0 +1,1 @@
+"""Pictures, attention and point clouds to look at."""

@@ -1,0 +1,86 @@
+"""Attention of the recalibration, drawn on the photographs."""
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from ghgs_lit.errors import require
+from ghgs_lit.recalibration.inspection import TokenAttention
+from ghgs_lit.types import Batch, Points, Tokens
+from ghgs_lit.visualization.pictures import grid, palette, row, to_uint8
+
+_SIDE = 224  # least height of a tile in pixels
+_QUERY = (255, 60, 220)
+
+
+def chosen_token(
+    tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
+) -> int | None:
+    """Index of the packed token at ``(view, row, column)`` of the token grid.
+
+    Without ``at``, or where no token with a point lies there, the nearest in that view to it or to the
+    middle of the subject; None where that view has no token with a point.
+    """
+    views, height, width = tokens.grid[1:]
+    if at is not None:
+        expected = f"view, row, column below {(views, height, width)}"
+        inside = all(0 <= n < end for n, end in zip(at, (views, height, width), strict=True))
+        require(inside, "callbacks.attention.token", expected, list(at))
+    view = 0 if at is None else at[0]
+    candidates = ((tokens.image == element * views + view) & points.tokens_valid).nonzero()[:, 0]
+    if not len(candidates):
+        return None
+    places = torch.stack((tokens.row[candidates], tokens.column[candidates]), -1).float()
+    wanted = places.mean(0) if at is None else places.new_tensor(at[1:])
+    return int(candidates[(places - wanted).square().sum(-1).argmin()])
+
+
+def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:
+    """The query (outlined) and its neighbours on the views of its element.
+
+    First the neighbours, the nearest brightest; captions say how many of them a view has. Then for each
+    layer the weights, mean over the heads, the largest brightest; captions give each view's share.
+    """
+    views = tokens.grid[1]
+    element = int(tokens.image[attention.query]) // views
+    names = batch.views[element] if batch.views else tuple(map(str, range(views)))
+    images = [to_uint8(image) for image in batch.images[element]]
+    count = len(attention.neighbors)
+    ranks = torch.linspace(1, 0.25, count)
+    near = tokens.image[attention.neighbors] % views
+    captions = [f"{name}: {int((near == v).sum())}/{count}" for v, name in enumerate(names)]
+    rows = [row(_tiles(images, tokens, attention, ranks), captions)]
+    for layer, weights in enumerate(attention.weights.float().mean(1).cpu()):
+        shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
+        captions = [f"layer {layer}: {100 * share:.0f}%" for share in shares]
+        rows.append(row(_tiles(images, tokens, attention, weights / weights.max()), captions))
+    return grid(rows)
+
+
+def _tiles(
+    images: list[np.ndarray], tokens: Tokens, attention: TokenAttention, strengths: Tensor
+) -> list[np.ndarray]:
+    """Each view, darkened, with its neighbours in colours of their strength in [0, 1]."""
+    scale = max(1, -(-_SIDE // images[0].shape[0]))
+    side, views = tokens.patch_size * scale, tokens.grid[1]
+
+    def box(token: int) -> tuple[int, int, int, int]:
+        left, top = int(tokens.column[token]) * side, int(tokens.row[token]) * side
+        return left, top, left + side - 1, top + side - 1
+
+    viridis = palette("viridis")
+    tiles = []
+    for view, image in enumerate(images):
+        large = image.repeat(scale, 0).repeat(scale, 1) // 4 * 3
+        tile = Image.fromarray(large).convert("RGBA")
+        layer = Image.new("RGBA", tile.size)
+        draw = ImageDraw.Draw(layer)
+        for token, strength in zip(attention.neighbors.tolist(), strengths.tolist(), strict=True):
+            if int(tokens.image[token]) % views == view:
+                color = tuple(int(c) for c in viridis[round(255 * strength)])
+                draw.rectangle(box(token), fill=(*color, 50 + round(120 * strength)))
+        if int(tokens.image[attention.query]) % views == view:
+            draw.rectangle(box(attention.query), outline=(*_QUERY, 255), width=max(2, scale))
+        tiles.append(np.asarray(Image.alpha_composite(tile, layer).convert("RGB")))
+    return tiles

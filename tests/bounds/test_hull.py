@@ -1,0 +1,170 @@
+import dataclasses
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from ghgs_lit.bounds.visual_hull import SubjectBounds, box_interval, dilate, subject_box
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, ring
+
+
+def inside(near, far, batch, slack=1e-4):
+    """Part of the subject's pixels whose true depth lies within the bounds."""
+    good = (near <= batch.depths + slack) & (batch.depths <= far + slack)
+    return good[batch.masks].float().mean().item()
+
+
+@pytest.mark.parametrize("kind", ["box", "hull"])
+@pytest.mark.parametrize(("views", "size"), [(2, (56, 56)), (3, (70, 42)), (4, (42, 56)), (5, (56, 56))])
+def test_true_depth_is_within_the_bounds(kind, views, size):
+    batch = make_batch(2, views, *size, spread=180.0 if views == 2 else 360.0)
+    near, far = SubjectBounds(kind=kind)(batch.masks, batch.cameras)
+    assert near.shape == far.shape == batch.masks.shape
+    assert (near > 0).all()
+    assert (far - near > 0.0199).all()
+    assert inside(near, far, batch) == 1
+
+
+@pytest.mark.parametrize("resolution", [30, 50, 160])
+def test_a_coarse_search_stays_conservative(resolution):
+    batch = make_batch(1, 4, 112, 112)
+    near, far = SubjectBounds(resolution=resolution)(batch.masks, batch.cameras)
+    assert inside(near, far, batch) == 1
+    box = SubjectBounds(kind="box", resolution=resolution)(batch.masks, batch.cameras)
+    assert (near >= box[0] - 0.0101).all()  # half the least thickness
+    assert (far <= box[1] + 0.0201).all()
+
+
+def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
+    batch = make_batch(1, 5, 112, 112)
+    lengths = {}
+    for kind in ("box", "hull"):
+        near, far = SubjectBounds(kind=kind, dilation=0.0)(batch.masks, batch.cameras)
+        lengths[kind] = (far - near)[batch.masks].mean()
+    assert lengths["hull"] < 0.7 * lengths["box"]
+    assert lengths["hull"] < 0.55  # the mean chord of the ellipsoid is about 0.3 m
+
+
+def test_the_box_holds_the_subject_and_little_more():
+    batch = make_batch(2, 4, 112, 112)
+    lower, upper = subject_box(batch.masks, batch.cameras, radius=1)
+    assert (lower <= CENTER - RADII).all()
+    assert (upper >= CENTER + RADII).all()
+    assert (lower >= CENTER - RADII - 0.25).all()
+    assert (upper <= CENTER + RADII + 0.25).all()
+
+
+def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
+    batch = make_batch(1, 4, 56, 56, zoom=1.6)
+    assert batch.masks[:, :, 0].any(), "the head must touch the border in this test"
+    for kind in ("box", "hull"):
+        assert inside(*SubjectBounds(kind=kind)(batch.masks, batch.cameras), batch) == 1
+
+
+@pytest.mark.parametrize("kind", ["box", "hull"])
+def test_an_empty_mask_does_not_vote(kind):
+    batch = make_batch(2, 3, 56, 56)
+    masks = batch.masks.clone()
+    masks[0, 1] = False
+    near, far = SubjectBounds(kind=kind)(masks, batch.cameras)
+    assert near.isfinite().all()
+    assert far.isfinite().all()
+    assert (
+        inside(
+            near[:, [0, 2]],
+            far[:, [0, 2]],
+            type(batch)(
+                batch.images[:, [0, 2]],
+                batch.masks[:, [0, 2]],
+                batch.cameras[:, [0, 2]],
+                depths=batch.depths[:, [0, 2]],
+            ),
+        )
+        == 1
+    )
+    near, far = SubjectBounds(kind=kind)(torch.zeros_like(masks), batch.cameras)
+    assert near.isfinite().all()
+    assert (far > near).all()
+
+
+def test_tolerance_outvotes_a_wrong_mask():
+    batch = make_batch(1, 5, 56, 56)
+    wrong = batch.masks.clone()
+    wrong[0, 2, 20:] = False  # one view has lost everything below the head
+    others = [0, 1, 3, 4]
+    near, far = SubjectBounds(tolerance=1)(wrong, batch.cameras)
+    good = (near <= batch.depths) & (batch.depths <= far)
+    assert good[:, others][batch.masks[:, others]].all()
+    feet = [subject_box(wrong, batch.cameras, 1, tolerance)[0][0, 1] for tolerance in (0, 1)]
+    assert feet[1] <= (CENTER - RADII)[1] < feet[0] - 0.3
+
+
+def test_masks_that_contradict_one_another_fall_back_to_the_box():
+    batch = make_batch(1, 3, 56, 56)
+    masks = torch.zeros_like(batch.masks)
+    masks[0, 0, :6, :6] = masks[0, 1, -6:, -6:] = masks[0, 2, :6, -6:] = True
+    hull = SubjectBounds(dilation=0.0)(masks, batch.cameras)
+    assert all(value.isfinite().all() for value in hull)
+    assert (hull[1] > hull[0]).all()
+
+
+def test_box_interval_ends_on_the_faces():
+    cameras = ring(2, 3, 28, 42)
+    lower, upper = torch.tensor([[-0.3, 0.2, -0.4]] * 2), torch.tensor([[0.5, 1.6, 0.3]] * 2)
+    near, far = box_interval(cameras, lower, upper)
+    hits = ellipsoid(cameras, radii=torch.tensor([0.1, 0.5, 0.1]))[0]  # rays that surely hit
+    for depth in (near, far):
+        points = unproject_maps(depth, cameras)[hits]
+        beyond = torch.maximum(lower[0] - points, points - upper[0]).amax(-1)
+        torch.testing.assert_close(beyond, torch.zeros_like(beyond), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("radius", [0, 1, 3, 40])
+def test_dilation_is_a_maximum_over_a_square(radius):
+    masks = torch.rand(2, 3, 17, 23, generator=torch.Generator().manual_seed(0)) > 0.97
+    padded = F.pad(masks.float(), (radius,) * 4)
+    expected = padded.unfold(-2, 2 * radius + 1, 1).unfold(-2, 2 * radius + 1, 1).amax((-1, -2)).bool()
+    assert torch.equal(dilate(masks, radius), expected)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
+    batch = make_batch(1, 3)
+    cameras = batch.cameras
+    for name, index in (("intrinsics", (..., [0, 1], [0, 1])), ("extrinsics", (..., slice(3), 3))):
+        changed = getattr(cameras, name).clone()
+        changed[index] *= factor
+        odd = dataclasses.replace(cameras, **{name: changed})
+        for kind in ("box", "hull"):
+            near, far = SubjectBounds(kind=kind)(batch.masks, odd)
+            assert near.isfinite().all()
+            assert far.isfinite().all()
+            assert ((near > 0) & (far >= near)).all()
+
+
+def test_autocast_changes_nothing():
+    batch = make_batch(1, 3)
+    expected = SubjectBounds()(batch.masks, batch.cameras)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = SubjectBounds()(batch.masks, batch.cameras)
+    assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
+
+
+def test_elements_of_a_batch_do_not_mix():
+    batch = make_batch(2, 3)
+    together = SubjectBounds()(batch.masks, batch.cameras)
+    for b in range(2):
+        alone = SubjectBounds()(batch.masks[b : b + 1], batch.cameras[b : b + 1])
+        for x, y in zip(together, alone, strict=True):
+            torch.testing.assert_close(x[b], y[0], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("option", "key"),
+    [({"kind": "sphere"}, "kind"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
+)
+def test_impossible_options_are_refused(option, key):
+    with pytest.raises(InputError, match=f"depth_head.*{key}"):
+        SubjectBounds(**option)

@@ -1,0 +1,175 @@
+"""A data set of one's own: the documentation's template, found by the command line, trained and measured."""
+
+import json
+import os
+import shutil
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ghgs_lit.cli.main import main
+from ghgs_lit.config import build, plugins
+from ghgs_lit.errors import InputError
+from tests.helpers.training import ring
+
+TEMPLATE = Path(__file__).parents[2] / "docs" / "template"
+CAMERAS, SIZE = 8, 60
+KEYS = {
+    "views": {"name": "v3", "training_counts": [3], "evaluation_count": 3},
+    "targets": {"name": "cameras", "vid": 0},
+}
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A user's folder: one Python file, one YAML, and a toy data set."""
+    shutil.copy(TEMPLATE / "my_people.py", tmp_path / "my_people.py")
+    shutil.copytree(TEMPLATE / "conf", tmp_path / "conf")
+    cameras = ring(CAMERAS, SIZE)
+    rng = np.random.default_rng(0)
+    for phase, names in (("train", "ab"), ("val", "c")):
+        for name in names:
+            folder = tmp_path / "photographs" / phase / name
+            folder.mkdir(parents=True)
+            color = rng.integers(60, 255, 3)
+            for pid in range(CAMERAS):
+                pixels = np.zeros((SIZE, SIZE, 4), np.uint8)
+                pixels[10:50, 22:38] = (*color, 255)
+                Image.fromarray(pixels).save(folder / f"{pid}.png")
+            np.savez(
+                folder / "cameras.npz", intrinsics=cameras.intrinsics, extrinsics=cameras.extrinsics[:, :3]
+            )
+            np.save(folder / "body.npy", rng.normal(size=(50, 3)) * 0.2)
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def clean(monkeypatch):
+    """Every test admits and imports anew."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.delenv(plugins.VARIABLE, raising=False)
+    plugins._installed.cache_clear()
+    yield
+    plugins._installed.cache_clear()
+    for name in ("my_people", "numbers_of_mine"):
+        sys.modules.pop(name, None)
+
+
+def node(project: Path, **changes) -> dict:
+    about = {"_target_": "my_people.MyDataModule", "name": "m", "root": str(project / "photographs")}
+    return {**about, "size": 56, "ring": CAMERAS, **KEYS, **changes}
+
+
+def ghgs(*arguments: str) -> int:
+    """The console script in this process."""
+    before = sys.argv
+    sys.argv = ["ghgs", *arguments]
+    os.environ.pop("HYDRA_FULL_ERROR", None)
+    try:
+        return main()
+    except SystemExit as exit:
+        return exit.code
+    finally:
+        sys.argv = before
+
+
+def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, capsys):
+    """The documentation's commands."""
+    monkeypatch.chdir(project)
+    monkeypatch.setenv(plugins.VARIABLE, "my_people.py")
+    code = ghgs(
+        "train", "--config-dir", "conf", "data=my_people", "data.root=photographs", "data.size=56",
+        "views=v3", "targets=cameras", "evaluation.targets=[cameras]", "trainer.max_steps=2",
+        "evaluation.pictures=0", "logger=none", "callbacks=none", "hydra.run.dir=run",
+    )  # fmt: skip
+    assert code == 0
+    content = json.loads(Path("run/metrics.json").read_text())
+    assert content["provenance"]["data"] == {"name": "my_people", "split": "val"}
+    assert content["provenance"]["training"]["steps"] == 2
+    # One subject; every camera that is no input is a target.
+    before = {row["target"]: row["psnr"] for row in content["rows"]}
+    assert {row["subject"] for row in content["rows"]} == {"c"}
+    assert len(before) == CAMERAS - 3
+    assert np.isfinite(list(before.values())).all()
+    # Its checkpoint is measured with the same admission, and refused without.
+    arguments = [
+        "evaluate", "checkpoint=run/checkpoints/last.ckpt", "views=v3", "targets=cameras",
+        "evaluation.targets=[cameras]", "evaluation.pictures=0", "hydra.run.dir=measured",
+    ]  # fmt: skip
+    monkeypatch.delenv(plugins.VARIABLE)
+    assert ghgs(*arguments) == 1
+    said = capsys.readouterr().err
+    assert "data._target_: expected a class of ghgs_lit" in said
+    assert plugins.VARIABLE in said
+    monkeypatch.setenv(plugins.VARIABLE, "my_people.py")
+    assert ghgs(*arguments) == 0
+    again = json.loads(Path("measured/metrics.json").read_text())
+    assert {row["target"]: row["psnr"] for row in again["rows"]} == pytest.approx(before, abs=1e-3)
+
+
+def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
+    monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
+    data = build(node(project), "data")
+    (batch,) = list(data.evaluation_loader())
+    assert batch.images.shape == (1, 3, 3, 56, 56)
+    assert len(batch.body_vertices[0]) == 50
+    expected = ring(CAMERAS, 56)
+    assert torch.allclose(batch.cameras.intrinsics[0], expected.intrinsics[[0, 2, 5]], atol=1e-4)
+    assert torch.allclose(batch.cameras.extrinsics[0], expected.extrinsics[[0, 2, 5]], atol=1e-5)
+    assert batch.masks.float().mean().item() == pytest.approx(40 * 16 / 60**2, abs=0.01)
+    # Other processes find the class, too.
+    assert str(project) in sys.path
+    with pytest.raises(InputError, match="no other view at a camera; found 3"):
+        list(build(node(project, targets={"name": "cameras", "vid": 3}), "data").evaluation_loader())
+    (project / "photographs" / "val" / "c" / "cameras.npz").unlink()
+    with pytest.raises(InputError, match=r"c/cameras\.npz"):
+        list(build(node(project), "data").evaluation_loader())
+
+
+def test_nothing_is_admitted_by_a_configuration(project):
+    for target in ("my_people.MyDataModule", "os.system", "ghgs_lit_evil.x"):
+        with pytest.raises(InputError, match=r"data\._target_"):
+            build(node(project, _target_=target), "data")
+    assert "my_people" not in sys.modules
+
+
+def test_an_admitted_module_admits_no_other(project, monkeypatch):
+    monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
+    for target in ("my_people_2.X", "os.system", "my_people"):
+        with pytest.raises(InputError, match="expected a class of ghgs_lit"):
+            build(node(project, _target_=target), "data")
+
+
+def test_a_module_and_an_installed_package_can_be_admitted(monkeypatch):
+    monkeypatch.setenv(plugins.VARIABLE, "fractions")
+    assert build({"_target_": "fractions.Fraction", "numerator": 3}).numerator == 3
+    monkeypatch.delenv(plugins.VARIABLE)
+    with pytest.raises(InputError, match="fractions"):
+        build({"_target_": "fractions.Fraction", "numerator": 3})
+    plugins._installed.cache_clear()
+    points = {plugins.GROUP: [SimpleNamespace(value="fractions")]}
+    monkeypatch.setattr(plugins.importlib.metadata, "entry_points", lambda group: points.get(group, []))
+    assert build({"_target_": "fractions.Fraction", "numerator": 3}).numerator == 3
+
+
+def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
+    for name, said in (
+        ("none.py", r"found no .*none\.py"),
+        ("json.py", "no other module has"),
+        ("my-x.py", "can import"),
+    ):
+        if name != "none.py":
+            (tmp_path / name).write_text("")
+        monkeypatch.setenv(plugins.VARIABLE, str(tmp_path / name))
+        with pytest.raises(InputError, match=said):
+            build({"_target_": "x.Y"})
+    # An error in the user's own file is shown as it is.
+    (tmp_path / "numbers_of_mine.py").write_text("1 / 0")
+    monkeypatch.setenv(plugins.VARIABLE, str(tmp_path / "numbers_of_mine.py"))
+    with pytest.raises(ZeroDivisionError):
+        build({"_target_": "numbers_of_mine.Y"})

@@ -1,0 +1,237 @@
+"""HuMMan-Recon: every oddity of the format, on a miniature in its true layout."""
+
+import json
+import pickle
+import shutil
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import sparse
+
+from ghgs_lit.data.humman.reader import HuMManReader
+from ghgs_lit.data.humman.smpl import read_model, read_parameters
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis.miniatures import humman
+from ghgs_lit.synthesis.miniatures.smpl import stand_in
+from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
+
+TEST = "p000455_a000986"
+WIDTH, HEIGHT = 160, 90
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("humman") / "recon"
+    make_miniature(humman, folder, [TEST], {"train": 1, "val": 1}, WIDTH, seed=3)
+    return folder
+
+
+def reader(root: Path, **options) -> HuMManReader:
+    return HuMManReader(root, [TEST], range(0, 97, 6), **options)
+
+
+def test_frames_are_multiples_of_6_and_some_lack(root):
+    assert list(reader(root).subjects) == [f"{TEST}_{n:06d}" for n in (0, 6, 18)]
+    assert set(reader(root).subjects.values()) == {tuple(range(10))}
+
+
+def test_a_camera_that_lacks_a_frame_is_left_out(root, tmp_path):
+    shutil.copytree(root / TEST, tmp_path / TEST)
+    (tmp_path / TEST / "kinect_color" / "kinect_004" / "000006.png").unlink()
+    subjects = reader(tmp_path).subjects
+    assert subjects[f"{TEST}_000006"] == (0, 1, 2, 3, 5, 6, 7, 8, 9)
+    assert subjects[f"{TEST}_000018"] == tuple(range(10))
+
+
+def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_path):
+    shutil.copytree(root, tmp_path / "recon")
+    (tmp_path / "recon" / "notes").mkdir()
+    data = build_data("humman", tmp_path / "recon", "data.body=none")
+    assert len(data.split["val"]) == len(set(data.split["val"])) == 22
+    assert data.sequences("train") == ["p100001_a000048"]
+    assert data.reader("val", None).sequences == {TEST}
+    assert data.published == {"train": 317, "val": 22}
+    assert list(data.frames) == [6 * i for i in range(17)]
+
+
+def test_the_world_is_the_first_cameras_frame_in_metres(root):
+    content = json.loads((root / TEST / "cameras.json").read_text())
+    assert len(content) == 20
+    views = [reader(root).view(f"{TEST}_000000", k) for k in range(10)]
+    np.testing.assert_allclose(views[0].extrinsics, np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(views[3].extrinsics[:3, 3], content["kinect_color_003"]["T"], rtol=1e-6)
+    centers = np.stack([-v.extrinsics[:3, :3].T @ v.extrinsics[:3, 3] for v in views])
+    assert 4 < np.linalg.norm(centers - centers[0], axis=-1).max() < 6
+
+
+def test_any_value_of_the_matting_is_the_performer(root):
+    path = root / TEST / "kinect_mask" / "kinect_002" / "000006.png"
+    matting = np.asarray(Image.open(path))
+    assert ((matting > 0) & (matting < 128)).any()
+    np.testing.assert_array_equal(reader(root).view(f"{TEST}_000006", 2).mask, matting > 0)
+
+
+def test_drawn_masks_are_read_where_there_are_any(root):
+    view = reader(root, masks="kinect_mask_manual").view(f"{TEST}_000006", 2)
+    assert view.mask.sum() < reader(root).view(f"{TEST}_000006", 2).mask.sum()
+    assert not (root / "p100001_a000048" / "kinect_mask_manual").exists()
+
+
+def test_the_background_is_black(root):
+    view = reader(root).view(f"{TEST}_000000", 1)
+    assert view.image[~view.mask].max() == 0
+    assert view.image[view.mask].max() > 60
+
+
+@pytest.mark.parametrize("share", [1, 2, 5])
+def test_intrinsics_fit_resized_photographs(root, tmp_path, share):
+    """A spot where OpenCV sees a point is where the view's camera sees it, to a fiftieth of a pixel."""
+    shutil.copytree(root / TEST, tmp_path / TEST)
+    camera = json.loads((root / TEST / "cameras.json").read_text())["kinect_color_005"]
+    matrix, rotation, translation = (np.array(camera[key]) for key in "KRT")
+    point = np.array([0.03, 0.1, 2.4])
+    x, y = (matrix @ (rotation @ point + translation))[:2] / (rotation @ point + translation)[2]
+    name = Path("kinect_005") / "000000.png"
+    Image.fromarray(blob(HEIGHT, WIDTH, x, y)).save(tmp_path / TEST / "kinect_color" / name)
+    full = Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8))
+    full.save(tmp_path / TEST / "kinect_mask" / name)
+    size = (HEIGHT // share, WIDTH // share)
+    view = reader(tmp_path, size=size).view(f"{TEST}_000000", 5)
+    assert view.image.shape == (*size, 3)
+    np.testing.assert_allclose(centroid(view.image), project(view, point), atol=0.02)
+
+
+def test_depth_points_lie_on_the_performer(root):
+    data = reader(root, body="depth")
+    for name in data.subjects:
+        points = data.body(name)
+        assert len(points) > 500
+        assert points.dtype == np.float32
+        assert min(inside(data.view(name, k), points) for k in range(10)) > 0.99
+        extent = np.ptp(points, axis=0)
+        assert 1.4 < extent[1] < 2.0  # y points down in the first camera's frame, about upright
+
+
+def test_depth_points_are_millimetres_of_the_depth_cameras(root, tmp_path):
+    """Shifting the depth cameras by 0.3 m moves the points off the performer."""
+    shutil.copytree(root / TEST, tmp_path / TEST)
+    content = json.loads((tmp_path / TEST / "cameras.json").read_text())
+    for key in content:
+        if "depth" in key:
+            content[key]["T"][0] += 0.3
+    (tmp_path / TEST / "cameras.json").write_text(json.dumps(content))
+    name = f"{TEST}_000000"
+    assert len(reader(tmp_path, body="depth").body(name)) < 0.7 * len(reader(root, body="depth").body(name))
+
+
+def test_no_body_is_a_choice(root):
+    assert reader(root, body="none").body(f"{TEST}_000000") is None
+    batch = build_data(
+        "humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0"
+    ).training_batch(0)
+    assert batch.body_vertices is None
+    assert batch.images.shape == (1, 4, 3, 36, 64)
+
+
+def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(root):
+    data = build_data("humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0")
+    samples = list(data.evaluation_loader(views=3))
+    assert len(samples) == 3
+    assert samples[0].views == (("000/0", "003/0", "006/0"),)
+    assert samples[0].targets.images.shape == (1, 7, 3, 36, 64)
+    assert data.people(data.reader("val", None)) == 1
+
+
+def test_parameters_have_the_published_shapes(root):
+    found = read_parameters(root / TEST / "smpl_params" / "000018.npz")
+    assert {key: value.shape for key, value in found.items()} == {
+        "betas": (10,), "body_pose": (69,), "global_orient": (3,), "transl": (3,)
+    }  # fmt: skip
+
+
+def test_the_stand_in_has_the_shapes_of_smpl(root):
+    arrays = read_model(root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl")
+    assert arrays["weights"].sum(1) == pytest.approx(1)
+    assert arrays["J_regressor"].sum(1) == pytest.approx(1, abs=1e-4)
+    assert set(arrays) == set(stand_in())
+
+
+def test_smpl_vertices_project_into_every_mask(root):
+    pytest.importorskip("smplx")
+    data = reader(root, body="smpl", smpl_model=root.with_name("recon_body_models"))
+    for name in data.subjects:
+        assert data.body(name).shape == (6890, 3)
+        assert min(inside(data.view(name, k), data.body(name)) for k in range(10)) > 0.97
+
+
+def test_smpl_turns_about_the_pelvis_and_then_shifts(root):
+    pytest.importorskip("smplx")
+    from ghgs_lit.data.humman.smpl import Body
+
+    body, model = Body(root.with_name("recon_body_models")), stand_in()
+    still = {
+        "betas": np.zeros(10),
+        "body_pose": np.zeros(69),
+        "global_orient": np.zeros(3),
+        "transl": np.zeros(3),
+    }
+    rest = body.vertices(still)
+    np.testing.assert_allclose(rest, model["v_template"], atol=1e-5)
+    turned = body.vertices(
+        {**still, "global_orient": np.array([0, np.pi, 0]), "transl": np.array([1.0, 2, 3])}
+    )
+    pelvis = model["J_regressor"][0] @ model["v_template"]
+    np.testing.assert_allclose(turned, (rest - pelvis) * [-1, 1, -1] + pelvis + [1, 2, 3], atol=1e-5)
+
+
+class Ch:
+    """As chumpy's arrays are pickled: an object with its array under ``x``."""
+
+    def __init__(self, x):
+        self.x = x
+
+
+@pytest.mark.parametrize("protocol", [0, 2])
+def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monkeypatch, protocol):
+    module = type(sys)("chumpy.ch")
+    module.Ch, Ch.__module__, Ch.__qualname__ = Ch, "chumpy.ch", "Ch"
+    monkeypatch.setitem(sys.modules, "chumpy", type(sys)("chumpy"))
+    monkeypatch.setitem(sys.modules, "chumpy.ch", module)
+    arrays = stand_in()
+    content = {
+        **arrays,
+        "shapedirs": Ch(arrays["shapedirs"]),
+        "J_regressor": sparse.csc_matrix(arrays["J_regressor"]),
+        "bs_type": "lrotmin",
+    }
+    path = tmp_path / "SMPL_NEUTRAL.pkl"
+    path.write_bytes(pickle.dumps(content, protocol=protocol))
+    monkeypatch.delitem(sys.modules, "chumpy.ch")
+    read = read_model(path)
+    for key, value in arrays.items():
+        np.testing.assert_allclose(read[key], value)
+
+
+def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
+    make_miniature(humman, tmp_path / "recon", [TEST], {"train": 1, "val": 0}, WIDTH, seed=3, frames=[0])
+    for name in ("kinect_color/kinect_007/000000.png", "kinect_depth/kinect_007/000000.png", "cameras.json"):
+        place = Path("p100001_a000048") / name
+        assert (tmp_path / "recon" / place).read_bytes() == (root / place).read_bytes()
+
+
+def test_targets_between_cameras_that_stand_still_are_refused(root):
+    data = build_data(
+        "humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0", "targets=release"
+    )
+    for draw in (
+        data.training_draws,
+        data.evaluation_loader,
+        partial(data.evaluation_loader, targets="midway"),
+    ):
+        with pytest.raises(InputError, match=r"targets: expected cameras for data=humman.*; found"):
+            draw()
+    assert len(data.evaluation_loader(targets="cameras")) > 0

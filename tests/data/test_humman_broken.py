@@ -1,0 +1,274 @@
+"""Broken HuMMan-Recon data: each case gets one line that says where, what was expected and what was found.
+
+The lines stand in ``docs/data_humman.md``.
+"""
+
+import json
+import os
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ghgs_lit.data.humman.datamodule import check_world
+from ghgs_lit.data.humman.smpl import read_model, read_parameters
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis.miniatures import humman
+from ghgs_lit.synthesis.miniatures.smpl import stand_in
+from tests.helpers.captures import blank, build_data, make_miniature, shrink, truncate
+
+NAME = "p000455_a000986"
+COLOR, MASK, DEPTH = (f"kinect_{kind}/kinect_000/000000.png" for kind in ("color", "mask", "depth"))
+
+
+class Malice:
+    """Runs a command when a pickle of it is read carelessly."""
+
+    def __reduce__(self):
+        return os.system, ("touch ran",)
+
+
+def calibrated(change):
+    """A case that changes what is in ``cameras.json``."""
+
+    def apply(folder: Path) -> None:
+        content = json.loads((folder / "cameras.json").read_text())
+        change(content)
+        (folder / "cameras.json").write_text(json.dumps(content))
+
+    return apply
+
+
+def put(key: str, value):
+    """A case that gives the fourth colour camera another K, R or T."""
+    return calibrated(lambda content: content["kinect_color_003"].__setitem__(key, value))
+
+
+def swap(content: dict) -> None:
+    for camera in content.values():
+        camera["R"], camera["T"] = camera["T"], camera["R"]
+
+
+def millimetres(content: dict) -> None:
+    for camera in content.values():
+        camera["T"] = [1000 * t for t in camera["T"]]
+
+
+def together(content: dict) -> None:
+    for camera in content.values():
+        camera["T"] = [0, 0, 0]
+
+
+def eight_bits(folder: Path) -> None:
+    Image.new("L", (40, 36), 7).save(folder / DEPTH)
+
+
+def renumber(folder: Path) -> None:
+    for path in folder.glob("kinect_*/kinect_*/000000.png"):
+        path.rename(path.with_name("000001.png"))
+
+
+CASES = {
+    "no cameras": (
+        lambda f: (f / "cameras.json").unlink(),
+        r"cameras.json: expected the cameras .*; found no such file",
+    ),
+    "truncated cameras": (lambda f: truncate(f / "cameras.json"), r"cameras.json: expected JSON; found"),
+    "a camera missing": (
+        calibrated(lambda c: c.pop("kinect_color_007")),
+        r"cameras.json: expected K of kinect_color_007; found none",
+    ),
+    "no T": (
+        calibrated(lambda c: c["kinect_color_003"].pop("T")),
+        r"expected T of kinect_color_003; found none",
+    ),
+    "R and T swapped": (calibrated(swap), r"kinect_color_000: R: expected an array 3x3; found 3"),
+    "NaN camera": (put("T", [float("nan")] * 3), r"kinect_color_003: T: expected finite numbers; found NaN"),
+    "no rotation": (put("R", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), r"kinect_color_003: expected a rotation in"),
+    "focal length below 0": (
+        put("K", [[-5, 0, 1], [0, 5, 1], [0, 0, 1]]),
+        r"expected focal lengths above 0; found -5",
+    ),
+    "text for a matrix": (
+        put("K", "none"),
+        r"kinect_color_003: K: expected an array 3x3; found could not convert",
+    ),
+    "millimetres": (
+        calibrated(millimetres),
+        r"expected translations T in metres; found color cameras \d+ m apart",
+    ),
+    "all cameras in one place": (
+        calibrated(together),
+        r"expected translations T in metres; found color cameras 0 m",
+    ),
+    "no photographs": (
+        lambda f: shutil.rmtree(f / "kinect_color"),
+        r"kinect_color: expected frames such as 000000.png; found none of 17 .*multiples of 6",
+    ),
+    "wrong frame numbers": (renumber, r"kinect_color: expected frames such as 000000.png; found none of 17"),
+    "truncated photograph": (lambda f: truncate(f / COLOR), r"000000.png: expected a readable image; found"),
+    "resized photograph": (
+        lambda f: (shrink(f / COLOR), shrink(f / MASK)),
+        r"kinect_000/000000.png: expected a photograph of the calibration's size, .*; found 36x64",
+    ),
+    "no mask": (
+        lambda f: (f / MASK).unlink(),
+        r"kinect_mask/kinect_000/000000.png: expected an image; found no such",
+    ),
+    "mask of another size": (
+        lambda f: shrink(f / MASK),
+        r"000000.png: expected the size of its photograph, 72x128; found 36x64",
+    ),
+    "empty mask": (
+        lambda f: blank(f / MASK),
+        r"kinect_mask/kinect_000/000000.png: expected a subject in the mask; found",
+    ),
+    "no depth": (
+        lambda f: shutil.rmtree(f / "kinect_depth"),
+        r"kinect_depth/kinect_000/000000.png: expected an image; found no such file",
+    ),
+    "depth of 8 bits": (
+        eight_bits,
+        r"000000.png: expected 16 bits of depth in millimetres; found uint8 \(36, 40\)",
+    ),
+    "no depth cameras": (
+        calibrated(lambda c: c.pop("kinect_depth_002")),
+        r"cameras.json: expected K of kinect_depth_002; found none",
+    ),
+    "no sequence": (shutil.rmtree, r"expected sequences such as p000455_a000986; found none of the split"),
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "recon"
+    make_miniature(humman, folder, [NAME], {"train": 0, "val": 1}, 128, seed=3, frames=[0])
+    return folder / NAME
+
+
+def read_all(root: Path) -> None:
+    """What evaluation reads of the frame."""
+    reader = build_data("humman", root, "data.body=depth").reader("val", (72, 128))
+    for subject in reader.subjects:
+        reader.view(subject, 0)
+        reader.body(subject)
+
+
+def test_the_whole_one_is_read(whole):
+    read_all(whole.parent)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_broken_one_gets_its_line(case, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / NAME)
+    spoil, line = CASES[case]
+    spoil(tmp_path / NAME)
+    with pytest.raises(InputError, match=line) as caught:
+        read_all(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_another_world_is_reported(whole, tmp_path):
+    check_world(whole / "cameras.json")
+    content = json.loads((whole / "cameras.json").read_text())
+    for camera in content.values():  # the same cameras in the frame of the second one
+        pose = np.linalg.inv(_pose(json.loads((whole / "cameras.json").read_text())["kinect_color_001"]))
+        moved = _pose(camera) @ pose
+        camera["R"], camera["T"] = moved[:3, :3].tolist(), moved[:3, 3].tolist()
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    with pytest.raises(
+        InputError, match=r"expected the world in the frame of kinect_color_000 \(R = 1, T = 0\)"
+    ):
+        check_world(tmp_path / "cameras.json")
+
+
+def _pose(camera: dict) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = camera["R"], camera["T"]
+    return pose
+
+
+GOOD = {"betas": np.zeros(10), "body_pose": np.zeros(69), "global_orient": np.zeros(3), "transl": np.zeros(3)}
+PARAMETERS = {
+    "malicious": ({**GOOD, "betas": np.array(Malice(), object)}, "expected an .npz file of arrays; found"),
+    "without transl": ({k: v for k, v in GOOD.items() if k != "transl"}, "expected transl; found"),
+    "of SMPL-X": ({**GOOD, "body_pose": np.zeros(63)}, "body_pose: expected an array 69; found 63"),
+    "NaN": ({**GOOD, "transl": np.full(3, np.nan)}, "transl: expected finite numbers; found NaN or infinity"),
+}
+
+
+@pytest.mark.parametrize("case", PARAMETERS)
+def test_broken_parameters_get_their_line(case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    content, line = PARAMETERS[case]
+    np.savez("000000.npz", **content)
+    with pytest.raises(InputError, match=f"000000.npz.*{line}"):
+        read_parameters(tmp_path / "000000.npz")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_missing_and_truncated_parameters_get_their_line(tmp_path):
+    path = tmp_path / "000000.npz"
+    with pytest.raises(InputError, match=r"000000.npz: expected SMPL parameters; found no such file"):
+        read_parameters(path)
+    np.savez(path, **GOOD)
+    truncate(path)
+    with pytest.raises(InputError, match=r"000000.npz: expected an .npz file of arrays; found"):
+        read_parameters(path)
+
+
+MODELS = {
+    "malicious": (
+        {**stand_in(), "f": Malice()},
+        "expected a pickle of NumPy arrays and plain containers; found posix.system",
+    ),
+    "of SMPL-X": (
+        {**stand_in(), "v_template": np.zeros((10475, 3))},
+        "v_template: expected an array 6890x3; found 10475x3",
+    ),
+    "a list": ([1, 2], "expected the arrays of an SMPL model; found list"),
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_a_broken_model_gets_its_line(case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    content, line = MODELS[case]
+    Path("SMPL_NEUTRAL.pkl").write_bytes(pickle.dumps(content))
+    with pytest.raises(InputError, match=f"SMPL_NEUTRAL.pkl: {line}"):
+        read_model(tmp_path / "SMPL_NEUTRAL.pkl")
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "line"),
+    [
+        (
+            [],
+            r"data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl .*; found null .*body=depth.*none",
+        ),
+        (
+            ["data.smpl_model=/nowhere"],
+            "/nowhere: expected SMPL_NEUTRAL.pkl, or a folder with smpl/SMPL_NEUTRAL.pkl",
+        ),
+        (["data.body=smplx"], "data.body: expected one of smpl, depth, none; found 'smplx'"),
+        (["data.masks=mask"], "data.masks: expected one of kinect_mask, kinect_mask_manual; found 'mask'"),
+        (["data.frames=[0,0,6]"], r"data.frames: expected \[start, stop, step\] with start < stop; found"),
+        (["data.split.val=null"], "data.split.val: expected names of sequences; found None"),
+    ],
+)
+def test_impossible_settings_are_refused(whole, overrides, line):
+    with pytest.raises(InputError, match=line):
+        build_data("humman", whole.parent, *overrides).reader("val", None)
+
+
+def test_without_smplx_the_message_says_what_to_install(whole, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "smplx", None)
+    place = whole.parent.with_name("recon_body_models")
+    with pytest.raises(InputError, match=r"data.body: expected the package smplx .*pip install smplx"):
+        build_data("humman", whole.parent, f"data.smpl_model={place}").reader("val", None)

@@ -1,0 +1,306 @@
+"""Sampling protocols and the DataModules: angles, draws that resume, batches, refusals."""
+
+import numpy as np
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from ghgs_lit.data.sampling import (
+    TargetProtocol,
+    TrainingDraws,
+    ViewProtocol,
+    evaluation_draws,
+    even_positions,
+    middle,
+)
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis import RenderedDataModule
+from tests.helpers.people import RELEASE, V4, equal, render_boxes
+
+FULL = tuple(range(16))
+RANDOM = ViewProtocol("random", (3, 4, 5), 4)
+MIDWAY = {"name": "midway", "per_subject": "all"}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rendered")
+    render_boxes(folder / "out", folder / "scans")
+    return folder / "out"
+
+
+def module(root, **changes) -> RenderedDataModule:
+    arguments = {"views": V4, "targets": RELEASE, "size": 28, "batch_size": 2} | changes
+    return RenderedDataModule(str(root), **arguments)
+
+
+def turns(cameras) -> np.ndarray:
+    """Yaw of cameras in degrees from their actual extrinsics."""
+    center = cameras.centers.double().numpy()
+    return np.degrees(np.arctan2(center[..., 0], center[..., 2]))
+
+
+def between(a, b) -> np.ndarray:
+    return np.abs((a - b + 180) % 360 - 180)
+
+
+def test_even_positions_are_the_protocols():
+    assert even_positions(16, 3) == [0, 5, 10]
+    assert even_positions(16, 4) == [0, 4, 8, 12]
+    assert even_positions(16, 5) == [0, 3, 6, 9, 12]
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_targets_stand_where_their_protocol_says(root, count):
+    """Angles of the actual cameras: 11.25 degrees beside the first input; equally far from two inputs."""
+    data = module(root)
+    for batch in data.evaluation_loader(count, "release"):
+        first, target = turns(batch.cameras)[:, 0], turns(batch.targets.cameras)[:, 0]
+        np.testing.assert_allclose((target - first) % 360, 11.25, atol=1e-3)
+        assert batch.targets.names == (("000/3",),) * len(batch.subjects)
+    for batch in data.evaluation_loader(count, MIDWAY):
+        inputs, targets = turns(batch.cameras), turns(batch.targets.cameras)
+        assert targets.shape[1] == count
+        step = 22.5 * np.diff([*even_positions(16, count), 16])
+        np.testing.assert_allclose(
+            between(targets, inputs), np.broadcast_to(step / 2, targets.shape), atol=1e-3
+        )
+        after = np.roll(inputs, -1, axis=1)
+        np.testing.assert_allclose(
+            between(targets, after), np.broadcast_to(step / 2, targets.shape), atol=1e-3
+        )
+    if count == 4:
+        batch = next(iter(data.evaluation_loader(4, "midway")))
+        assert batch.targets.names[0] == ("002/0",)
+        np.testing.assert_allclose(
+            between(turns(batch.targets.cameras), turns(batch.cameras)[:, :1]), 45, atol=1e-3
+        )
+
+
+def test_middle_wraps_around_the_ring():
+    assert middle(0, 5, 16) == (2, 3)
+    assert middle(12, 0, 16) == (14, 0)
+    assert middle(10, 0, 16) == (13, 0)
+    assert middle(15, 0, 16) == (15, 3)
+    assert middle(15, 2, 16) == (0, 3)
+
+
+def test_release_beside_every_input_and_listed_positions():
+    targets = TargetProtocol("release", per_subject="all")
+    draws = evaluation_draws({"a": FULL}, 3, targets, 16, 0, {3: [0, 6, 11]})
+    assert draws[0].inputs == ((0, 0), (6, 0), (11, 0))
+    assert draws[0].targets == ((0, 3), (6, 3), (11, 3))
+
+
+def test_random_targets_of_evaluation_are_fixed_and_differ_between_subjects():
+    targets = TargetProtocol("random", per_subject=3)
+    subjects = {f"s{i}": FULL for i in range(6)}
+    first = evaluation_draws(subjects, 4, targets, 16, 0)
+    assert first == evaluation_draws(subjects, 4, targets, 16, 0)
+    assert len({d.targets for d in first}) == 6
+    for draw in first:
+        assert len(set(draw.targets)) == 3
+        assert not set(draw.targets) & set(draw.inputs)
+
+
+def draws(views=RANDOM, targets=None, **changes) -> TrainingDraws:
+    targets = targets or TargetProtocol("random", per_step=3)
+    arguments = {
+        "subjects": {f"s{i}": FULL for i in range(5)},
+        "ring": 16,
+        "batch_size": 2,
+        "seed": 0,
+    } | changes
+    return TrainingDraws(views=views, targets=targets, **arguments)
+
+
+def test_training_draws_depend_on_seed_step_and_index_only():
+    forward = [draws().batch(step) for step in range(40)]
+    backward = [draws().batch(step) for step in reversed(range(40))][::-1]
+    assert forward == backward
+    assert forward != [draws(seed=1).batch(step) for step in range(40)]
+    torch.manual_seed(5)
+    np.random.seed(5)  # noqa: NPY002  no global generator has a say
+    assert forward[7] == draws().batch(7)
+
+
+def test_training_draws_are_fair():
+    batches = [draws().batch(step) for step in range(300)]
+    for batch in batches:
+        assert len({len(d.inputs) for d in batch}) == 1
+        for draw in batch:
+            assert len(set(draw.inputs)) == len(draw.inputs)
+            assert len(set(draw.targets)) == 3
+            assert not set(draw.targets) & set(draw.inputs)
+    names = [d.subject for batch in batches for d in batch]
+    for start in range(0, 600, 5):  # every subject once in each round
+        assert sorted(names[start : start + 5]) == ["s0", "s1", "s2", "s3", "s4"]
+    assert len({tuple(names[s : s + 5]) for s in range(0, 600, 5)}) > 30
+    counts = np.bincount([len(batch[0].inputs) for batch in batches], minlength=6)[3:]
+    assert counts.min() > 70
+    seen = np.bincount([pid for batch in batches for d in batch for pid, _ in d.inputs], minlength=16)
+    assert seen.min() > 0.6 * seen.mean()
+    assert {vid for batch in batches for d in batch for _, vid in d.targets} == {0, 2, 3, 4}
+
+
+def test_processes_share_out_one_sequence():
+    whole = [d.subject for step in range(5) for d in draws(batch_size=4).batch(step)]
+    ranks = [[draws().batch(step, rank, 2) for step in range(5)] for rank in range(2)]
+    assert whole == [d.subject for step in range(5) for rank in range(2) for d in ranks[rank][step]]
+    for one, other in zip(*ranks, strict=True):
+        assert len(one[0].inputs) == len(other[0].inputs)
+
+
+def test_even_training_views_keep_their_spacing():
+    even = draws(ViewProtocol("v5", (5,), 5, "even"))
+    starts = set()
+    for step in range(60):
+        pids = [pid for pid, _ in even.batch(step)[0].inputs]
+        starts.add(pids[0])
+        assert sorted(np.diff([*pids, pids[0]]) % 16) == [3, 3, 3, 3, 4]
+    assert len(starts) > 10
+
+
+def test_batches_have_the_shapes_and_values_they_promise(root):
+    data = module(root, targets={"name": "random", "per_step": 2}, target_size=[42, 35], body_vertices=5)
+    batch = data.training_batch(0)
+    assert batch.images.shape == (2, 4, 3, 28, 28)
+    assert batch.targets.images.shape == (2, 2, 3, 42, 35)
+    assert (batch.targets.cameras.height, batch.targets.cameras.width) == (42, 35)
+    assert batch.masks.dtype == torch.bool
+    assert batch.images.dtype == batch.depths.dtype == batch.cameras.extrinsics.dtype == torch.float32
+    assert 0.3 < batch.images.max() <= 1
+    assert [tuple(b.shape) for b in batch.body_vertices] == [(5, 3)] * 2
+    assert ((batch.depths > 1.5) & (batch.depths < 2.5))[batch.masks].float().mean() > 0.98
+    assert (batch.depths[~batch.masks] == 0).all()
+    assert [len(v) for v in batch.views] == [4, 4]
+    # Antialiased rims stay unless asked: some light outside the mask, none with apply_mask.
+    outside = batch.images.movedim(2, -1)[~batch.masks]
+    assert outside.max() > 0.05
+    blacked = module(root, targets={"name": "random", "per_step": 2}, apply_mask=True).training_batch(0)
+    assert blacked.images.movedim(2, -1)[~blacked.masks].max() == 0
+    assert torch.equal(data.training_batch(0).body_vertices[0], batch.body_vertices[0])
+
+
+def test_data_without_depth_or_body_says_none(root, tmp_path):
+    import shutil
+
+    shutil.copytree(root / "train", tmp_path / "train")
+    shutil.rmtree(tmp_path / "train" / "depth")
+    shutil.rmtree(tmp_path / "train" / "smpl" / "s1")
+    batch = module(tmp_path, batch_size=3).training_batch(0)
+    assert batch.depths is None
+    assert batch.body_vertices is None
+
+
+class Recorder(LightningModule):
+    """Trains one number and notes what it saw."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen = []
+
+    def training_step(self, batch, _):
+        self.seen.append((batch.subjects, batch.views, batch.targets.names))
+        return (self.weight * batch.images.mean()) ** 2
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def train(root, steps, checkpoint=None, folder=None, workers=0):
+    recorder = Recorder()
+    saver = ModelCheckpoint(folder, every_n_train_steps=3, save_top_k=-1, filename="{step}")
+    trainer = Trainer(
+        max_steps=steps,
+        accelerator="cpu",
+        logger=False,
+        callbacks=[saver],
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        limit_val_batches=0,
+    )
+    data = module(root, views=RANDOM, steps_per_epoch=4, workers=workers)
+    trainer.fit(recorder, datamodule=data, ckpt_path=checkpoint)
+    return recorder.seen
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_training_resumes_with_the_very_next_draw(root, tmp_path):
+    """Stopped after 3 steps of an epoch of 4: the fourth is next, not the first again."""
+    whole = train(root, 10, folder=tmp_path / "a")
+    assert len(set(map(str, whole))) == 10
+    for done in (3, 9):
+        rest = train(root, 10, tmp_path / "a" / f"step={done}.ckpt", tmp_path / "b")
+        assert rest == whole[done:]
+
+
+def test_loading_processes_change_nothing(root):
+    alone, helped = module(root), module(root, workers=2, pin_memory=False)
+    for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
+        assert equal(a, b)
+
+
+def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
+    data = module(root)
+    assert len(data.train_dataloader()) == 2  # 3 subjects, 2 at a time
+    assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]
+    assert [len(b.subjects) for b in data.evaluation_loader(split="train", batch_size=2)] == [2, 1]
+    assert len(module(root, steps_per_epoch=7).train_dataloader()) == 7
+    assert list(module(root, limit={"train": 2}).subjects("train")) == ["s0", "s1"]
+    again = [b for _ in range(2) for b in module(root).val_dataloader()]
+    assert equal(*again)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"batch_size": 0}, "data.batch_size: expected at least 1; found 0"),
+        ({"views": V4 | {"training_counts": [1]}}, "views.training_counts: expected counts of at least 2"),
+        ({"views": V4 | {"training": "odd"}}, "views.training: expected one of any, even; found 'odd'"),
+        ({"views": V4 | {"trainign": "any"}}, "views key: expected one of .*; found 'trainign'"),
+        ({"targets": {"name": "sideways"}}, "targets.kind: expected one of release, midway, random"),
+        ({"targets": RELEASE | {"training_vids": [7]}}, "targets.training_vids: expected some of"),
+        (
+            {"targets": RELEASE | {"per_subject": 0}},
+            "targets.per_subject: expected a number of at least 1 or all",
+        ),
+        ({"size": [3, 4, 5]}, "data.size: expected a side or"),
+        ({"pixel_centers": "corner"}, "data.pixel_centers: expected one of half, integer"),
+        ({"limit": {"test": 3}}, "data.limit key: expected one of train, val"),
+        ({"limit": {"train": 0}}, "data.limit.train: expected at least 1 or null"),
+        ({"workers": -1}, "data.workers: expected at least 0"),
+    ],
+)
+def test_impossible_values_fail_at_once(root, changes, message):
+    with pytest.raises(InputError, match=message):
+        module(root, **changes)
+
+
+def test_fewer_views_than_asked(root, tmp_path):
+    import shutil
+
+    for kind in ("img", "mask", "parm", "depth"):
+        for pid in (0, 4, 9):
+            for phase, name in (("train", "s0"), ("val", "s3")):
+                shutil.copytree(
+                    root / phase / kind / f"{name}_{pid:03d}", tmp_path / phase / kind / f"{name}_{pid:03d}"
+                )
+    data = module(tmp_path, batch_size=1)
+    with pytest.raises(
+        InputError, match="expected 4 ring positions of subject s0 to draw 4 views from; found 3"
+    ):
+        data.train_dataloader()
+    with pytest.raises(
+        InputError, match=r"expected ring positions \[0, 4, 8, 12\] of subject s3; found no position 8"
+    ):
+        data.val_dataloader()
+    with pytest.raises(
+        InputError, match=r"targets.per_subject: expected at most the 4 inputs, or all; found 5"
+    ):
+        module(root).evaluation_loader(4, {"name": "midway", "per_subject": 5})
+    listed = module(tmp_path, evaluation_positions={3: [0, 4, 9]}, batch_size=1)
+    assert next(iter(listed.evaluation_loader(3))).views == (("000/0", "004/0", "009/0"),)

@@ -1,0 +1,303 @@
+"""ZJU-MoCap: every oddity of the format, on a miniature in its true layout."""
+
+import shutil
+from functools import partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.calibration import distort_points
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from ghgs_lit.data.pickles import load_npy
+from ghgs_lit.data.reader import fit
+from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
+from ghgs_lit.data.zju_mocap.reader import Split, ZJUMoCapReader
+from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis.miniatures import zju_mocap
+from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
+
+OPENCV = np.load(Path(__file__).parents[1] / "fixtures" / "opencv_camera.npz")
+SIZE = 112
+BOTH = ("mask_cihp", "mask")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """One sequence of each generation with two frames."""
+    folder = tmp_path_factory.mktemp("zju_mocap")
+    make_miniature(zju_mocap, folder, ["386", "313"], SIZE, seed=3, frames=2)
+    return folder
+
+
+def reader(root: Path, sequence: str = "386", frames=(0, 2, 1), **options) -> ZJUMoCapReader:
+    return ZJUMoCapReader(root, [Split((sequence,), frames)], **options)
+
+
+def test_bodies_project_into_every_mask(root):
+    for sequence in ("386", "313"):
+        data = reader(root, sequence, cameras=None, masks=BOTH)
+        shares = [inside(data.view(n, k), data.body(n)) for n, pids in data.subjects.items() for k in pids]
+        assert len(shares) == 2 * (21 if sequence == "313" else 23)
+        assert min(shares) > 0.99
+
+
+def test_translations_are_millimetres(root):
+    cams = load_npy(root / "CoreView_386" / "annots.npy")["cams"]
+    data = reader(root)
+    for k in (0, 11):
+        view = data.view("CoreView_386_000000", k)
+        np.testing.assert_allclose(view.extrinsics[:3, 3] * 1000, cams["T"][k][:, 0], rtol=1e-6)
+        distance = np.linalg.norm(
+            data.body("CoreView_386_000000").mean(0) + view.extrinsics[:3, :3].T @ view.extrinsics[:3, 3]
+        )
+        assert 2 < distance < 4
+
+
+def test_any_label_is_the_performer(root):
+    data = reader(root, undistorted=False)
+    labels = np.asarray(Image.open(root / "CoreView_386" / "mask_cihp" / "Camera_B1" / "000000.png"))
+    assert 0 < labels.max() < 20
+    np.testing.assert_array_equal(data.view("CoreView_386_000000", 0).mask, labels > 0)
+
+
+def test_label_maps_of_three_channels_are_read(root):
+    labels = Image.open(root / "CoreView_386" / "mask_cihp" / "Camera_B4" / "000000.png")
+    assert labels.mode == "RGB"
+    mask = reader(root, undistorted=False).view("CoreView_386_000000", 3).mask
+    np.testing.assert_array_equal(mask, np.asarray(labels)[..., 0] > 0)
+
+
+def test_masks_are_united(root):
+    parts = [reader(root, undistorted=False, masks=[m]).view("CoreView_386_000000", 5).mask for m in BOTH]
+    union = reader(root, undistorted=False, masks=BOTH).view("CoreView_386_000000", 5).mask
+    np.testing.assert_array_equal(union, parts[0] | parts[1])
+    assert union.sum() > max(part.sum() for part in parts)
+
+
+def test_a_sequence_without_the_second_folder_of_masks_is_read(root, tmp_path):
+    shutil.copytree(root / "CoreView_386", tmp_path / "CoreView_386")
+    shutil.rmtree(tmp_path / "CoreView_386" / "mask")
+    one = reader(tmp_path, masks=BOTH).view("CoreView_386_000000", 0).mask
+    np.testing.assert_array_equal(one, reader(root).view("CoreView_386_000000", 0).mask)
+
+
+def test_the_background_is_black(root):
+    for undistorted in (True, False):
+        view = reader(root, undistorted=undistorted).view("CoreView_386_000000", 2)
+        assert view.image[~view.mask].max() == 0
+        assert view.image[view.mask].max() > 60
+
+
+def test_undistortion_is_that_of_opencv():
+    height, width = OPENCV["image"].shape[:2]
+    grid = undistorting_grid(OPENCV["intrinsics"], OPENCV["distortion"].ravel(), height, width)
+    image, mask = undistort(OPENCV["image"], np.ones((height, width), bool), grid)
+    error = np.abs(image.astype(int) - OPENCV["undistorted"])
+    assert error.mean() < 0.3
+    assert error.max() <= 4  # OpenCV rounds places to 1/32 px
+    assert np.abs(OPENCV["image"].astype(int) - OPENCV["undistorted"]).mean() > 20
+    assert not mask.all()
+
+
+def test_undistortion_comes_before_the_resize(root):
+    whole = reader(root).view("CoreView_386_000000", 7)
+    half = reader(root, size=(SIZE // 2, SIZE // 2)).view("CoreView_386_000000", 7)
+    mean = whole.image.reshape(SIZE // 2, 2, SIZE // 2, 2, 3).mean((1, 3))
+    assert np.abs(half.image - mean).max() <= 1
+    bent = reader(root, undistorted=False).view("CoreView_386_000000", 7)
+    assert (bent.mask != whole.mask).any()
+    np.testing.assert_array_equal(bent.intrinsics, whole.intrinsics)
+
+
+def test_a_lens_without_distortion_leaves_photographs_alone(root):
+    grid = undistorting_grid(OPENCV["intrinsics"], np.zeros(5), *OPENCV["image"].shape[:2])
+    image, mask = undistort(OPENCV["image"], np.ones(OPENCV["image"].shape[:2], bool), grid)
+    assert np.abs(image.astype(int) - OPENCV["image"]).max() <= 1
+    assert mask[1:-1, 1:-1].all()
+
+
+@pytest.mark.parametrize("side", [SIZE, SIZE // 2, SIZE // 4])
+def test_intrinsics_fit_resized_photographs(root, tmp_path, side):
+    """A spot where OpenCV sees a point is where the view's camera sees it, to a fiftieth of a pixel."""
+    folder = tmp_path / "CoreView_386"
+    shutil.copytree(root / "CoreView_386", folder)
+    cams = load_npy(folder / "annots.npy")["cams"]
+    point = reader(root).body("CoreView_386_000000").mean(0)
+    local = cams["R"][0] @ point + cams["T"][0][:, 0] / 1000
+    x, y = (cams["K"][0] @ local)[:2] / local[2]
+    Image.fromarray(blob(SIZE, SIZE, x, y)).save(folder / "spot.png")
+    (folder / "Camera_B1" / "000000.jpg").unlink()
+    (folder / "spot.png").rename(folder / "Camera_B1" / "000000.jpg")
+    full = np.full((SIZE, SIZE), 7, np.uint8)
+    Image.fromarray(full).save(folder / "mask_cihp" / "Camera_B1" / "000000.png")
+    view = reader(tmp_path, undistorted=False, size=(side, side)).view("CoreView_386_000000", 0)
+    np.testing.assert_allclose(centroid(view.image), project(view, point), atol=0.02)
+
+
+def test_halving_is_opencvs_area(root):
+    view = reader(root).view("CoreView_386_000000", 0)
+    image = OPENCV["image"]
+    halved = fit(type(view)(image, image[..., 0] > 0, None, view.intrinsics, view.extrinsics), 24, 32).image
+    assert np.abs(halved.astype(int) - OPENCV["halved"]).max() <= 1
+
+
+def test_cameras_project_as_opencv_does():
+    rotation, translation = OPENCV["rotation"], OPENCV["translation"]
+    local = OPENCV["points"] @ rotation.T + translation
+    ideal = local @ OPENCV["intrinsics"].T
+    ideal = torch.from_numpy(ideal[:, :2] / ideal[:, 2:])[None]
+    lens, matrix = (
+        torch.from_numpy(OPENCV["distortion"].reshape(1, 5)),
+        torch.from_numpy(OPENCV["intrinsics"]),
+    )
+    bent = distort_points(ideal, matrix[None], lens)
+    np.testing.assert_allclose(bent[0].numpy(), OPENCV["projected"], atol=1e-6)
+
+
+def test_cameras_are_the_first_so_many(root):
+    assert reader(root).subjects["CoreView_386_000000"] == tuple(range(20))
+    assert len(reader(root, cameras=None).subjects["CoreView_386_000000"]) == 23
+    assert len(reader(root, "313", cameras=None).subjects["CoreView_313_000001"]) == 21
+
+
+def test_old_sequences_count_frames_from_one(root):
+    data = reader(root, "313")
+    assert list(data.subjects) == ["CoreView_313_000001", "CoreView_313_000002"]
+    assert not (root / "CoreView_313" / "new_vertices" / "0.npy").exists()
+    stored = np.load(root / "CoreView_313" / "new_vertices" / "1.npy")
+    np.testing.assert_array_equal(data.body("CoreView_313_000001"), stored)
+    assert list(reader(root).subjects) == ["CoreView_386_000000", "CoreView_386_000001"]
+
+
+@pytest.mark.parametrize("renamed", ["photographs", "masks", "both"])
+def test_old_sequences_are_read_with_long_and_short_names(root, tmp_path, renamed):
+    shutil.copytree(root / "CoreView_313", tmp_path / "CoreView_313")
+    assert len(next((tmp_path / "CoreView_313").glob("Camera (22)/*.jpg")).stem.split("_")) == 7
+    patterns = {"photographs": ["Camera*/*.jpg"], "masks": ["mask*/Camera*/*.png"]}
+    for pattern in patterns.get(renamed, [*patterns["photographs"], *patterns["masks"]]):
+        for path in (tmp_path / "CoreView_313").glob(pattern):
+            path.rename(path.with_name(path.stem.split("_")[4] + path.suffix))
+    one, other = (reader(place, "313").view("CoreView_313_000002", 19) for place in (root, tmp_path))
+    np.testing.assert_array_equal(one.image, other.image)
+    np.testing.assert_array_equal(one.mask, other.mask)
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("Camera (1)/CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592.jpg", 1),
+        ("Camera (1)/0001.jpg", 1),
+        ("Camera_B1/000000.jpg", 0),
+        ("Camera_B23/000616.jpg", 616),
+    ],
+)
+def test_frame_numbers_are_of_both_generations(name, number):
+    assert frame_number(PurePosixPath(name)) == number
+
+
+def test_names_of_windows_are_read(root, tmp_path):
+    folder = tmp_path / "CoreView_386"
+    shutil.copytree(root / "CoreView_386", folder)
+    content = load_npy(folder / "annots.npy")
+    for frame in content["ims"]:
+        frame["ims"] = [name.replace("/", "\\") for name in frame["ims"]]
+    np.save(folder / "annots.npy", content)
+    assert reader(tmp_path).view("CoreView_386_000000", 0).mask.any()
+
+
+@pytest.mark.parametrize("shape", [(4,), (5,), (5, 1), (1, 5)])
+def test_lens_coefficients_of_any_shape_are_read(root, tmp_path, shape):
+    folder = tmp_path / "CoreView_386"
+    folder.mkdir()
+    content = load_npy(root / "CoreView_386" / "annots.npy")
+    content["cams"]["D"] = [np.ravel(d)[: np.prod(shape)].reshape(shape) for d in content["cams"]["D"]]
+    np.save(folder / "annots.npy", content)
+    assert len(read_annotations(folder / "annots.npy").distortions[0]) == np.prod(shape)
+
+
+def test_the_new_fit_is_preferred(root, tmp_path):
+    shutil.copytree(root / "CoreView_386", tmp_path / "CoreView_386")
+    new = np.load(root / "CoreView_386" / "new_vertices" / "0.npy")
+    old = np.load(root / "CoreView_386" / "vertices" / "0.npy")
+    assert new.shape == (6890, 3)
+    assert np.abs(new - old).max() > 0.002
+    np.testing.assert_array_equal(reader(root).body("CoreView_386_000000"), new)
+    np.testing.assert_array_equal(reader(root, bodies=["vertices"]).body("CoreView_386_000000"), old)
+    shutil.rmtree(tmp_path / "CoreView_386" / "new_vertices")
+    np.testing.assert_array_equal(reader(tmp_path).body("CoreView_386_000000"), old)
+    shutil.rmtree(tmp_path / "CoreView_386" / "vertices")
+    assert reader(tmp_path).body("CoreView_386_000000") is None
+
+
+def test_parameters_place_the_body_about_the_origin(root):
+    """V = R(Rh) X + Th: what (V - Th) R gives stands upright on its own floor, whatever the world."""
+    for number in (0, 1):
+        params = load_npy(root / "CoreView_386" / "new_params" / f"{number}.npy")
+        assert params["poses"].shape == (1, 72)
+        assert params["shapes"].shape == (1, 10)
+        turn = Rotation.from_rotvec(params["Rh"][0]).as_matrix()
+        own = (np.load(root / "CoreView_386" / "new_vertices" / f"{number}.npy") - params["Th"]) @ turn
+        assert abs(own[:, 1].min()) < 0.06
+        assert 1.4 < own[:, 1].max() < 2.0
+
+
+def test_frames_are_places_in_the_annotations(root):
+    assert list(reader(root, frames=(1, 500, 5)).subjects) == ["CoreView_386_000001"]
+    assert list(reader(root, frames=(0, 500, 5)).subjects) == ["CoreView_386_000000"]
+    with pytest.raises(InputError, match="expected a frame 700; found 2 frames"):
+        reader(root, frames=(700, 1000, 6))
+
+
+def test_the_default_split_is_sherfs(root):
+    data = build_data("zju_mocap", root)
+    train, val = data.splits["train"], data.splits["val"]
+    assert [s.sequences for s in train] == [("386", "387", "390", "392", "393", "394")]
+    assert [s.sequences for s in val] == [("377", "313", "315")]
+    assert len(range(*train[0].frames)) == 100
+    assert list(range(*val[0].frames)) == list(range(0, 500, 20))
+    assert data.published == {"train": 6, "val": 3}
+
+
+def test_batches_have_the_protocols_cameras(root):
+    data = build_data("zju_mocap", root, "data.size=64", "data.workers=0", "views=v3")
+    batch = data.training_batch(0)
+    assert batch.images.shape == (1, 3, 3, 64, 64)
+    assert batch.targets.images.shape == (1, 1, 3, 64, 64)
+    assert batch.body_vertices[0].shape == (4096, 3)
+    assert [data.people(data.reader(phase, None)) for phase in ("train", "val")] == [1, 1]
+    samples = list(data.evaluation_loader(views=3))
+    assert samples[0].views == (("000/0", "007/0", "015/0"),)
+    assert [len(names) for sample in samples for names in sample.targets.names] == [17]
+
+
+def test_other_protocols_are_configurations(root):
+    nhp = build_data("zju_mocap_nhp", root)
+    assert (
+        sum(len(range(*s.frames)) * len(s.sequences) for s in nhp.splits["train"])
+        == 60 + 67 + 10 + 100 + 50 + 54
+    )
+    gp_nerf = build_data("zju_mocap_gp_nerf", root)
+    assert sum(len(range(*s.frames)) * len(s.sequences) for s in gp_nerf.splits["train"]) == 1800
+    assert gp_nerf.evaluation_positions == {3: [0, 8, 16], 4: [0, 6, 12, 18], 5: [0, 4, 8, 12, 16]}
+
+
+def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
+    make_miniature(zju_mocap, tmp_path, ["386"], SIZE, seed=3, frames=1)
+    for name in ("Camera_B7/000000.jpg", "mask_cihp/Camera_B7/000000.png", "new_vertices/0.npy"):
+        assert (tmp_path / "CoreView_386" / name).read_bytes() == (root / "CoreView_386" / name).read_bytes()
+
+
+def test_targets_between_cameras_that_stand_still_are_refused(root):
+    data = build_data("zju_mocap", root, "data.size=64", "data.workers=0", "targets=release")
+    for draw in (
+        data.training_draws,
+        data.evaluation_loader,
+        partial(data.evaluation_loader, targets="midway"),
+    ):
+        with pytest.raises(InputError, match=r"targets: expected cameras for data=zju_mocap.*; found"):
+            draw()
+    assert len(data.evaluation_loader(targets="cameras")) > 0

@@ -1,0 +1,144 @@
+"""The attention kernel of a CPU against PyTorch's own in float64."""
+
+import numba
+import pytest
+import torch
+import torch.nn.functional as F
+
+from ghgs_lit.encoder import cpu
+from ghgs_lit.encoder.cpu import attention
+from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES, ROWS
+from ghgs_lit.kernels.compile import processor_features
+
+HALF = pytest.param(
+    torch.bfloat16,
+    marks=pytest.mark.skipif("avx512bf16" not in processor_features(), reason="no products in bfloat16"),
+)
+DTYPES = [torch.float32, HALF]
+
+
+def scene(n, heads, tokens, width, dtype, scale=1.0, seed=0):
+    """Queries, keys and values [n, heads, tokens, width] as the encoder has them: parts of one tensor."""
+    g = torch.Generator().manual_seed(seed)
+    qkv = torch.randn(n, tokens, 3, heads, width, generator=g)
+    qkv[:, :, :2] *= scale
+    return qkv.to(dtype).permute(2, 0, 3, 1, 4).unbind(0)
+
+
+def error(found, q, k, v):
+    """Root mean square of the difference to float64, as a part of the result's."""
+    expected = F.scaled_dot_product_attention(q.double(), k.double(), v.double()).transpose(1, 2)
+    return ((found.double() - expected).square().mean() / expected.square().mean()).sqrt()
+
+
+def pytorch(q, k, v):
+    return F.scaled_dot_product_attention(q, k, v).transpose(1, 2)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    ("n", "heads", "tokens", "width"),
+    [
+        (1, 1, 1, 32),
+        (2, 3, ROWS + 1, 64),
+        (1, 2, 31, 96),
+        (1, 2, KEYS - 1, 32),
+        (2, 1, KEYS + 1, 64),
+        (1, 2, 2 * KEYS + 77, 64),
+        (1, 1, 3 * QUERIES + 5, 128),
+    ],
+)
+@pytest.mark.parametrize("scale", [0.0, 1.0, 4.0])
+def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype, scale):
+    q, k, v = scene(n, heads, tokens, width, dtype, scale)
+    found = cpu.attend(q, k, v)
+    assert found.dtype == dtype
+    assert found.shape == (n, tokens, heads, width)
+    least = 2e-7 if dtype == torch.float32 else 2e-3
+    assert error(found, q, k, v) < max(1.5 * error(pytorch(q, k, v), q, k, v), least)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_fewer_queries_than_keys_and_more(dtype):
+    q, k, v = scene(1, 2, 300, 64, dtype)
+    for queries, keys in ((5, 300), (300, 7), (1, 1)):
+        args = q[:, :, :queries], k[:, :, :keys], v[:, :, :keys]
+        assert error(cpu.attend(*args), *args) < (1e-6 if dtype == torch.float32 else 1e-2)
+
+
+def test_scores_that_rise_and_fall_by_hundreds():
+    """The running maximum moves in every block of keys, or in none after the first."""
+    v = scene(1, 1, 5 * KEYS, 32, torch.float32)[2]
+    slope = torch.linspace(-300, 300, 5 * KEYS)[:, None]
+    q = torch.ones_like(v)
+    for keys in (slope, -slope, slope.sin() * 300):
+        args = q, keys.expand(-1, 32)[None, None] / 32**0.5, v
+        assert error(cpu.attend(*args), *args) < 1.5 * error(pytorch(*args), *args)
+
+
+def test_weights_below_the_smallest_float_count_for_nothing():
+    q = torch.full((1, 1, 1, 32), 10.0)
+    k = torch.zeros(1, 1, 64, 32)
+    k[0, 0, 0] = 10
+    v = torch.full_like(k, 1e6)
+    v[0, 0, 0] = 1
+    torch.testing.assert_close(cpu.attend(q, k, v), torch.ones(1, 1, 1, 32), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_what_is_not_finite_reaches_the_same_values_as_in_pytorch(dtype, bad):
+    for part in range(3):
+        q, k, v = (x.clone() for x in scene(1, 2, 300, 32, dtype))
+        (q, k, v)[part][0, 1, 290, 3] = bad
+        found = cpu.attend(q, k, v)
+        assert torch.equal(found.isnan(), pytorch(q, k, v).isnan())
+        assert found[:, :, 0].isfinite().all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("heads", "tokens"), [(5, 40), (1, 7 * QUERIES + 3)])
+def test_the_same_bits_with_any_number_of_threads(dtype, heads, tokens):
+    before = torch.get_num_threads()
+    args = scene(2, heads, tokens, 32, dtype)
+    found = []
+    try:
+        for threads in (1, 2, 3, 7):
+            torch.set_num_threads(threads)
+            found.append(cpu.attend(*args))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(other, found[0]) for other in found[1:])
+
+
+def test_types_may_differ_and_that_of_the_values_is_taken():
+    q, k, v = scene(1, 2, 50, 32, torch.float32)
+    halves = [x.bfloat16() for x in (q, k)]
+    assert error(cpu.attend(*halves, v), *halves, v) < 1e-6
+
+
+def test_inputs_whose_numbers_lie_apart():
+    q, k, v = (x.transpose(2, 3).contiguous().transpose(2, 3) for x in scene(1, 2, 50, 32, torch.float32))
+    assert q.stride(-1) != 1
+    assert error(cpu.attend(q, k, v), q, k, v) < 1e-6
+
+
+def test_what_the_kernel_is_asked_for(monkeypatch):
+    monkeypatch.setattr(attention, "_has", lambda feature: feature == "avx512f")
+    q, _, v = scene(1, 4, 1024, 32, torch.float32)
+    assert not cpu.is_supported(q, v)  # a gradient may be wanted
+    with torch.no_grad():
+        assert cpu.is_supported(q, v)
+        assert not cpu.is_supported(q[:, :, :100], v[:, :, :100])  # small
+        assert not cpu.is_supported(q[..., :24], v[..., :24])
+        assert not cpu.is_supported(q.double(), v.double())
+        assert not cpu.is_supported(q, v.half())
+        assert not cpu.is_supported(q, v.bfloat16())  # the processor has no products for it
+        assert not cpu.is_supported(q.to("meta"), v.to("meta"))
+        monkeypatch.setattr(attention, "_has", lambda feature: False)
+        assert not cpu.is_supported(q, v)
+
+
+def test_features_of_the_processor_may_be_limited(monkeypatch):
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", "+avx2,-avx512f")
+    assert processor_features() == {"avx2"}

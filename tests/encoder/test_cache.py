@@ -1,0 +1,215 @@
+"""Tokens on disk: the same tokens, never those of something else."""
+
+import dataclasses
+import multiprocessing
+
+import pytest
+import torch
+
+from ghgs_lit.encoder import FeatureCache, VGGTEncoder, attach_cache
+from ghgs_lit.errors import InputError
+from tests.helpers.models import close, make_model
+from tests.helpers.scenes import make_batch
+
+OPTIONS = {"width": 32, "heads": 2, "depth": 2, "layers": (0, 1), "vit": {"kind": "stem", "channels": 8}}
+
+
+def make(seed=0, **options):
+    torch.manual_seed(seed)
+    return VGGTEncoder(**{**OPTIONS, "trainable": "none", **options})
+
+
+def views(b=1, v=2, height=70, width=84, seed=1):
+    g = torch.Generator().manual_seed(seed)
+    masks = torch.zeros(b, v, height, width, dtype=torch.bool)
+    masks[:, :, 30:40, 30:33] = True
+    return torch.rand(b, v, 3, height, width, generator=g), masks
+
+
+def same(a, b):
+    assert (a.grid, a.patch_size) == (b.grid, b.patch_size)
+    for field in ("semantic", "image", "row", "column"):
+        assert torch.equal(getattr(a, field), getattr(b, field))
+    assert len(a.latent) == len(b.latent)
+    assert all(torch.equal(x, y) and x.dtype == y.dtype for x, y in zip(a.latent, b.latent, strict=True))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
+    encoder = make().to(dtype)
+    images, masks = views(b=2)
+    expected = [encoder(images[b : b + 1], masks[b : b + 1]) for b in range(2)]
+    stored = {torch.float64: "float32"}.get(dtype, str(dtype).removeprefix("torch."))
+    encoder.cache = FeatureCache(tmp_path, tokens="all", dtype=stored)
+    first, second = encoder(images, masks), encoder(images, masks)
+    same(first, second)
+    assert (encoder.cache.hits, encoder.cache.made) == (2, 2)
+    if dtype != torch.float64:
+        for b, one in enumerate(expected):
+            mine = first.image // 2 == b
+            assert all(torch.equal(x[mine], y) for x, y in zip(first.latent, one.latent, strict=True))
+    assert first.latent[0].dtype == dtype
+
+
+def test_the_subject_and_a_ring_are_kept(tmp_path):
+    encoder = make()
+    images, masks = views()
+    everything = encoder(images, masks)
+    # The subject lies in rows and columns 2 of 5 x 6 patches.
+    for ring, rows in ((0, {2}), (1, {1, 2, 3})):
+        encoder.cache = FeatureCache(tmp_path, ring=ring)
+        found = encoder(images, masks)
+        assert set(found.row.tolist()) == set(found.column.tolist()) == rows
+        assert found.grid == everything.grid
+        flat = (found.image * 5 + found.row) * 6 + found.column
+        assert torch.equal(found.latent[1], everything.latent[1][flat])
+        assert torch.equal(found.semantic, everything.semantic[flat])
+        encoder.cache = None
+
+
+@pytest.mark.parametrize("change", ["weight", "image", "mask", "interval", "option", "ring", "autocast"])
+def test_whatever_changes_the_tokens_misses(tmp_path, change):
+    encoder = make(interval_input=change == "interval", mask_input=True)
+    images, masks = views()
+    interval = (torch.ones_like(masks, dtype=torch.float32), 2 * torch.ones_like(masks, dtype=torch.float32))
+    encoder.cache = FeatureCache(tmp_path)
+    encoder(images, masks, interval)
+    assert encoder(images, masks, interval) is not None
+    assert (encoder.cache.hits, encoder.cache.made) == (1, 1)
+    if change == "weight":
+        encoder.aggregator.frame_blocks[0].mlp.fc1.weight[0, 0] += 1e-3
+    elif change == "image":
+        images[0, 1, 2, 3, 4] += 1e-3
+    elif change == "mask":
+        masks[0, 0, 0, 0] = True
+    elif change == "interval":
+        interval[1][0, 1, 2, 3] += 1e-3
+    elif change == "option":
+        encoder.cache, encoder.options["heads"] = FeatureCache(tmp_path), 4
+    elif change == "ring":
+        encoder.cache = FeatureCache(tmp_path, ring=2)
+    made = encoder.cache.made
+    with torch.autocast("cpu", torch.bfloat16, enabled=change == "autocast"):
+        encoder(images, masks, interval)
+    assert encoder.cache.made == made + 1
+
+
+def test_masks_that_nothing_reads_do_not_miss(tmp_path):
+    encoder = make()
+    images, masks = views()
+    encoder.cache = FeatureCache(tmp_path, tokens="all")
+    encoder(images, masks)
+    encoder(images, ~masks)
+    assert (encoder.cache.hits, encoder.cache.made) == (1, 1)
+
+
+@pytest.mark.parametrize("left", [0, 7, 2000])
+def test_a_truncated_file_is_made_anew(tmp_path, left, capsys):
+    encoder = make()
+    images, masks = views()
+    encoder.cache = FeatureCache(tmp_path)
+    expected = encoder(images, masks)
+    (path,) = tmp_path.glob("*/*.safetensors")
+    path.write_bytes(path.read_bytes()[:left])
+    same(encoder(images, masks), expected)
+    assert str(path) in capsys.readouterr().out
+    same(encoder(images, masks), expected)
+    assert (encoder.cache.hits, encoder.cache.made) == (1, 2)
+    assert not list(tmp_path.glob("*/*.aside"))
+
+
+def test_half_precision_files_give_the_same_twice(tmp_path):
+    encoder = make()
+    images, masks = views()
+    exact = encoder(images, masks)
+    encoder.cache = FeatureCache(tmp_path, tokens="all", dtype="bfloat16")
+    first, second = encoder(images, masks), encoder(images, masks)
+    same(first, second)
+    assert first.latent[0].dtype == torch.float32
+    error = (first.latent[0] - exact.latent[0]).abs().max()
+    assert 0 < error <= 2**-8 * exact.latent[0].abs().max()
+
+
+def _work(directory, queue):
+    torch.set_num_threads(1)
+    encoder = make()
+    encoder.cache = FeatureCache(directory)
+    found = [encoder(*views(seed=seed)).latent[1].sum().item() for seed in range(6)]
+    queue.put((found, encoder.cache.hits + encoder.cache.made))
+
+
+def test_two_processes_share_a_directory(tmp_path):
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    workers = [context.Process(target=_work, args=(tmp_path, queue)) for _ in range(2)]
+    for worker in workers:
+        worker.start()
+    found = [queue.get(timeout=60) for _ in workers]
+    for worker in workers:
+        worker.join()
+        assert worker.exitcode == 0
+    assert found[0] == found[1]
+    assert found[0][1] == 6
+    assert len(list(tmp_path.glob("*/*"))) == 6
+
+
+def test_an_encoder_that_learns_is_refused(tmp_path):
+    encoder = make(trainable="last_1")
+    encoder.cache = FeatureCache(tmp_path)
+    with pytest.raises(InputError, match="feature_cache: expected a frozen encoder"):
+        encoder(*views())
+    with torch.no_grad():
+        encoder(*views())
+    assert encoder.cache.made == 1
+
+
+def test_the_report_says_how_much_there_is(tmp_path):
+    encoder = make()
+    encoder.cache = FeatureCache(tmp_path / "new", tokens="all")
+    images, masks = views()
+    encoder(images, masks)
+    encoder(images, masks)
+    size = sum(path.stat().st_size for path in tmp_path.glob("new/*/*"))
+    assert encoder.cache.report() == (
+        f"feature cache {tmp_path / 'new'}: 1 found, 1 made ({size / 1e6:.1f} MB; all tokens, float32);"
+        f" 1 files, {size / 1e6:.1f} MB in all"
+    )
+
+
+@pytest.mark.parametrize("option", [{"tokens": "most"}, {"ring": -1}, {"dtype": "int8"}])
+def test_impossible_options_are_refused(tmp_path, option):
+    with pytest.raises(InputError, match=f"feature_cache.{next(iter(option))}"):
+        FeatureCache(tmp_path, **option)
+
+
+def test_tokens_of_a_hit_need_no_encoder(tmp_path, monkeypatch):
+    encoder = make()
+    images, masks = views()
+    encoder.cache = FeatureCache(tmp_path)
+    expected = encoder(images, masks)
+    monkeypatch.setattr(encoder, "encode", lambda *_: pytest.fail("encoded"))
+    same(encoder(images, masks), expected)
+    assert dataclasses.asdict(expected)["grid"] == (1, 2, 5, 6)
+
+
+@pytest.mark.parametrize(("recalibrated", "kept"), [("subject", "subject"), ("all", "all")])
+def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, kept):
+    model = make_model("model=paper", f"recalibration.tokens={recalibrated}").eval()
+    batch = make_batch(height=140, width=112, views=3)
+    options = {"directory": str(tmp_path), "tokens": "subject", "ring": 1, "dtype": "float32"}
+    with torch.no_grad():
+        expected = model(batch)
+        cache = attach_cache(model, options)
+        first, second = model(batch), model(batch)
+    assert cache.tokens == kept
+    assert (cache.hits, cache.made) == (1, 1)
+    close(second.gaussians, first.gaussians, 0.0)
+    assert torch.equal(first.gaussians.means, expected.gaussians.means) == (kept == "all")
+
+
+def test_no_directory_is_no_cache():
+    model = make_model("model=paper")
+    assert (
+        attach_cache(model, {"directory": None, "tokens": "subject", "ring": 1, "dtype": "float32"}) is None
+    )
+    assert model.encoder.cache is None

@@ -1,0 +1,165 @@
+"""Encoder and dense head against numbers of the published architecture (random weights, CPU).
+
+``fixtures/<case>.safetensors`` holds ``state/``, ``in/``, ``out/`` (float32) and ``out64/`` (float64, with
+the same tables kept in float32 as here); ``encoder_cases.json`` holds options and float32 bounds.
+"""
+
+import gzip
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.encoder.rope import rotary_tables, rotate
+from ghgs_lit.encoder.vit import VisionTransformer
+from ghgs_lit.heads.activations import split_activated
+from ghgs_lit.heads.dpt import DPTHead
+from ghgs_lit.heads.position import position_embedding
+from ghgs_lit.types import Tokens
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+CASES = json.loads((FIXTURES / "encoder_cases.json").read_text())
+DTYPES = {torch.float32: "out", torch.float64: "out64"}
+
+
+def _load(name: str) -> dict[str, dict[str, torch.Tensor]]:
+    groups: dict[str, dict[str, torch.Tensor]] = {}
+    for key, value in load_file(FIXTURES / f"{name}.safetensors").items():
+        group, key = key.split("/", 1)
+        groups.setdefault(group, {})[key] = value
+    if "state" in CASES[name]:
+        groups["state"] = _load(CASES[name]["state"])["state"]
+    return groups
+
+
+def _inputs(groups: dict, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    return {k: v.to(dtype) if v.is_floating_point() else v for k, v in groups["in"].items()}
+
+
+def _compare(name: str, groups: dict, dtype: torch.dtype, found: dict[str, torch.Tensor]) -> None:
+    expected = groups[DTYPES[dtype]]
+    assert set(found) == set(expected)
+    for key, value in found.items():
+        assert value.dtype == expected[key].dtype
+        error = (value.reshape(expected[key].shape) - expected[key]).abs().max().item()
+        bound = (
+            CASES[name]["bounds"][key] if dtype == torch.float32 else 1e-9 * expected[key].abs().max().item()
+        )
+        assert error <= bound, f"{name}/{key}: {error:.3g} > {bound:.3g}"
+
+
+def _names(prefix: str) -> list[str]:
+    return [name for name in CASES if name.startswith(prefix)]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", _names("vit_"))
+def test_vit(name, dtype):
+    groups = _load(name)
+    vit = VisionTransformer(3, patch_size=14, **CASES[name]["options"])
+    vit.load_state_dict(groups["state"])
+    vit.to(dtype)
+    with torch.no_grad():
+        x = _inputs(groups, dtype)["x"]
+        tokens, patches = vit.tokens(x), vit(x)
+    found = {"cls_token": tokens[:, 0], "register_tokens": tokens[:, 1:5], "patch_tokens": patches}
+    _compare(name, groups, dtype, found)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", _names("agg_"))
+def test_encoder(name, dtype):
+    groups = _load(name)
+    encoder = VGGTEncoder(**CASES[name]["options"])
+    encoder.aggregator.load_state_dict(groups["state"])
+    encoder.to(dtype)
+    images = _inputs(groups, dtype)["images"]
+    b, v, _, height, width = images.shape
+    with torch.no_grad():
+        pairs, patches = encoder.aggregator((images - encoder.mean) / encoder.std)
+        tokens = encoder(images, torch.ones(b, v, height, width, dtype=torch.bool))
+    found = {f"layer_{i}": torch.cat(pair, dim=-1) for i, pair in enumerate(pairs)}
+    _compare(name, groups, dtype, found | {"patch_tokens": patches})
+
+    assert tokens.grid == (b, v, height // 14, width // 14)
+    assert torch.equal(tokens.semantic, patches.flatten(0, 1))
+    for i, latent in enumerate(tokens.latent):
+        assert torch.equal(latent, found[f"layer_{i}"][:, 5:].flatten(0, 1))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", _names("rope_"))
+def test_rotary_positions(name, dtype):
+    groups = _load(name)
+    inputs = _inputs(groups, dtype)
+    assert (inputs["positions"] == inputs["positions"][:1]).all()
+    tables = rotary_tables(inputs["positions"][0], inputs["x"].shape[-1], inputs["x"])
+    _compare(name, groups, dtype, {"rotated": rotate(inputs["x"], tables)})
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", ["dpt_depth_tall", "dpt_features_nonsquare", "dpt_small_variance"])
+def test_dpt(name, dtype):
+    case, groups = CASES[name], _load(name)
+    head = DPTHead(**case["options"])
+    head.load_state_dict(groups["state"])
+    head.to(dtype)
+    inputs = _inputs(groups, dtype)
+    b, v, _, height, width = inputs["images"].shape
+    grid = (b, v, height // 14, width // 14)
+    packed = [inputs[f"tokens_{i}"][:, :, case["special"] :].flatten(0, 2) for i in range(4)]
+    index = torch.zeros(len(packed[0]), dtype=torch.long)
+    tokens = Tokens(tuple(packed), packed[0], index, index, index, grid, 14)
+    with torch.no_grad():
+        raw = head(tokens)
+    assert raw.shape == (b * v, case["options"]["output_dim"], height, width)
+    if "activations" not in case:
+        return _compare(name, groups, dtype, {"features": raw})
+    values, confidence = split_activated(raw, *case["activations"])
+    _compare(name, groups, dtype, {"preds": values, "conf": confidence})
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_dpt_positions(dtype):
+    name = "dpt_posembed"
+    groups = _load(name)
+    like = _inputs(groups, dtype)["like"]
+    found = {
+        f"embed_{i}": position_embedding(channels, rows, columns, width / height, like)
+        for i, (channels, rows, columns, height, width) in enumerate(CASES[name]["cases"])
+    }
+    expected = groups[DTYPES[dtype]]
+    _compare(name, groups, dtype, {key: value.to(expected[key].dtype) for key, value in found.items()})
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_activations(dtype):
+    name = "dpt_head_activations"
+    groups = _load(name)
+    raw = _inputs(groups, dtype)["raw"]
+    found = {f"preds_{a}": split_activated(raw, a)[0] for a in CASES[name]["activations"]}
+    found |= {f"conf_{a}": split_activated(raw, "linear", a)[1] for a in CASES[name]["conf_activations"]}
+    _compare(name, groups, dtype, found)
+
+
+def test_published_names_and_shapes():
+    with gzip.open(FIXTURES / "encoder_keys.json.gz") as file:
+        published = json.load(file)
+    with torch.device("meta"):
+        encoder = VGGTEncoder(
+            width=1024,
+            heads=16,
+            depth=24,
+            vit={"kind": "dinov2", "depth": 24, "heads": 16},
+            layers=(4, 11, 17, 23),
+            trainable="none",
+        )
+        levels = (256, 512, 1024, 1024)
+        heads = {"pos_head": DPTHead(2048, 256, levels, 2), "decoder": DPTHead(2048, 256, levels, 32)}
+    for name, module in {"aggregator": encoder.aggregator, **heads}.items():
+        shapes = {key: list(value.shape) for key, value in module.state_dict().items()}
+        assert shapes == published[name]
+    assert sum(p.numel() for p in encoder.parameters()) == 909_112_320

@@ -1,0 +1,102 @@
+"""Baselines on analytic scenes."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation import baselines
+from ghgs_lit.evaluation.baselines import baseline, nearest_view, splats_at
+from ghgs_lit.geometry.projection import project
+from ghgs_lit.metrics import psnr
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Rendering
+from tests.helpers.training import Standin, batched, example_batch, flat_renderer, ring
+
+
+def nothing(gaussians, cameras):
+    shape = (*cameras.shape, 1, cameras.height, cameras.width)
+    return Rendering(torch.zeros(*cameras.shape, 3, cameras.height, cameras.width), *[torch.zeros(shape)] * 2)
+
+
+@pytest.mark.parametrize("views", [3, 5])
+def test_the_nearest_view_is_the_one_beside_the_target(views):
+    batch = example_batch(subjects=2, views=views, targets=2)
+    step = 2 * math.pi / views
+    # the first target stands beside view 2 on the far side, the second beside view 0
+    near = dataclasses.replace(ring(2, 16))
+    cameras = ring(1, 16, start=2 * step + 0.4 * step), ring(1, 16, start=-0.4 * step)
+    near = dataclasses.replace(near, extrinsics=torch.cat([c.extrinsics for c in cameras]))
+    batch = dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, cameras=batched(near, 2)))
+    image = nearest_view(batch).image
+    assert torch.equal(image[:, 0], batch.images[:, 2])
+    assert torch.equal(image[:, 1], batch.images[:, 0])
+
+
+def test_the_nearest_view_is_resized_to_the_target():
+    batch = example_batch(size=16)
+    masks = torch.zeros(2, 1, 32, 24, dtype=torch.bool)
+    large = dataclasses.replace(batch.targets, images=torch.zeros(2, 1, 3, 32, 24), masks=masks)
+    batch = dataclasses.replace(batch, targets=large)
+    assert nearest_view(batch).image.shape == (2, 1, 3, 32, 24)
+
+
+def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
+    batch = example_batch(views=2)
+    depth = torch.full(batch.masks.shape, 1.7)
+    gaussians = splats_at(batch, depth, batch.masks, sigma=0.5, opacity=0.8)
+    assert gaussians.splits == tuple(batch.masks.flatten(1).sum(1).tolist())
+    first = gaussians[0]
+    seen = int(batch.masks[0, 0].sum())
+    pixels, z = project(first.means[:seen], batch.cameras.intrinsics[0, 0], batch.cameras.extrinsics[0, 0])
+    rows, columns = batch.masks[0, 0].nonzero(as_tuple=True)
+    assert torch.allclose(pixels, torch.stack((columns + 0.5, rows + 0.5), -1), atol=1e-4)
+    assert torch.allclose(z, torch.full_like(z, 1.7), atol=1e-5)
+    # 0.5 pixels at depth 1.7 under a focal length of 16 pixels
+    assert torch.allclose(first.scales, torch.full_like(first.scales, 0.5 * 1.7 / 16))
+    assert torch.equal(first.colors[:seen], batch.images[0, 0].movedim(0, -1)[batch.masks[0, 0]])
+
+
+def test_true_depth_renders_the_input_again():
+    batch = example_batch(subjects=1, views=2, size=32)
+    own = dataclasses.replace(
+        batch.targets, images=batch.images[:, :1], masks=batch.masks[:, :1], cameras=batch.cameras[:, :1]
+    )
+    # Only the first view, so that no other view's splats stand in front.
+    alone = batch.masks.clone()
+    alone[:, 1] = False
+    batch = dataclasses.replace(batch, targets=own, masks=alone)
+    method = baseline("true_depth", Renderer("reference"), untrained=None, sigma=0.1, opacity=0.99)
+    estimate = method(batch)
+    assert torch.equal(estimate.depth, batch.depths)
+    inside = batch.masks[0, 0]
+    assert psnr(estimate.image[0], batch.images[0, :1], inside[None]).item() > 15
+    assert estimate.image[0, 0, :, ~inside].mean() < 0.1
+
+
+def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
+    batch = example_batch(subjects=1, views=3)
+    estimate = baseline("body_depth", nothing, untrained=None)(batch)
+    for v in range(3):
+        _, z = project(batch.body_vertices[0], batch.cameras.intrinsics[0, v], batch.cameras.extrinsics[0, v])
+        assert torch.allclose(estimate.depth[0, v], z.mean().expand(16, 16), atol=1e-5)
+
+
+def test_black_and_untrained():
+    batch = example_batch()
+    assert baseline("black", nothing, None)(batch).image.abs().max() == 0
+    estimate = baseline("untrained", flat_renderer, Standin)(batch)
+    assert estimate.image.shape == batch.targets.images.shape
+    assert estimate.gaussians == (144, 144)
+
+
+@pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])
+def test_what_the_data_lacks_is_an_error(name, field):
+    batch = dataclasses.replace(example_batch(), **{field: None})
+    with pytest.raises(InputError, match=name):
+        baseline(name, nothing, None)(batch)
+    with pytest.raises(InputError, match="baselines"):
+        baseline("white", nothing, None)
+    assert set(baselines.BASELINES) == {"black", "nearest_view", "body_depth", "true_depth", "untrained"}

@@ -1,0 +1,159 @@
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.unprojection import Unprojection
+from ghgs_lit.heads.gaussian import GaussianHead
+from ghgs_lit.types import DepthMaps
+from tests.heads.test_depth import make_tokens
+from tests.helpers.scenes import CASES, fixture, make_batch
+
+HEADERS = ("offset_header", "scale_header", "rot_header", "opacity_header")
+
+
+def make_head(**options):
+    torch.manual_seed(4)
+    return GaussianHead(64, dpt={"features": 16, "out_channels": [16, 16, 16, 16]}, **options)
+
+
+def run(head, batch, masks=None):
+    maps = DepthMaps(batch.depths, batch.masks if masks is None else masks, batch.depths)
+    tokens = make_tokens(batch)
+    return head(tokens, batch, Unprojection()(maps, tokens, batch), maps)
+
+
+def shake(head, scale=1.0):
+    """Leave the initial state, as training does."""
+    for name in HEADERS:
+        torch.nn.init.normal_(getattr(head, name)[-1].weight, std=scale)
+    return head
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_attributes_match_the_release(dtype):
+    head = make_head(parameterization="release").to(dtype)
+    state = fixture("attribute_heads", "state", dtype)
+    missing, unexpected = head.load_state_dict(state, strict=False)
+    assert not unexpected
+    assert all(key.startswith("decoder.") for key in missing)
+    raw = head._raw(fixture("attribute_heads", "in", dtype)["x"][0])
+    found = dict(zip(("offset", "scale", "rot", "opacity"), head.activate(*raw, raw[3]), strict=True))
+    expected = fixture("attribute_heads", "out64", torch.float64)
+    for name, value in found.items():
+        bound = CASES["attribute_heads"]["bounds"][name] if dtype == torch.float32 else 1e-9
+        target = expected[name][0].reshape(value.shape)
+        torch.testing.assert_close(value.double(), target, atol=bound, rtol=0)
+
+
+def test_training_starts_with_small_opaque_splats_on_the_surface():
+    batch = make_batch(2, 3)
+    gaussians = run(make_head(), batch)
+    maps = DepthMaps(batch.depths, batch.masks, batch.depths)
+    points = Unprojection()(maps, make_tokens(batch), batch)
+    assert torch.equal(gaussians.means, points.pixels[batch.masks])
+    footprint = batch.depths[batch.masks] / batch.cameras.intrinsics[0, 0, 0, 0]
+    torch.testing.assert_close(gaussians.scales, 0.3 * footprint[:, None].expand(-1, 3))
+    torch.testing.assert_close(gaussians.opacities, torch.full_like(gaussians.opacities, 0.9))
+    assert torch.equal(gaussians.quaternions, torch.tensor([1.0, 0, 0, 0]).expand(len(gaussians), 4))
+    assert torch.equal(gaussians.colors, batch.images.permute(0, 1, 3, 4, 2)[batch.masks])
+
+
+def test_gaussians_name_their_pixels_in_order():
+    batch = make_batch(2, 3, 56, 42)
+    gaussians = run(make_head(), batch)
+    assert gaussians.splits == tuple(batch.masks.flatten(1).sum(1).tolist())
+    image, row, column = batch.masks.flatten(0, 1).nonzero(as_tuple=True)
+    assert torch.equal(gaussians.image, image)
+    assert torch.equal(gaussians.pixel, row * 42 + column)
+    assert (gaussians[1].image >= 3).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e4])
+def test_attributes_stay_within_their_bounds(scale):
+    batch = make_batch()
+    gaussians = run(shake(make_head(), scale), batch)
+    start = run(make_head(), batch)
+    footprint = start.scales / 0.3
+    assert ((gaussians.means - start.means).abs() <= 0.05 + 1e-6).all()
+    ratio = gaussians.scales / footprint
+    assert ((ratio >= 0.15 * 0.999) & (ratio <= 4 * 1.001)).all()
+    assert ((gaussians.opacities >= 0.1) & (gaussians.opacities <= 1)).all()
+    torch.testing.assert_close(gaussians.quaternions.norm(dim=-1), torch.ones(len(gaussians)))
+    assert ratio.std() > 0.01
+
+
+def test_every_parameter_gets_a_finite_gradient():
+    batch = make_batch()
+    head = shake(make_head())
+    gaussians = run(head, batch)
+    target = sum(t.square().sum() for t in (gaussians.means, gaussians.scales, gaussians.opacities))
+    (target + gaussians.quaternions[:, 1:].sum()).backward()
+    for name, parameter in head.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+def test_scale_does_not_pull_on_the_depth():
+    batch = make_batch()
+    depth = batch.depths.clone().requires_grad_()
+    gaussians = run(make_head(), dataclasses.replace(batch, depths=depth))
+    assert not torch.autograd.grad(gaussians.scales.sum(), depth, allow_unused=True)[0]
+
+
+def test_heads_on_every_pixel_give_the_same_gaussians():
+    batch = make_batch(2, 3)
+    subject, every = (run(shake(make_head(pixels=pixels)), batch) for pixels in ("subject", "all"))
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        a, b = getattr(subject, name), getattr(every, name)
+        assert (a - b).abs().max() <= 1e-5 * b.abs().max()
+
+
+@pytest.mark.parametrize("parameterization", ["footprint", "release"])
+def test_no_valid_pixel_gives_no_gaussians(parameterization):
+    batch = make_batch(2, 2)
+    head = make_head(parameterization=parameterization)
+    gaussians = run(head, batch, torch.zeros_like(batch.masks))
+    assert len(gaussians) == 0
+    assert gaussians.splits == (0, 0)
+    (gaussians.means.sum() + gaussians.scales.sum()).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in head.parameters())
+
+
+def test_attributes_are_wide_under_autocast():
+    batch = make_batch()
+    head = shake(make_head())
+    expected = run(head, batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = run(head, batch)
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        assert getattr(found, name).dtype == torch.float32
+    assert (found.means - expected.means).abs().max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"parameterization": "ours"}, "gaussian_head.parameterization"),
+        ({"pixels": "some"}, "gaussian_head.pixels"),
+        ({"hidden": [32]}, "gaussian_head.hidden"),
+        ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
+        ({"attributes": {"opacity_start": 1.0}}, "gaussian_head.attributes.opacity_start"),
+        ({"attributes": {"offset_limit": -1.0}}, "gaussian_head.attributes.offset_limit"),
+    ],
+)
+def test_impossible_options_are_refused(options, key):
+    with pytest.raises(InputError, match=key):
+        make_head(**options)
+
+
+def test_the_last_projection_is_wide_under_autocast():
+    head = shake(make_head())
+    descriptors = torch.rand(50, 32)
+    hidden = head.offset_header[:-1]
+    with torch.autocast("cpu", torch.bfloat16):
+        offset = head._raw(descriptors)[0]
+        expected = hidden(descriptors).float()
+    last = head.offset_header[-1]
+    torch.testing.assert_close(offset, torch.nn.functional.linear(expected, last.weight, last.bias))

@@ -1,0 +1,93 @@
+"""Guides: what dense heads and the encoder see of shapes beside tokens."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.bounds.visual_hull import SubjectBounds
+from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.relative_depth import UNIT, relative_depth, relative_interval
+from ghgs_lit.heads.depth import DepthHead
+from ghgs_lit.heads.guide import GuidePyramid, photo_guide
+from tests.helpers.scenes import make_batch
+
+
+def make_encoder(**options):
+    torch.manual_seed(0)
+    return VGGTEncoder(
+        width=32, heads=2, depth=4, vit={"kind": "stem", "channels": 8}, layers=(0, 1, 2, 3), **options
+    )
+
+
+def test_relative_maps_know_shape_and_not_distance():
+    batch = make_batch(2, 3)
+    near, far = SubjectBounds(kind="hull")(batch.masks, batch.cameras)
+    maps = relative_interval((near, far), batch.masks)
+    moved = relative_interval((near + 5, far + 5), batch.masks)
+    assert torch.allclose(maps, moved, atol=1e-4)
+    start, length = maps.unbind(2)
+    assert torch.allclose(length[batch.masks], ((far - near) / UNIT)[batch.masks])
+    middle = (start + length / 2) * batch.masks
+    assert middle.sum((-2, -1)).abs().max() < 1e-2
+    assert not maps.movedim(2, -1)[~batch.masks].any()
+
+
+def test_relative_depth_has_no_gradient_and_no_mean():
+    depth = make_batch().depths.requires_grad_()
+    masks = depth > 0
+    maps = relative_depth(depth, masks)
+    assert not maps.requires_grad
+    assert maps.sum((-2, -1)).abs().max() < 1e-2
+
+
+def test_an_empty_mask_gives_empty_maps():
+    masks = torch.zeros(1, 2, 8, 8, dtype=torch.bool)
+    depth = torch.rand(1, 2, 8, 8)
+    assert not relative_depth(depth, masks).any()
+    assert not relative_interval((depth, depth + 1), masks).any()
+
+
+@pytest.mark.parametrize("size", [(28, 42), (35, 21)])
+def test_pyramid_halves_twice(size):
+    full, half, quarter = GuidePyramid(6, 16)(torch.rand(2, 6, *size))
+    assert full.shape == (2, 8, *size)
+    assert half.shape == (2, 16, *((n + 1) // 2 for n in size))
+    assert quarter.shape == (2, 16, *((n + 3) // 4 for n in size))
+
+
+def test_depth_follows_the_guide():
+    """Two batches with the same tokens and other pixels give other depths, but for an unguided head."""
+    batch = make_batch()
+    other = dataclasses.replace(batch, images=batch.images.flip(-1))
+    tokens = make_encoder()(batch.images, batch.masks)
+    for guided in (True, False):
+        torch.manual_seed(1)
+        head = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, bounds="hull", guide=guided)
+        torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
+        interval = head.interval(batch)
+        same = torch.equal(head(tokens, batch, interval).depth, head(tokens, other, interval).depth)
+        assert same == (not guided)
+
+
+def test_the_guide_is_asked_for_and_refused():
+    batch = make_batch()
+    tokens = make_encoder()(batch.images, batch.masks)
+    guided = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, guide=True).dpt
+    plain = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}).dpt
+    with pytest.raises(InputError, match="guide"):
+        guided(tokens)
+    with pytest.raises(InputError, match="guide"):
+        plain(tokens, photo_guide(batch))
+
+
+def test_the_encoder_sees_intervals_where_it_is_told_to():
+    batch = make_batch()
+    interval = SubjectBounds(kind="hull")(batch.masks, batch.cameras)
+    encoder = make_encoder(mask_input=True, interval_input=True)
+    tokens = encoder(batch.images, batch.masks, interval)
+    deeper = encoder(batch.images, batch.masks, (interval[0], interval[1] + 0.1 * interval[0]))
+    assert not torch.allclose(tokens.latent[-1], deeper.latent[-1])
+    with pytest.raises(InputError, match=r"encoder\.interval_input"):
+        encoder(batch.images, batch.masks)

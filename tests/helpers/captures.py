@@ -1,0 +1,84 @@
+"""What the tests of ZJU-MoCap and HuMMan share: miniatures made once, and what a view must agree with."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from PIL import Image
+from scipy.ndimage import binary_dilation
+
+from ghgs_lit.config import build, conf_dir
+from ghgs_lit.data.reader import View
+from ghgs_lit.synthesis import people
+
+_person = functools.lru_cache(people.generate)
+
+
+def make_miniature(miniature, *arguments, **options) -> list[Path]:
+    """``miniature.make(...)`` of people that are generated once for all tests of a process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(miniature.people, "generate", _person)
+        return miniature.make(*arguments, **options)
+
+
+@functools.lru_cache
+def _config(*overrides: str):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return compose("train", overrides=["targets=cameras", *overrides])
+
+
+def build_data(name: str, root: Path, *overrides: str):
+    """The data module that the command line makes of ``data=<name> data.root=<root>``."""
+    cfg = _config(f"data={name}", *overrides)
+    place = {} if any(o.startswith("data.root=") for o in overrides) else {"root": str(root)}
+    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0, **place)
+
+
+def inside(view: View, points: np.ndarray) -> float:
+    """The share of world points that project into the view's mask, or onto a pixel beside it."""
+    local = points @ view.extrinsics[:3, :3].T + view.extrinsics[:3, 3]
+    pixels = local @ view.intrinsics.T
+    columns, rows = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
+    height, width = view.mask.shape
+    framed = (local[:, 2] > 0) & (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    near = binary_dilation(view.mask, np.ones((3, 3)))
+    return float(near[rows[framed], columns[framed]].sum() / len(points))
+
+
+def blob(height: int, width: int, x: float, y: float, sigma: float = 3.0) -> np.ndarray:
+    """[h, w, 3] uint8: a spot at ``x``, ``y`` where pixel centres are integers, as OpenCV has them."""
+    rows, columns = np.mgrid[:height, :width]
+    spot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    return np.repeat(np.round(255 * spot)[..., None], 3, -1).astype(np.uint8)
+
+
+def centroid(image: np.ndarray) -> np.ndarray:
+    """Where the light of an image is centred, x and y, pixel centres at +0.5."""
+    weight = image[..., 0].astype(np.float64)
+    rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    return np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+
+
+def project(view: View, point: np.ndarray) -> np.ndarray:
+    """Pixel x and y of a world point."""
+    pixel = view.intrinsics @ (view.extrinsics[:3, :3] @ point + view.extrinsics[:3, 3])
+    return pixel[:2] / pixel[2]
+
+
+def truncate(path: Path, share: float = 0.5) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+
+
+def shrink(path: Path) -> None:
+    """Halve a picture, as somebody does who saves space."""
+    image = Image.open(path)
+    image.resize((image.width // 2, image.height // 2), Image.Resampling.NEAREST).save(path)
+
+
+def blank(path: Path) -> None:
+    """A picture of the same size and mode with nothing on it."""
+    image = Image.open(path)
+    Image.new(image.mode, image.size).save(path)

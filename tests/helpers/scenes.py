@@ -1,0 +1,63 @@
+"""An analytic subject in front of a ring of cameras, for the tests of the stages."""
+
+import json
+import math
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+
+from ghgs_lit.types import Batch, Cameras
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+CASES = json.loads((FIXTURES / "stages_cases.json").read_text())
+CENTER, RADII = torch.tensor([0.1, 0.9, 0.0]), torch.tensor([0.25, 0.8, 0.2])
+
+
+def fixture(name, part, dtype=torch.float32):
+    """The tensors of one part (``in``, ``out64``, ``state`` ...) of a fixture, floats in ``dtype``."""
+    prefix = part + "/"
+    tensors = load_file(FIXTURES / f"{name}.safetensors")
+    found = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+    return {key: value.to(dtype) if value.is_floating_point() else value for key, value in found.items()}
+
+
+def ring(batch, views, height, width, spread=360.0, radius=2.0, zoom=0.8):
+    """Cameras that look at the subject; elements are turned against one another."""
+    focal = zoom * max(height, width)
+    intrinsics = torch.tensor([[focal, 0, width / 2 + 1], [0, focal, height / 2 - 1], [0, 0, 1]])
+    extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
+    for b in range(batch):
+        for v in range(views):
+            angle = math.radians(spread * v / views + 20 * b)
+            eye = CENTER + torch.tensor([radius * math.sin(angle), 0.3, radius * math.cos(angle)])
+            forward = F.normalize(CENTER - eye, dim=0)
+            right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0])), dim=0)
+            rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+            extrinsics[b, v, :3, :3], extrinsics[b, v, :3, 3] = rotation, -rotation @ eye
+    return Cameras(intrinsics.repeat(batch, views, 1, 1), extrinsics, height, width)
+
+
+def ellipsoid(cameras, center=CENTER, radii=RADII):
+    """Mask and z-depth of an ellipsoid, from the quadratic equation of each ray in float64."""
+    intrinsics, extrinsics = cameras.intrinsics.double(), cameras.extrinsics.double()
+    v, u = torch.meshgrid(
+        torch.arange(cameras.height) + 0.5, torch.arange(cameras.width) + 0.5, indexing="ij"
+    )
+    pixels = torch.stack((u, v, torch.ones_like(u)), -1).double()
+    rotation = extrinsics[..., :3, :3]
+    directions = torch.einsum("...ji,...jk,hwk->...hwi", rotation, intrinsics.inverse(), pixels) / radii
+    eye = -(rotation.mT @ extrinsics[..., :3, 3:])[..., 0]
+    start = ((eye - center) / radii)[..., None, None, :]
+    a, b, c = directions.square().sum(-1), (directions * start).sum(-1), start.square().sum(-1) - 1
+    root = b * b - a * c
+    mask = root > 0
+    return mask, torch.where(mask, (-b - root.clamp(min=0).sqrt()) / a, 0).float()
+
+
+def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
+    cameras = ring(batch, views, height, width, **kwargs)
+    masks, depths = ellipsoid(cameras)
+    images = torch.rand(batch, views, 3, height, width, generator=torch.Generator().manual_seed(3))
+    return Batch(images * masks[:, :, None], masks, cameras, depths=depths)

@@ -1,0 +1,126 @@
+"""A model and a renderer that train in microseconds, and batches for them."""
+
+import lightning.pytorch as L
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+
+from ghgs_lit.data.batches import StepSampler
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.types import (
+    Batch,
+    Cameras,
+    DepthMaps,
+    Gaussians,
+    Points,
+    Prediction,
+    Rendering,
+    Targets,
+)
+
+
+def ring(count: int, size: int, radius: float = 2.0, start: float = 0.0) -> Cameras:
+    """Cameras on a circle around the origin, looking at it, y down in the image."""
+    angles = torch.arange(count) * (2 * torch.pi / count) + start
+    centers = torch.stack((radius * angles.sin(), torch.zeros(count), radius * angles.cos()), -1)
+    forward = -centers / radius
+    down = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
+    rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
+    extrinsics = torch.eye(4).repeat(count, 1, 1)
+    extrinsics[:, :3, :3] = rotation
+    extrinsics[:, :3, 3] = -(rotation @ centers[..., None])[..., 0]
+    intrinsics = torch.tensor([[size, 0.0, size / 2], [0.0, size, size / 2], [0, 0, 1]]).repeat(count, 1, 1)
+    return Cameras(intrinsics, extrinsics, size, size)
+
+
+def batched(cameras: Cameras, count: int) -> Cameras:
+    return cameras[None][torch.zeros(count, dtype=torch.long)]
+
+
+def example_batch(
+    subjects: int = 2, views: int = 3, targets: int = 1, size: int = 16, seed: int = 0
+) -> Batch:
+    g = torch.Generator().manual_seed(seed)
+    masks = torch.zeros(subjects, views, size, size, dtype=torch.bool)
+    masks[..., 4:12, 5:11] = True
+    images = torch.rand(subjects, views, 3, size, size, generator=g) * masks[:, :, None]
+    return Batch(
+        images=images,
+        masks=masks,
+        cameras=batched(ring(views, size), subjects),
+        targets=Targets(
+            images=torch.rand(subjects, targets, 3, size, size, generator=g) * 0.5,
+            masks=masks[:, :1].expand(-1, targets, -1, -1),
+            cameras=batched(ring(targets, size, start=0.2), subjects),
+            names=tuple(tuple(f"00{k}/3" for k in range(targets)) for _ in range(subjects)),
+        ),
+        body_vertices=[torch.rand(20, 3, generator=g) * 0.2 for _ in range(subjects)],
+        depths=torch.full((subjects, views, size, size), 2.1) * masks,
+        subjects=tuple(f"p{i}" for i in range(subjects)),
+        views=tuple(tuple(f"00{k}/0" for k in range(views)) for _ in range(subjects)),
+    )
+
+
+class Standin(nn.Module):
+    """One depth for all pixels and one shift of the colours."""
+
+    def __init__(self):
+        super().__init__()
+        self.depth = nn.Parameter(torch.tensor(2.5))
+        self.shift = nn.Parameter(torch.zeros(3))
+
+    def forward(self, batch: Batch) -> Prediction:
+        masks = batch.masks
+        depth = self.depth.expand(masks.shape)
+        pixels = unproject_maps(depth, batch.cameras)
+        n = int(masks.sum())
+        gaussians = Gaussians(
+            means=pixels[masks],
+            quaternions=torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
+            scales=torch.full((n, 3), 0.01),
+            opacities=torch.full((n,), 0.9),
+            colors=batch.images.movedim(2, -1)[masks] + self.shift,
+            splits=tuple(masks.flatten(1).sum(1).tolist()),
+        )
+        nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
+        maps = DepthMaps(depth, masks, torch.ones_like(depth))
+        return Prediction(gaussians, depth, masks, Points(pixels, masks, *nothing), maps)
+
+
+def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+    """Every image is the mean colour of its Gaussians: differentiable, and nothing else."""
+    b, t = cameras.shape
+    colors = torch.stack([gaussians[i].colors.mean(0) for i in range(b)])
+    image = colors[:, None, :, None, None].expand(b, t, 3, cameras.height, cameras.width)
+    ones = torch.ones(b, t, 1, cameras.height, cameras.width)
+    return Rendering(image, ones, ones)
+
+
+class _Steps(Dataset):
+    def __init__(self, length: int):
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, step: int) -> Batch:
+        return example_batch(seed=step)
+
+
+class StepData(L.LightningDataModule):
+    """Training batches that are functions of the step, in epochs of ``length``; two to validate on."""
+
+    def __init__(self, length: int = 5):
+        super().__init__()
+        self.length = length
+
+    def train_dataloader(self) -> DataLoader:
+        def first() -> int:
+            return self.trainer.global_step * self.trainer.accumulate_grad_batches
+
+        steps = _Steps(self.length)
+        return DataLoader(steps, batch_size=None, collate_fn=lambda b: b, sampler=StepSampler(steps, first))
+
+    def val_dataloader(self) -> DataLoader:
+        batches = [example_batch(seed=1000 + i) for i in range(2)]
+        return DataLoader(batches, batch_size=None, collate_fn=lambda b: b)

@@ -1,0 +1,292 @@
+"""Metrics against torchmetrics, the authors' numbers, the reference FLIP and exact cases."""
+
+import sys
+import types
+from pathlib import Path
+
+import kornia
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torchmetrics.functional.image import (
+    peak_signal_noise_ratio,
+    structural_similarity_index_measure,
+)
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.metrics import PSNR, PSNR_CAP, SSIM, ImageMetrics, depth_error_mm, flip_map, psnr, ssim
+from ghgs_lit.metrics.functional import box_of, ssim_map
+
+FIXTURES = Path(__file__).parents[1] / "fixtures"
+
+
+def _images(n=3, h=30, w=41, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    target = torch.rand(n, 3, h, w, generator=g)
+    image = (target + 0.1 * torch.randn(target.shape, generator=g)).clamp(0, 1)
+    return image, target
+
+
+def test_authors_evaluation_numbers():
+    data = load_file(FIXTURES / "losses.safetensors")
+    first, second = data["in/img1"], data["in/img2"]
+    assert torch.allclose(psnr(first, second)[:, None], data["out/psnr"], atol=1e-5)
+    assert torch.allclose(ssim(first, second, "zeros"), data["out/ssim_per_image"], atol=2e-6)
+    assert torch.allclose(
+        ssim(first.double(), second.double(), "zeros"), data["out64/ssim_per_image"], atol=2e-7
+    )
+    # As the release protocol reports them, over whole images.
+    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")
+    values = release(first, second, torch.zeros(2, 40, 48, dtype=torch.bool))
+    assert torch.allclose(values["psnr"][:, None], data["out/psnr"], atol=1e-5)
+    assert torch.allclose(values["ssim"], data["out/ssim_per_image"], atol=2e-6)
+    # Without padding it is another number: the fixture tells them apart.
+    assert (ssim(first, second, "valid") - data["out/ssim_per_image"]).abs().min() > 1e-3
+
+
+def test_psnr_and_ssim_are_torchmetrics():
+    image, target = _images()
+    for i in range(len(image)):
+        a, b = image[i : i + 1], target[i : i + 1]
+        assert psnr(a, b).item() == pytest.approx(
+            peak_signal_noise_ratio(a, b, data_range=1.0).item(), abs=1e-4
+        )
+        expected = structural_similarity_index_measure(a, b, data_range=1.0, sigma=1.5)
+        assert ssim(a, b, "reflect").item() == pytest.approx(expected.item(), abs=1e-5)
+
+
+def test_psnr_and_ssim_are_scikit_images():
+    metrics = pytest.importorskip("skimage.metrics")
+    image, target = _images()
+    options = {
+        "channel_axis": 0, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5,
+        "use_sample_covariance": False, "full": True,
+    }  # fmt: skip
+    for i in range(len(image)):
+        a, b = image[i].double(), target[i].double()
+        mean, full = metrics.structural_similarity(a.numpy(), b.numpy(), **options)
+        assert ssim(a[None], b[None], "valid").item() == pytest.approx(mean, abs=1e-6)
+        # ... and its map, whose border scikit-image mirrors with the edge pixel doubled.
+        own = ssim_map(a[None], b[None], "reflect")[0]
+        assert np.abs(own.numpy() - full)[:, 5:-5, 5:-5].max() < 1e-6
+        expected = metrics.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1.0)
+        assert psnr(a[None], b[None]).item() == pytest.approx(expected, abs=1e-6)
+
+
+def test_ssim_maps_are_kornias():
+    image, target = _images(2)
+    for padding, name in (("reflect", "same"), ("valid", "valid")):
+        expected = kornia.metrics.ssim(image, target, 11, padding=name)
+        assert torch.allclose(ssim_map(image, target, padding), expected, atol=2e-5)
+
+
+def test_ssim_without_padding_is_the_interior():
+    image, target = _images(1)
+    inside = ssim_map(image, target, "reflect")[..., 5:-5, 5:-5].mean()
+    assert ssim(image, target, "valid").item() == pytest.approx(inside.item(), abs=1e-6)
+
+
+def test_ssim_gradient_is_that_of_finite_differences():
+    image, target = (i[:, :1].double() for i in _images(1, 12, 13))
+    image.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: ssim(x, target, "valid"), (image,), fast_mode=True)
+
+
+def test_ssim_is_wide_under_autocast():
+    image, target = _images()
+    with torch.autocast("cpu", torch.bfloat16):
+        low = ssim(image, target)
+    assert torch.equal(low, ssim(image, target))
+
+
+def test_psnr_of_known_errors_by_region():
+    target = torch.zeros(1, 3, 10, 12)
+    mask = torch.zeros(1, 10, 12, dtype=torch.bool)
+    mask[0, 2, 3] = mask[0, 5, 8] = True
+    image = target.clone()
+    image[0, :, 2, 3] = 0.1  # one subject pixel is off by 0.1, the rest is exact
+    box = box_of(mask)
+    assert box.sum() == 4 * 6
+    assert box[0, 2:6, 3:9].all()
+    assert psnr(image, target).item() == pytest.approx(20 + 10 * np.log10(120), abs=1e-4)
+    assert psnr(image, target, box).item() == pytest.approx(20 + 10 * np.log10(24), abs=1e-4)
+    assert psnr(image, target, mask).item() == pytest.approx(20 + 10 * np.log10(2), abs=1e-4)
+
+
+def test_equal_images_and_empty_regions_are_defined():
+    image, _ = _images()
+    nobody = torch.zeros(3, 30, 41, dtype=torch.bool)
+    assert torch.equal(psnr(image, image), torch.full((3,), PSNR_CAP))
+    assert torch.allclose(ssim(image, image), torch.ones(3))
+    assert flip_map(image, image).abs().max() == 0
+    assert psnr(image, image, nobody).isnan().all()
+    assert not box_of(nobody).any()
+    metric = PSNR("box")
+    metric.update(image, image, nobody)
+    metric.update(image, image, ~nobody)
+    assert metric.compute().item() == pytest.approx(PSNR_CAP)
+    assert depth_error_mm(torch.ones(3, 30, 41), torch.ones(3, 30, 41), nobody).isnan()
+
+
+def test_ssim_of_a_region_is_the_mean_of_its_windows():
+    image, target = _images(1)
+    region = torch.zeros(1, 30, 41, dtype=torch.bool)
+    region[0, 12, 20] = True
+    window = ssim(image[..., 7:18, 15:26], target[..., 7:18, 15:26])  # the one window centred there
+    assert ssim(image, target, "valid", region).item() == pytest.approx(window.item(), abs=1e-6)
+    with pytest.raises(InputError, match="at least 11x11"):
+        ssim(image[..., :10], target[..., :10])
+
+
+def test_flip_is_the_reference_implementation():
+    """``flip.npz``: maps made with the authors' flip-evaluator 1.7 at its default viewing distance."""
+    data = np.load(FIXTURES / "flip.npz")
+    reference, test = (
+        torch.from_numpy(data[k].astype(np.float32) / 255).permute(0, 3, 1, 2) for k in ("reference", "test")
+    )
+    assert torch.allclose(flip_map(test, reference), torch.from_numpy(data["flip"]), atol=2e-5)
+
+
+def test_flip_of_black_and_white_is_nearly_one():
+    black, white = torch.zeros(1, 3, 20, 20), torch.ones(1, 3, 20, 20)
+    value = flip_map(white, black)
+    assert value.max() <= 1
+    assert value.min() > 0.9
+    assert torch.allclose(flip_map(black, white), value, atol=1e-6)
+
+
+def test_metric_classes_average_the_pure_functions():
+    image, target = _images(4)
+    mask = torch.rand(4, 30, 41, generator=torch.Generator().manual_seed(5)) > 0.9
+    for metric, values in (
+        (PSNR("box"), psnr(image, target, box_of(mask))),
+        (SSIM("zeros"), ssim(image, target, "zeros")),
+    ):
+        metric.update(image[:1], target[:1], mask[:1])
+        metric.update(image[1:], target[1:], mask[1:])
+        assert metric.compute().item() == pytest.approx(values.mean().item(), rel=1e-6)
+        assert not metric.state_dict()
+
+
+def test_a_protocol_reports_its_metrics_by_name():
+    image, target = _images(2)
+    mask = torch.zeros(2, 30, 41, dtype=torch.bool)
+    mask[:, 8:20, 10:30] = True
+    values = ImageMetrics(lpips="off")(image * 1.5, target, mask)
+    assert set(values) == {
+        "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
+    }  # fmt: skip
+    assert torch.equal(values["psnr"], psnr((image * 1.5).clamp(0, 1), target))
+    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")(image * 1.5, target, mask)
+    assert set(release) == {"psnr", "ssim", "flip"}
+    assert torch.equal(release["psnr"], psnr(image * 1.5, target))
+
+
+def test_lpips_is_left_out_with_its_reason_or_refused():
+    try:
+        import torchvision  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip("torchvision is installed")
+    protocol = ImageMetrics(lpips="auto")
+    assert "lpips" not in protocol.metrics
+    assert "torchvision" in protocol.left_out["lpips"]
+    with pytest.raises(InputError, match="torchvision"):
+        ImageMetrics(lpips="require")
+
+
+class RecordingNetwork:
+    """Stands in for torchmetrics' LPIPS: notes its options and what it is fed."""
+
+    def __init__(self, net_type, normalize):
+        self.options, self.fed = (net_type, normalize), []
+
+    def __call__(self, image, target):
+        self.fed.append((image, target))
+        return (image - target).abs().mean()
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    import torchmetrics.image.lpip
+
+    monkeypatch.setitem(sys.modules, "torchvision", types.ModuleType("torchvision"))
+    monkeypatch.setattr(
+        torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", RecordingNetwork, raising=False
+    )
+
+
+@pytest.mark.usefixtures("recorded")
+def test_lpips_sees_what_its_protocol_says():
+    image, target = _images(3)
+    mask = torch.ones(3, 30, 41, dtype=torch.bool)
+    overshooting = image * 1.5
+    for protocol, signed, expected in (
+        (ImageMetrics(), True, overshooting.clamp(0, 1)),
+        # The authors' evaluation: [0, 1] as it is, neither clamped nor mapped.
+        (
+            ImageMetrics("release", ["image"], "zeros", False, "require", lpips_signed=False),
+            False,
+            overshooting,
+        ),
+    ):
+        values = protocol(overshooting, target, mask)["lpips"]
+        network = protocol.metrics["lpips"].network
+        assert network.options == ("vgg", signed)
+        # One image at a time: torchmetrics would give the mean of a batch.
+        assert torch.equal(torch.cat([a for a, _ in network.fed]), expected)
+        assert torch.allclose(values, (expected - target).abs().mean((1, 2, 3)))
+
+
+@pytest.mark.usefixtures("recorded")
+def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
+    import torchmetrics.image.lpip
+
+    def offline(**_):
+        raise OSError("no\nroute")
+
+    monkeypatch.setattr(
+        torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", offline, raising=False
+    )
+    protocol = ImageMetrics()
+    assert "lpips" not in protocol.metrics
+    assert protocol.left_out["lpips"] == "LPIPS: the weights of 'vgg' could not be had: no route"
+
+
+def test_the_box_can_be_wider():
+    mask = torch.zeros(2, 20, 30, dtype=torch.bool)
+    mask[0, 8, 10] = mask[0, 11, 19] = True  # 4 high, 10 wide
+    wider = box_of(mask, 0.5)
+    assert wider[0].nonzero().amin(0).tolist() == [6, 5]
+    assert wider[0].nonzero().amax(0).tolist() == [13, 24]
+    assert wider[0].sum() == 8 * 20
+    assert not wider[1].any()
+    # It ends where the image does.
+    assert box_of(mask, 9.0)[0].all()
+    image, target = _images(2, 20, 30)
+    values = ImageMetrics(lpips="off", box_margin=0.5)(image, target, mask)
+    assert torch.equal(values["psnr_box"][:1], psnr(image, target, wider)[:1])
+    assert values["psnr_box"][1].isnan()
+    with pytest.raises(InputError, match="box_margin"):
+        ImageMetrics(lpips="off", box_margin=-0.1)
+
+
+def test_a_protocol_says_what_its_numbers_mean():
+    said = ImageMetrics(lpips="off", box_margin=0.1).definitions
+    assert said["ssim"].endswith("padding reflect")
+    assert "at most 100 dB" in said["psnr"]
+    assert "0.1 of its sides wider" in said["box"]
+    assert "clamped" in said["image"]
+    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off").definitions
+    assert release["ssim"].endswith("padding zeros")
+    assert "as they are" in release["image"]
+    assert "box" not in release
+
+
+def test_depth_error_is_in_millimetres_on_known_subject_pixels():
+    depth = torch.full((1, 2, 3), 2.0)
+    truth = torch.tensor([[[2.01, 2.03, 0.0], [2.0, 5.0, 2.0]]])
+    region = torch.tensor([[[True, True, True], [False, False, True]]])
+    assert depth_error_mm(depth, truth, region).item() == pytest.approx((10 + 30 + 0) / 3, abs=1e-3)

@@ -1,0 +1,89 @@
+"""Options, refusals and configs of the renderer."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.rendering import Renderer, render
+from tests.helpers.splats import cameras, cloud
+
+CONFIGS = sorted((Path(__file__).parents[2] / "conf" / "renderer").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_every_config_builds_a_renderer(path):
+    options = yaml.safe_load(path.read_text())
+    assert options.pop("_target_") == "ghgs_lit.rendering.Renderer"
+    assert Renderer(**options).backend == path.stem
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"backend": "cuda"}, "renderer.backend"),
+        ({"near": 0.0}, "renderer.near"),
+        ({"near": float("nan")}, "renderer.near"),
+        ({"near": 2.0, "far": 1.0}, "renderer.far"),
+        ({"background": "white"}, "renderer.background"),
+        ({"background": [0.0, float("inf"), 0.0]}, "renderer.background"),
+        ({"low_pass": -1.0}, "low_pass"),
+        ({"alpha_max": 1.0}, "alpha_max"),
+        ({"alpha_min": 0.9999}, "alpha_min"),
+        ({"antialiased": 1}, "antialiased"),
+        ({"lowpass": 0.3}, "lowpass"),
+    ],
+)
+def test_impossible_options_are_refused_by_name(options, key):
+    with pytest.raises(InputError, match=key):
+        Renderer(**options)
+
+
+def test_auto_is_the_cpu_backend_for_cpu_tensors():
+    gaussians, views = cloud(20), cameras(2, 20, 30)
+    assert torch.equal(Renderer()(gaussians, views).image, render(gaussians, views, "cpu").image)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_backgrounds(backend):
+    gaussians, views = cloud(20), cameras(2, 20, 30)
+    black = render(gaussians, views, backend)
+    behind = 1 - black.alpha
+    color = torch.tensor([0.1, 0.5, 0.9])
+    for background in (color, (0.1, 0.5, 0.9), color.expand(1, 2, 3)[..., None, None]):
+        image = render(gaussians, views, backend, background=background).image
+        torch.testing.assert_close(image, black.image + behind * color[:, None, None])
+    torch.testing.assert_close(
+        Renderer(backend, background=0.5)(gaussians, views, background=1.0).image, black.image + behind
+    )
+    with pytest.raises(InputError, match="background"):
+        render(gaussians, views, backend, background=(0.0, 1.0))
+
+
+def test_the_background_is_differentiable():
+    background = torch.zeros(3, requires_grad=True)
+    rendering = render(cloud(20), cameras(1, 20, 30), "cpu", background=background)
+    rendering.image.sum().backward()
+    torch.testing.assert_close(background.grad, (1 - rendering.alpha).sum().expand(3))
+
+
+def test_inputs_that_do_not_fit():
+    gaussians, views = cloud(20), cameras(2, 20, 30)
+    with pytest.raises(InputError, match="cameras"):
+        render(gaussians, views[0], "cpu")
+    with pytest.raises(InputError, match="cameras"):
+        render(cloud(20, splits=(10, 10)), views, "cpu")
+    with pytest.raises(InputError, match=r"gaussians\.splits"):
+        render(cloud(20, splits=(19,)), views, "cpu")
+    skewed = views.intrinsics.clone()
+    skewed[..., 0, 1] = 1.0
+    with pytest.raises(InputError, match="skew"):
+        render(gaussians, type(views)(skewed, views.extrinsics, 20, 30), "cpu")
+
+
+@pytest.mark.parametrize("region", [(0, 0, 21, 30), (-1, 0, 5, 5), (0, 0, 5), (0.0, 0.0, 5.0, 5.0)])
+def test_regions_that_do_not_fit(region):
+    with pytest.raises(InputError, match="region"):
+        render(cloud(5), cameras(2, 20, 30), "cpu", region=region)

@@ -1,0 +1,147 @@
+"""gsplat: its own projection in PyTorch as an outside check, how it is called, and on a GPU its image."""
+
+import inspect
+
+import pytest
+import torch
+
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.rendering import BackendUnavailable, RasterSettings, gsplat_backend, reference, render
+from ghgs_lit.types import Cameras, Gaussians
+from tests.helpers.splats import FIELDS, cameras, cloud, differentiate, error, leaves
+
+
+def _functions():
+    """gsplat's functions in plain PyTorch, which need no GPU."""
+    reason = "needs the package gsplat (it needs no GPU for this test)"
+    return pytest.importorskip("gsplat.cuda._torch_impl", reason=reason)
+
+
+def test_covariances_are_those_of_gsplat():
+    gaussians = leaves(cloud(100), torch.float64)
+    wanted, _ = _functions()._quat_scale_to_covar_preci(
+        gaussians.quaternions, gaussians.scales, compute_preci=False
+    )
+    root = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
+    torch.testing.assert_close(root @ root.mT, wanted)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("distance", [3.0, 0.8])
+def test_projection_is_that_of_gsplat(distance, antialiased):
+    """Centres, inverse covariances, depths and opacities of every splat in view, and their gradients.
+
+    Near cameras see Gaussians beyond the frame, where the Jacobian is held.
+    """
+    gaussians, views = leaves(cloud(200), torch.float64), cameras(3, 40, 50, distance=distance)
+    views = Cameras(views.intrinsics.double(), views.extrinsics.double(), 40, 50)
+    settings = RasterSettings(antialiased=antialiased)
+    covariances, _ = _functions()._quat_scale_to_covar_preci(
+        gaussians.quaternions, gaussians.scales, compute_preci=False
+    )
+    _, centers, depths, conics, compensations = _functions()._fully_fused_projection(
+        gaussians.means, covariances, views.extrinsics[0], views.intrinsics[0], 50, 40,
+        eps2d=settings.low_pass, calc_compensations=True,
+    )  # fmt: skip
+    fields = [gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities]
+    compared = 0
+    for view in range(3):
+        splats = reference.project(gaussians, views[0, view], settings)
+        xx, xy, yy = splats["covariances"].unbind(-1)
+        found = [
+            splats["centers"],
+            torch.stack((yy, -xy, xx), dim=-1) / splats["determinants"][:, None],
+            splats["depths"][:, None],
+            splats["opacities"][:, None],
+        ]
+        opacities = gaussians.opacities * compensations[view] if antialiased else gaussians.opacities
+        wanted = [centers[view], conics[view], depths[view][:, None], opacities[:, None]]
+        front = splats["depths"].detach() > 0.05
+        compared += int(front.sum())
+        slopes = []
+        for values in (found, wanted):
+            table = torch.cat([value[front] for value in values], dim=-1)
+            weights = torch.randn(
+                table.shape, generator=torch.Generator().manual_seed(view), dtype=table.dtype
+            )
+            slopes.append(torch.autograd.grad((table * weights).sum(), fields, retain_graph=True))
+        for ours, theirs in zip(found, wanted, strict=True):
+            torch.testing.assert_close(ours[front], theirs[front], rtol=1e-6, atol=1e-9)
+        for ours, theirs in zip(*slopes, strict=True):
+            assert error(ours, theirs) < 1e-6
+    assert compared > 400
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="tells what happens without CUDA")
+def test_gsplat_without_cuda_says_what_is_missing():
+    with pytest.raises(BackendUnavailable, match=r"renderer\.backend=gsplat.*CUDA"):
+        render(cloud(5), cameras(1, 8, 8), "gsplat")
+
+
+def test_gsplat_refuses_constants_it_does_not_know():
+    with pytest.raises(ValueError, match="renderer"):
+        render(cloud(5), cameras(1, 8, 8), "gsplat", settings=RasterSettings(stop=0.5))
+
+
+def _stand_in(
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d,
+    render_mode, packed, rasterize_mode,
+):  # fmt: skip
+    """gsplat's ``rasterization`` as its documentation has it, drawn by the reference."""
+    assert (render_mode, packed) == ("RGB+ED", False)
+    assert all(torch.isfinite(t).all() for t in (means, quats, scales, opacities))
+    torch.testing.assert_close(quats.norm(dim=-1), torch.ones(len(quats)))
+    gaussians = Gaussians(means, quats, scales, opacities, colors, splits=(len(means),))
+    settings = RasterSettings(low_pass=eps2d, antialiased=rasterize_mode == "antialiased")
+    views = Cameras(Ks[None], viewmats[None], height, width)
+    drawn = reference.rasterize(gaussians, views, settings, near_plane, far_plane)
+    values = torch.cat((drawn.image, drawn.depth), dim=2)[0].permute(0, 2, 3, 1)
+    return values, drawn.alpha[0].permute(0, 2, 3, 1), {}
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
+    monkeypatch.setattr(gsplat_backend, "load", lambda: _stand_in)
+    gaussians, views = cloud(40, splits=(15, 0, 25)), cameras(2, 20, 30, batch=3)
+    gaussians.quaternions[3] = 0
+    gaussians.quaternions[4] *= 1e-25
+    gaussians.means[5, 0] = float("nan")
+    settings = RasterSettings(low_pass=0.2, antialiased=antialiased)
+    gaussians = leaves(gaussians)
+    found = gsplat_backend.rasterize(gaussians, views, settings, 0.5, 20.0)
+    wanted = render(gaussians, views, "cpu", settings=settings, near=0.5, far=20.0)
+    for name in ("image", "alpha", "depth"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4)
+    found.image.sum().backward()
+    assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
+
+
+def test_every_argument_is_one_of_gsplat():
+    gsplat = pytest.importorskip("gsplat", reason="needs the package gsplat (it needs no GPU for this test)")
+    parameters = inspect.signature(gsplat.rasterization).parameters
+    assert set(inspect.signature(_stand_in).parameters) <= set(parameters)
+    defaults = {"radius_clip": 0.0, "sh_degree": None, "backgrounds": None, "camera_model": "pinhole"}
+    assert {name: parameters[name].default for name in defaults} == defaults
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_draws_the_same_image_with_the_same_gradients(antialiased):
+    pytest.importorskip("gsplat")
+    gaussians, views = cloud(500, splits=(200, 0, 300)), cameras(2, 45, 70, batch=3)
+    options = {"settings": RasterSettings(antialiased=antialiased), "background": (0.1, 0.5, 0.9)}
+    generator = torch.Generator().manual_seed(7)
+    weights = [torch.randn(3, 2, c, 45, 70, generator=generator, dtype=torch.float64) for c in (3, 1, 1)]
+    wanted, slopes = differentiate(gaussians, views, "cpu", torch.float32, weights, **options)
+    found, others = differentiate(
+        gaussians.to("cuda"),
+        views.to("cuda"),
+        "gsplat",
+        torch.float32,
+        [w.cuda() for w in weights],
+        **options,
+    )
+    for name in ("image", "alpha", "depth"):
+        assert error(getattr(found, name).cpu(), getattr(wanted, name)) < 1e-3
+    for name in FIELDS:
+        assert error(others[name].cpu(), slopes[name]) < 1e-2

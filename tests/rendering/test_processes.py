@@ -1,0 +1,175 @@
+"""The CPU backend among threads, processes, processors and cached machine code."""
+
+import dataclasses
+import importlib.util
+import multiprocessing
+import os
+import platform
+import subprocess
+import sys
+import threading
+import warnings
+from pathlib import Path
+
+import numba
+import pytest
+import torch
+
+from ghgs_lit.kernels import compile, pool
+from ghgs_lit.rendering import render
+from ghgs_lit.rendering.cpu import backend
+from tests.helpers.splats import FIELDS, body, cameras, leaves
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("splits", [(3000,), (1501, 0, 1, 1498)])
+def test_the_same_bits_with_any_number_of_threads(monkeypatch, splits):
+    """Small parts, so that several threads have work; many Gaussians of equal depth lie in several parts."""
+    monkeypatch.setattr(pool, "GRAIN", 64)
+    scene = body(3000, 64)
+    scene.means[::3, 2] = 0.1
+    scene = dataclasses.replace(scene, splits=splits)
+
+    def run():
+        gaussians = leaves(scene)
+        rendering = render(gaussians, cameras(2, 64, 64, batch=len(splits)), "cpu")
+        (rendering.image.square().sum() + rendering.depth.sum()).backward()
+        return [rendering.image.detach(), *(getattr(gaussians, name).grad for name in FIELDS)]
+
+    first = run()
+    for threads in (2, 3, 7):
+        torch.set_num_threads(threads)
+        assert all(torch.equal(a, b) for a, b in zip(first, run(), strict=True))
+
+
+def test_two_threads_of_the_caller_at_once():
+    torch.set_num_threads(2)
+    gaussians, views = body(2000, 48), cameras(2, 48, 48)
+    wanted = render(gaussians, views, "cpu").image
+    found = []
+
+    def work():
+        for _ in range(5):
+            leaf = leaves(gaussians)
+            rendering = render(leaf, views, "cpu")
+            rendering.image.sum().backward()
+            found.append(rendering.image.detach())
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    [thread.start() for thread in threads]
+    [thread.join(timeout=60) for thread in threads]
+    assert len(found) == 10
+    assert all(torch.equal(image, wanted) for image in found)
+
+
+def _render_in_child(queue):
+    torch.set_num_threads(2)
+    queue.put(float(render(body(500, 32), cameras(2, 32, 32), "cpu").image.sum()))
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+def test_after_a_fork():
+    torch.set_num_threads(2)
+    wanted = float(render(body(500, 32), cameras(2, 32, 32), "cpu").image.sum())
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    children = [context.Process(target=_render_in_child, args=(queue,)) for _ in range(2)]
+    [child.start() for child in children]
+    found = [queue.get(timeout=60) for _ in children]
+    [child.join(timeout=60) for child in children]
+    assert found == [wanted, wanted]
+
+
+class _Renderings(torch.utils.data.Dataset):
+    def __len__(self):
+        return 8
+
+    def __getitem__(self, index):
+        gaussians = leaves(body(500, 32, seed=index))
+        image = render(gaussians, cameras(1, 32, 32), "cpu").image
+        image.square().sum().backward()
+        return image.detach(), gaussians.means.grad
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
+def test_training_in_four_workers_of_a_data_loader():
+    torch.set_num_threads(2)
+    wanted = [_Renderings()[index] for index in range(8)]
+    loader = torch.utils.data.DataLoader(
+        _Renderings(), batch_size=None, num_workers=4, multiprocessing_context="fork", timeout=60
+    )
+    for found, (image, gradient) in zip(loader, wanted, strict=True):
+        assert torch.equal(found[0], image)
+        assert torch.equal(found[1], gradient)
+
+
+def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
+    """A kernel cached under one digest is compiled anew under another, and found again under its own."""
+    source = tmp_path / "scaled.py"
+    source.write_text(
+        "from ghgs_lit.kernels import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
+    )
+
+    def hits(digest):
+        original, compile._digest = compile._digest, lambda folder: digest
+        try:
+            spec = importlib.util.spec_from_file_location("scaled", source)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules["scaled"] = module
+            spec.loader.exec_module(module)
+            assert module.double(2) == 4
+            return sum(module.double.stats.cache_hits.values())
+        finally:
+            compile._digest = original
+
+    assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])
+def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
+    backend._warn_of_narrow_vectors.cache_clear()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            render(body(10, 8), cameras(1, 8, 8), "cpu")
+    assert sum("256 bits" in str(warning.message) for warning in caught) == warned
+
+
+_SUM = """
+import torch
+from tests.helpers.splats import body, cameras, leaves
+from ghgs_lit.rendering import render
+from ghgs_lit.rendering.cpu import backend
+gaussians = leaves(body(300, 24))
+image = render(gaussians, cameras(1, 24, 24), "cpu").image
+image.square().sum().backward()
+print(float(image.detach().sum()), float(gaussians.scales.grad.norm()))
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="takes x86 vectors away")
+def test_the_same_image_without_wide_vectors():
+    """Compiled for a processor that has vectors of 128 bits only (the first run takes a while)."""
+
+    def run(**variables):
+        path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+        environment = {**os.environ, "PYTHONPATH": path, **variables}
+        done = subprocess.run(
+            [sys.executable, "-c", _SUM], env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        return [float(number) for number in done.stdout.split()], done.stderr
+
+    wanted, _ = run()
+    found, said = run(NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
+    assert found == pytest.approx(wanted, rel=1e-5)
+    assert said.count("no vectors of 256 bits") == 1

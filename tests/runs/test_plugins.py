@@ -1,0 +1,97 @@
+"""Hydra's launchers and sweepers that come as extras, on sweeps without training."""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from ghgs_lit.runs.run import Run, State
+from tests.helpers.jobs import executed, hydra_app
+
+SETTINGS = {
+    "joblib": ("hydra_plugins.hydra_joblib_launcher", "cluster", ["hydra.launcher.n_jobs=2"]),
+    "submitit_local": (
+        "hydra_plugins.hydra_submitit_launcher",
+        "cluster",
+        ["hydra.launcher.cpus_per_task=1", "hydra.launcher.timeout_min=5"],
+    ),
+    "ray": ("hydra_plugins.hydra_ray_launcher", "ray", ["+hydra.launcher.ray.init.num_cpus=2"]),
+}
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch):
+    # Jobs in other processes import the stand-ins of this folder.
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    GlobalHydra.instance().clear()
+
+
+@pytest.mark.parametrize("launcher", sorted(SETTINGS))
+def test_launchers_run_a_sweep_of_four_once(launcher, monkeypatch, capsys, tmp_path):
+    module, extra, settings = SETTINGS[launcher]
+    pytest.importorskip(module, reason=f"the extra {extra} is not installed", exc_type=ImportError)
+    chosen = ["-m", f"hydra/launcher={launcher}", *settings, f"hydra.sweep.dir={tmp_path}"]
+    hydra_app(monkeypatch, *chosen, "seed=1,2", "ablation=full,neither")
+    names = executed(tmp_path)
+    assert len(names) == len(set(names)) == 4
+    assert all(Run(tmp_path / name).state == State.DONE for name in names)
+    assert "4 runs: 4 done" in capsys.readouterr().out
+    hydra_app(monkeypatch, *chosen, "seed=1,2", "ablation=full,neither")
+    assert len(executed(tmp_path)) == 4
+
+
+def test_an_optuna_study_is_kept_in_the_sweep(monkeypatch, tmp_path):
+    pytest.importorskip(
+        "hydra_plugins.hydra_optuna_sweeper", reason="the extra optuna is not installed", exc_type=ImportError
+    )
+    import optuna
+
+    command = ["-m", "hydra/sweeper=optuna_stored", "hydra.sweeper.n_trials=2", f"hydra.sweep.dir={tmp_path}"]
+    for _ in range(2):
+        GlobalHydra.instance().clear()
+        hydra_app(monkeypatch, *command, "optimizer.lr=interval(0.001,0.01)")
+    study = optuna.load_study(study_name="ghgs", storage=f"sqlite:///{tmp_path / 'optuna.db'}")
+    values = [trial.value for trial in study.trials]
+    assert len(values) == 4
+    assert study.best_value == max(values)
+    assert all(trial.value == pytest.approx(20 + trial.params["optimizer.lr"]) for trial in study.trials)
+    # The second call begins as the first one did, finds those runs done, and runs none of them again.
+    assert len(executed(tmp_path)) == len({t.params["optimizer.lr"] for t in study.trials}) == 2
+    assert sys.modules["optuna"].__version__.startswith("2.")
+
+
+# What submitit calls, for jobs that run at once on this machine.
+FAKES = {
+    "sbatch": """#!/bin/bash
+export SLURM_ARRAY_JOB_ID=7 SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0
+export SLURM_JOB_NUM_NODES=1 SLURM_JOB_NODELIST=here
+for i in 0 1; do SLURM_JOB_ID=$((7 + i)) SLURM_ARRAY_TASK_ID=$i bash "$1" > /dev/null 2>&1 & done
+echo "Submitted batch job 7"
+""",
+    "srun": """#!/bin/bash
+while [[ "$1" == -* ]]; do if [[ "$1" == --output || "$1" == --error ]]; then shift; fi; shift; done
+exec "$@"
+""",
+    "sacct": "#!/bin/bash\necho 'JobID|State'\nfor i in 0 1; do echo \"7_$i|RUNNING\"; done\n",
+}
+
+
+def test_the_slurm_example_submits_what_is_missing(monkeypatch, tmp_path):
+    pytest.importorskip(
+        "hydra_plugins.hydra_submitit_launcher",
+        reason="the extra cluster is not installed",
+        exc_type=ImportError,
+    )
+    for name, text in FAKES.items():
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    sweep = tmp_path / "sweep"
+    hydra_app(monkeypatch, "-m", "hydra/launcher=slurm", f"hydra.sweep.dir={sweep}", "seed=1,2")
+    names = executed(sweep)
+    assert len(names) == len(set(names)) == 2
+    (script,) = sweep.glob(".submitit/*/*.sh")
+    assert "#SBATCH --gpus-per-node=1" in script.read_text()

@@ -1,0 +1,309 @@
+"""Sweeps: nothing twice, nothing lost; grown, cut off, shared, refused."""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus
+
+from ghgs_lit.cli import train as train_verb
+from ghgs_lit.config import conf_dir
+from ghgs_lit.errors import InputError
+from ghgs_lit.runs import job, plan
+from ghgs_lit.runs.grid import carry_out, combinations
+from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.runs.results import read_results
+from ghgs_lit.runs.run import Run, State
+from tests.cli.test_main import call
+from tests.helpers.jobs import executed, finish, hold, noting, planned_by_hand, work_through
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+@pytest.fixture
+def sweep(monkeypatch, capsys, tmp_path):
+    """``sweep("seed=1,2")`` runs the verb as a sweep in ``tmp_path / "sweep"`` without training."""
+    monkeypatch.setattr(train_verb, "train", noting)
+
+    def run(*overrides: str):
+        return call(monkeypatch, capsys, "train", "-m", f"hydra.sweep.dir={tmp_path / 'sweep'}", *overrides)
+
+    run.directory = tmp_path / "sweep"
+    return run
+
+
+def test_a_grid_that_grows_runs_what_is_missing(sweep):
+    code, out, _ = sweep("seed=1,2")
+    assert (code, len(executed(sweep.directory))) == (0, 2)
+    code, out, _ = sweep("seed=1,2,3")
+    assert code == 0
+    assert "3 runs: 2 done before, 1 to do" in out
+    names = executed(sweep.directory)
+    assert len(names) == len(set(names)) == 3
+    sweep("seed=2,3", "logger=none", "data.workers=1", "hydra.sweeper.max_batch_size=1")
+    assert executed(sweep.directory) == names  # what no number depends on makes no new run
+    for name in names:
+        source = read_results(sweep.directory / name / "metrics.json")["provenance"]
+        assert name == source["config_hash"] == config_hash(source["config"])
+
+
+def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
+    code, out, _ = sweep("seed=1,2", "dry_run=true", "trainer.max_steps=100")
+    assert code == 0
+    assert not sweep.directory.exists()
+    assert "2 runs: 2 missing; nothing was run" in out
+    assert "unknown" in out
+    sweep("seed=1", "trainer.max_steps=100")
+    names = executed(sweep.directory)
+    code, out, _ = sweep("seed=1,2,3", "dry_run=true", "trainer.max_steps=100")
+    assert executed(sweep.directory) == names
+    assert names[0] in out
+    assert "3 runs: 1 done, 2 missing" in out
+    assert "0:01:40 (0.5 s a step, measured in 1 runs that are done)" in out  # 2 x 100 x 0.5 s
+    code, out, _ = sweep("seed=2,3", "dry_run=true", "trainer.max_time=00:00:00:10")
+    assert ": 0:00:20 (trainer.max_time; 0.5 s a step" in out  # the budget ends before 5000 x 0.5 s
+
+
+def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, monkeypatch):
+    def bad(config, directory, notes):
+        if config["seed"] == 1:
+            raise InputError("step 3: expected finite losses; found nan")
+        if config["seed"] == 2:
+            (directory / "checkpoints").mkdir()
+            (directory / "checkpoints" / "last.ckpt").touch()
+            raise KeyboardInterrupt
+        return noting(config, directory, notes)
+
+    monkeypatch.setattr(train_verb, "train", bad)
+    code, _, _ = sweep("seed=3,1,2,4")
+    assert code == 130
+    assert len(executed(sweep.directory)) == 1
+    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4  # tables show what is planned as missing
+    _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
+    assert "4 runs: 1 done, 1 partial, 1 failed, 1 missing" in out
+    monkeypatch.setattr(train_verb, "train", noting)
+    code, out, _ = sweep("seed=1,2,3,4")
+    assert code == 0
+    assert "4 runs: 4 done" in out
+    lines = [line.split() for line in (sweep.directory / "executed").read_text().splitlines()]
+    resumed = {name: resume for name, _, resume in lines}
+    assert len(lines) == len(resumed) == 4
+    cut = [name for name, resume in resumed.items() if resume != "None"]
+    assert len(cut) == 1
+    assert resumed[cut[0]] == str(sweep.directory / cut[0] / "checkpoints" / "last.ckpt")
+    outcomes = [s.get("outcome") for s in Run(sweep.directory / cut[0]).sessions()]
+    assert outcomes == ["interrupted", "done"]
+
+
+def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
+    def bad(config, directory, notes):
+        if config["seed"] == 1:
+            raise InputError("step 3: expected finite losses; found nan")
+        return noting(config, directory, notes)
+
+    monkeypatch.setattr(train_verb, "train", bad)
+    code, out, err = sweep("seed=1,2")
+    assert code == 1
+    assert "expected finite losses" in err
+    assert "2 runs: 1 done, 1 failed" in out
+    assert len(executed(sweep.directory)) == 1
+
+
+def test_an_impossible_job_fails_before_any_is_launched(sweep):
+    code, _, err = sweep("seed=1,-2")
+    assert code == 1
+    assert "seed: expected an integer from 0" in err
+    code, _, err = sweep("seed=1,2", "trainer=ddp_cpu", "dry_run=true")
+    assert code == 1
+    assert "trainer.devices: expected 1 in a sweep whose jobs share a process; found 2" in err
+    assert not executed(sweep.directory)
+
+
+def test_results_that_are_not_whole_are_no_results(tmp_path):
+    run = Run(tmp_path / "run")
+    assert run.state == State.MISSING
+    run.directory.mkdir()
+    (run.directory / "metrics.json").write_text('{"format_version": 1, "summ')
+    assert run.state == State.MISSING
+    finish(run.directory, {"seed": 1})
+    assert run.state == State.DONE
+    assert run.metric == 20.0
+
+
+def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
+    run = Run(tmp_path)
+    with run.session():
+        pass
+    with open(tmp_path / "sessions.jsonl", "a") as file:
+        file.write('{"started": "2026-')
+    with run.session(resumed="x") as notes:
+        notes["steps"] = 3
+    first, second = run.sessions()
+    assert first["outcome"] == second["outcome"] == "done"
+    assert (second["resumed"], second["steps"]) == ("x", 3)
+
+
+def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
+    ready = SPAWN.Event()
+    holder = SPAWN.Process(target=hold, args=(tmp_path, ready))
+    holder.start()
+    assert ready.wait(30)
+    run = Run(tmp_path)
+    assert run.state == State.RUNNING
+    assert str(holder.pid) in run.owner
+    with run.claim() as mine:
+        assert not mine
+    os.kill(holder.pid, signal.SIGKILL)
+    with run.claim(wait=True) as mine:
+        assert mine
+        assert run.state == State.RUNNING
+        with Run(tmp_path).claim() as again:
+            assert not again
+        child = os.fork()
+        if child == 0:  # such as a worker that reads data, left over after a kill
+            time.sleep(30)
+            os._exit(0)
+    try:
+        assert run.state == State.MISSING
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    holder.join()
+
+
+def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
+    count, barrier = 8, SPAWN.Barrier(2)
+    processes = [SPAWN.Process(target=work_through, args=(tmp_path, count, barrier)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    assert sorted(executed(tmp_path)) == sorted(item.name for item in planned_by_hand(tmp_path, count))
+    assert [p.read_text() for p in tmp_path.glob("seen_*")] == ["8", "8"]
+    pids = {line.split()[1] for line in (tmp_path / "executed").read_text().splitlines()}
+    assert len(pids) == 2
+
+
+def test_a_sweep_comes_back_to_what_others_worked_on(tmp_path):
+    items, launched = planned_by_hand(tmp_path, 2), []
+
+    def launch(jobs, first):
+        launched.append([overrides[0] for overrides in jobs])
+        values = [job.BUSY if len(launched) == 1 and name == "0" else 20.0 for (name,) in jobs]
+        return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
+
+    assert [result.return_value for result in carry_out(items, launch)] == [20.0, 20.0]
+    assert launched == [["0", "1"], ["0"]]
+
+
+def test_a_directory_of_a_single_run_is_not_shared_either(tmp_path):
+    ready = SPAWN.Event()
+    holder = SPAWN.Process(target=hold, args=(tmp_path, ready))
+    holder.start()
+    try:
+        assert ready.wait(30)
+        with pytest.raises(InputError, match=f"that no process works in; found process {holder.pid} on"):
+            job.work_on(Run(tmp_path), {"resume": None}, noting)
+    finally:
+        holder.kill()
+        holder.join()
+
+
+def test_the_command_line_replaces_a_sweeps_own_values():
+    own = {"seed": "1,2,3", "views": "v4"}
+    assert combinations(own, ["seed=7", "model=hull"]) == [["views=v4", "seed=7", "model=hull"]]
+    assert len(combinations(own, ["ablation=full,neither"])) == 6
+
+
+@pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
+def test_time_budgets(value, seconds):
+    assert plan.time_budget({"trainer": {"max_time": value}}) == seconds
+
+
+def test_a_bad_time_budget_names_its_key():
+    with pytest.raises(InputError, match=r"trainer\.max_time: expected days:hours:minutes:seconds"):
+        plan.time_budget({"trainer": {"max_time": "10 minutes"}})
+
+
+def composed(*overrides: str):
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return compose("train", overrides=list(overrides), return_hydra_config=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "data"),
+    [
+        ("table1", 6, "zju_mocap"),
+        ("table2", 9, "thuman2"),
+        ("table3", 3, "thuman2"),
+        ("table4", 12, "thuman2"),
+    ],
+)
+def test_named_sweeps(name, count, data):
+    cfg = composed(f"sweep={name}")
+    assert cfg.hydra.mode.name == "MULTIRUN"
+    assert cfg.data.name == data
+    assert cfg.model.name == "paper"
+    assert len(combinations(cfg.hydra.sweeper.params, [f"sweep={name}"])) == count
+
+
+def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
+    there = f"hydra.sweep.dir={tmp_path}"
+    code, out, _ = call(monkeypatch, capsys, "train", "sweep=table4", "seed=1", "dry_run=true", there)
+    assert code == 0
+    assert "4 runs: 4 missing; nothing was run" in out
+
+
+def test_tables_share_runs_and_take_other_data(sweep):
+    def names(*overrides):
+        code, out, err = sweep("dry_run=true", "seed=1", *overrides)
+        assert code == 0, err
+        return {word for word in out.split() if len(word) == 12 and set(word) <= set("0123456789abcdef")}
+
+    table2, table4 = names("sweep=table2"), names("sweep=table4")
+    assert (len(table2), len(table4), len(table2 & table4)) == (3, 4, 1)
+    small = names("sweep=table4", "data=synthetic", "encoder=vggt_nano", "trainer=cpu")
+    assert len(small) == 4
+    assert not small & table4
+
+
+def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tmp_path):
+    """Lightning starts the command line again for its other processes: it must be this job's."""
+    started = {}
+    finish(tmp_path, {"seed": 1}, 31.0)
+
+    def fake(command, env, check):
+        started.update(command=command, env=env)
+        return type("Done", (), {"returncode": 0})
+
+    cfg = composed("trainer=ddp_cpu", "seed=5", "hydra.mode=MULTIRUN")
+    cfg.hydra.runtime.choices["hydra/launcher"] = "joblib"
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", cfg)
+    monkeypatch.setattr(job.subprocess, "run", fake)
+    assert job.needs_own_process({"trainer": {"devices": 2}})
+    assert job.work_in_own_process(Run(tmp_path)) == 31.0
+    assert started["command"][2:] == [
+        "ghgs_lit",
+        "train",
+        "trainer=ddp_cpu",
+        "seed=5",
+        f"hydra.run.dir='{tmp_path}'",
+        "hydra.mode=RUN",
+    ]
+    assert started["env"]["GHGS_SWEEP_JOB"] == "skip"
+    cfg.hydra.runtime.choices["hydra/launcher"] = "submitit_slurm"
+    assert not job.needs_own_process({"trainer": {"devices": 2}})
+
+
+def test_hash_ignores_only_what_no_number_depends_on():
+    base = {"seed": 1, "resume": None, "data": {"root": "a", "workers": 0}, "logger": {"csv": {}}}
+    same = {"seed": 1, "resume": "x", "data": {"root": "a", "workers": 4}, "logger": {}}
+    assert config_hash(base) == config_hash(same)
+    assert config_hash(base) != config_hash({**base, "data": {"root": "b", "workers": 0}})
+    assert json.loads(json.dumps(base)) == base

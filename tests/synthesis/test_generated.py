@@ -1,0 +1,135 @@
+"""DataModules from configuration, and generated people: built, cached, extended, refused."""
+
+import numpy as np
+import pytest
+
+from ghgs_lit.config import build, conf_dir
+from ghgs_lit.data.sampling import (
+    TargetProtocol,
+    subject_rng,
+)
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis import ScansDataModule, SyntheticDataModule, people
+from tests.helpers.people import RELEASE, RIG, V4, box_person, equal
+
+
+def compose(*overrides):
+    import hydra
+
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose("prepare", overrides=list(overrides))
+
+
+def built(*overrides, **extra):
+    cfg = compose(*overrides)
+    return build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed, **extra)
+
+
+@pytest.mark.parametrize("views", ["v3", "v4", "v5", "random"])
+@pytest.mark.parametrize("targets", ["release", "midway", "random"])
+def test_configuration_groups_build(views, targets, tmp_path):
+    data = built("data=scans", f"views={views}", f"targets={targets}")
+    assert data.views.name == views
+    assert data.targets.name == targets
+    assert data.views.evaluation_count == {"random": 4}.get(
+        views, int(views[-1]) if views[-1].isdigit() else 0
+    )
+    # Evaluating another protocol by its name gives what its file says.
+    by_name = TargetProtocol(targets)
+    assert (data.targets.kind, data.targets.vid, data.targets.per_subject) == (
+        by_name.kind,
+        by_name.vid,
+        by_name.per_subject,
+    )
+    synthetic = built(f"views={views}", f"targets={targets}", cache_dir=str(tmp_path))
+    assert isinstance(synthetic, SyntheticDataModule)
+
+
+def test_configuration_of_the_rig_is_the_rigs_default():
+    data = built("data=scans")
+    assert isinstance(data, ScansDataModule)
+    assert data.rig == RIG
+    assert data.render == type(data.render)()
+    with pytest.raises(InputError, match=r"data\.rig key: expected one of .*; found 'raduis'"):
+        built("data=scans", "+data.rig.raduis=3")
+    with pytest.raises(InputError, match=r"data\.render\.lights key"):
+        built("data=scans", "+data.render.lights.colour=3")
+
+
+def synthetic(tmp_path, **changes) -> SyntheticDataModule:
+    arguments = {
+        "people": {"train": 2, "val": 1},
+        "views": V4,
+        "targets": RELEASE,
+        "size": 28,
+        "render": {"size": 28, "samples": 1},
+        "cache_dir": str(tmp_path),
+        "render_workers": 0,
+    }
+    return SyntheticDataModule(**(arguments | changes))
+
+
+@pytest.fixture
+def generated(monkeypatch):
+    """Boxes in place of people; the list of what was made."""
+    made = []
+
+    def generate(seed, index):
+        made.append((seed, index))
+        rng = np.random.default_rng([seed, index])
+        return box_person(f"p{index}", rng.integers(60, 255, 3), (0.5, rng.uniform(1.5, 1.9), 0.3))
+
+    monkeypatch.setattr(people, "generate", generate, raising=False)
+    return made
+
+
+def test_generated_people_are_rendered_once_and_extended(tmp_path, generated):
+    data = synthetic(tmp_path)
+    with pytest.raises(InputError, match="expected the folder of the data set; found no such folder"):
+        data.train_dataloader()
+    data.prepare_data()
+    assert generated == [(0, 0), (0, 1), (0, 1_000_000)]
+    first = data.training_batch(0)
+    assert data.val_dataloader().dataset[0].subjects == ("p1000000",)
+    again = synthetic(tmp_path)
+    again.prepare_data()
+    assert len(generated) == 3
+    assert equal(first, again.training_batch(0))
+    more = synthetic(tmp_path, people={"train": 3, "val": 1})
+    more.prepare_data()
+    assert generated[3:] == [(0, 2)]
+    assert more.root == data.root
+    assert len(more.subjects("train")) == 3
+    assert len(synthetic(tmp_path).subjects("train")) == 2
+
+
+def test_the_cache_is_named_after_every_setting(tmp_path):
+    roots = [
+        synthetic(tmp_path, **changes).root
+        for changes in (
+            {},
+            {"people_seed": 1},
+            {"render": {"size": 42, "samples": 1}},
+            {"render": {"size": 28, "samples": 2}},
+            {"render": {"size": 28, "samples": 1, "lights": {"ambient": 0.4}}},
+            {"rig": {"height": None}},
+            {"rig": {"pitch": -9.0}},
+        )
+    ]
+    assert len(set(roots)) == len(roots)
+    assert synthetic(tmp_path, seed=5, size=14, people={"train": 9, "val": 3}).root == roots[0]
+
+
+def test_generated_people_must_have_the_views_that_are_asked_for(tmp_path):
+    with pytest.raises(
+        InputError, match=r"data\.render\.vids: expected \[0, 2, 3, 4\] for targets=release; found \[0\]"
+    ):
+        synthetic(tmp_path, render={"size": 28, "vids": [0]})
+    with pytest.raises(InputError, match=r"data\.people\.val: expected at least 1; found 0"):
+        synthetic(tmp_path, people={"train": 2})
+
+
+def test_rig_draws_do_not_depend_on_other_subjects():
+    a, b = RIG.yaws(subject_rng(0, "a")), RIG.yaws(subject_rng(0, "b"))
+    assert not np.allclose(a, b)
+    np.testing.assert_array_equal(a, RIG.yaws(subject_rng(0, "a")))

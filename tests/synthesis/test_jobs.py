@@ -1,0 +1,227 @@
+"""Rendering jobs: killed half-way, started twice, in several processes, with other settings."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ghgs_lit.data.layout import Layout
+from ghgs_lit.errors import InputError
+from ghgs_lit.synthesis.jobs import render_people
+from ghgs_lit.synthesis.scans import ScanSource
+from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
+
+SMALL = replace(TINY, positions=(0, 4, 8), vids=(0, 3))
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Every data file below ``root``."""
+    files = (p for phase in ("train", "val") for p in (root / phase).rglob("*") if p.is_file())
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in files}
+
+
+@dataclass(frozen=True)
+class Counting:
+    """A source that notes in ``log`` whom it loads, and fails on request."""
+
+    source: ScanSource
+    log: Path
+    fail: str = ""
+
+    def load(self, name):
+        with open(self.log, "a") as file:
+            file.write(f"{name}\n")
+        if name == self.fail:
+            raise InputError(f"{name}: expected a person; found a test")
+        return self.source.load(name)
+
+    def facing(self, name):
+        return 0.0
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scans")
+    for i in range(4):
+        write_obj_scan(folder, f"s{i}", color=(40 * i + 40, 90, 200 - 40 * i))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def reference(scans, tmp_path_factory):
+    root = tmp_path_factory.mktemp("reference") / "out"
+    render_boxes(root, scans, 3, 1, settings=SMALL)
+    return contents(root)
+
+
+def render_and_die(root: Path, scans: Path, moves: int) -> None:
+    """Render until ``moves`` folders or files were moved, then vanish as ``kill -9`` makes one vanish."""
+    count, replace_file = [0], os.replace
+
+    def dying(*paths):
+        count[0] += 1
+        if count[0] > moves:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace_file(*paths)
+
+    os.replace = dying
+    render_boxes(root, scans, 3, 1, settings=SMALL)
+
+
+def test_a_killed_run_leaves_nothing_that_looks_whole_and_goes_on(scans, reference, tmp_path):
+    """Killed in the middle of moving the second subject to its place."""
+    root = tmp_path / "out"
+    process = SPAWN.Process(target=render_and_die, args=(root, scans, 25))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert list(Layout(root, "train", names=["s0"]).subjects) == ["s0"]
+    half = {p.name for p in (root / "train").glob("*/s1_*")}
+    assert half  # some of the second subject did arrive
+    for names in (None, ["s1"]):
+        with pytest.raises(InputError, match=r"\(s1 is missing or half-rendered: render again to finish\)"):
+            Layout(root, "train", names=names)
+    log = tmp_path / "log"
+    source = Counting(ScanSource(scans), log)
+    names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
+    assert render_people(root, names, source, RIG, SMALL, 0, workers=0) == 3
+    assert log.read_text().split() == ["s1", "s2", "s3"]
+    assert contents(root) == reference
+    assert not (root / "rendering" / "tmp").exists()
+    assert render_people(root, names, source, RIG, SMALL, 0, workers=0) == 0
+
+
+def render_at_once(barrier, root: Path, scans: Path, log: Path) -> None:
+    barrier.wait()
+    names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
+    render_people(root, names, Counting(ScanSource(scans), log), RIG, SMALL, 0, workers=0)
+
+
+def test_two_processes_at_once_share_the_work(scans, reference, tmp_path):
+    barrier, root, log = SPAWN.Barrier(2), tmp_path / "out", tmp_path / "log"
+    processes = [SPAWN.Process(target=render_at_once, args=(barrier, root, scans, log)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    assert sorted(log.read_text().split()) == ["s0", "s1", "s2", "s3"]  # each rendered once
+    assert contents(root) == reference
+
+
+@dataclass(frozen=True)
+class Stuck:
+    """A source that notes which process loads, and takes its time."""
+
+    source: ScanSource
+    log: Path
+
+    def load(self, name):
+        with open(self.log, "a") as file:
+            file.write(f"{os.getpid()}\n")
+        time.sleep(60)
+        return self.source.load(name)
+
+    def facing(self, name):
+        return 0.0
+
+
+def render_stuck(root: Path, scans: Path, log: Path) -> None:
+    names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
+    render_people(root, names, Stuck(ScanSource(scans), log), RIG, SMALL, 0, workers=2)
+
+
+def lives(pid: int) -> bool:
+    """Whether a process runs; one that waits to be buried does not."""
+    state = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
+    return state.strip()[:1] not in ("", "Z")
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(scans, tmp_path, signal_number):
+    log = tmp_path / "log"
+    process = SPAWN.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
+    process.start()
+    limit = time.monotonic() + 60
+    while not (log.exists() and len(log.read_text().split()) == 2) and time.monotonic() < limit:
+        time.sleep(0.05)
+    workers = [int(pid) for pid in log.read_text().split()]
+    assert all(map(lives, workers))
+    os.kill(process.pid, signal_number)
+    process.join()
+    while any(map(lives, workers)) and time.monotonic() < limit:
+        time.sleep(0.05)
+    assert not any(map(lives, workers))
+
+
+def test_several_workers_make_the_same_files(scans, reference, tmp_path):
+    render_boxes(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
+    assert contents(tmp_path / "out") == reference
+
+
+def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp_path):
+    root = tmp_path / "out"
+    names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
+    source = Counting(ScanSource(scans), tmp_path / "log", fail="s1")
+    with pytest.raises(InputError, match="s1: expected a person; found a test"):
+        render_people(root, names, source, RIG, SMALL, 0, workers=0)
+    assert not list((root / "rendering").glob("tmp/*"))
+    assert render_people(root, names, ScanSource(scans), RIG, SMALL, 0, workers=0) == 3
+    assert contents(root) == reference
+
+
+def test_other_settings_and_other_folders_are_refused(scans, tmp_path):
+    root = tmp_path / "out"
+    render_boxes(root, scans, 1, 0, settings=SMALL)
+    before = contents(root)
+    with pytest.raises(
+        InputError,
+        match=r"settings\.json: expected render\.quality = 90; found 98 .render into another folder",
+    ):
+        render_boxes(root, scans, 2, 0, settings=replace(SMALL, quality=90))
+    with pytest.raises(InputError, match=r"settings\.json: expected seed = 1; found 0"):
+        render_boxes(root, scans, 2, 0, settings=SMALL, seed=1)
+    assert contents(root) == before
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    with pytest.raises(
+        InputError, match="expected an empty folder or one rendered here before; found other files"
+    ):
+        render_boxes(tmp_path / "mine", scans, 1, 0, settings=SMALL)
+    assert sorted(p.name for p in (tmp_path / "mine").iterdir()) == ["thesis.txt"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size": 0}, r"data\.render\.size: expected a side or"),
+        ({"samples": 0}, r"data\.render\.samples: expected between 1 and 16; found 0"),
+        ({"vids": (0, 9)}, r"data\.render\.vids: expected some of"),
+        ({"quality": 0}, r"data\.render\.quality"),
+    ],
+)
+def test_impossible_settings_fail_at_once(changes, message):
+    with pytest.raises(InputError, match=message):
+        replace(TINY, **changes)
+
+
+def test_positions_beyond_the_ring_are_refused(scans, tmp_path):
+    with pytest.raises(InputError, match=r"data\.render\.positions: expected some of 0 to 15"):
+        render_boxes(tmp_path / "out", scans, 1, 0, settings=replace(TINY, positions=(0, 16)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_portrait_photographs(scans, tmp_path):
+    render_boxes(tmp_path / "out", scans, 1, 0, settings=replace(SMALL, size=(56, 28)))
+    view = Layout(tmp_path / "out", "train").view("s0", 0, 0)
+    assert view.image.shape == (56, 28, 3)
+    assert view.intrinsics[0, 0] == pytest.approx(0.8 * 56)
+    columns = np.flatnonzero(view.mask.any(0))
+    assert abs((columns[0] + columns[-1] + 1) / 2 - 14) < 3

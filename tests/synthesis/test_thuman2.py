@@ -1,0 +1,315 @@
+"""THuman2.0 on miniatures in its true layout: one test for each quirk that a loader can get wrong."""
+
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ghgs_lit.config import build
+from ghgs_lit.data.layout import Layout
+from ghgs_lit.data.overlap import overlap
+from ghgs_lit.data.sampling import subject_rng
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.synthesis import THuman2DataModule, people
+from ghgs_lit.synthesis.miniatures import thuman2 as miniature
+from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.synthesis.photograph import Lights, Studio
+from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.synthesis.scans import read_split
+from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
+from ghgs_lit.types import Cameras
+from tests.helpers.people import V4
+
+SIZE = 96
+COUNT = {"train": 1, "val": 1}
+RELEASE = {"name": "release", "training_vids": [2, 3, 4]}
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Renders as the published scripts make them: one person a phase, all 16 x 5 views."""
+    return miniature.make(tmp_path_factory.mktemp("thuman2"), COUNT, SIZE, 0)
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    return miniature.make_raw(tmp_path_factory.mktemp("raw") / "THuman2.0_Release", COUNT, 64, 0)
+
+
+def module(root=None, **changes) -> THuman2DataModule:
+    arguments = {"root": root, "views": V4, "targets": RELEASE, "size": SIZE, "name": "thuman2"}
+    return THuman2DataModule(**(arguments | {"pixel_centers": "auto"} | changes))
+
+
+def seen_by(view, scan=None) -> np.ndarray:
+    """The mask of the miniature's person 0000 from the camera that was read."""
+    rng = subject_rng(0, "0000")
+    scan = miniature._scan("0000", 0)
+    person = Rig().place(Person("0000", (scan.mesh,), None), rng)
+    height, width = view.mask.shape
+    cameras = Cameras(
+        torch.from_numpy(view.intrinsics)[None], torch.from_numpy(view.extrinsics)[None], height, width
+    )
+    return Studio(person, Lights().draw(rng), samples=2).shoot(cameras).masks[0]
+
+
+def test_published_renders_have_integer_pixel_centres(rendered):
+    """The person seen from the camera that was read covers exactly the mask; half a pixel off it does not."""
+    view = module(rendered).reader("train", None).view("0000", 2, 3)
+    np.testing.assert_array_equal(seen_by(view), view.mask)
+    ignored = module(rendered, pixel_centers="half").reader("train", None).view("0000", 2, 3)
+    assert (seen_by(ignored) != ignored.mask).sum() > 20
+
+
+def test_own_renders_have_half_pixel_centres(raw, tmp_path):
+    data = module(str(tmp_path), source=str(raw), limit={"val": 1, "train": 1}, render_workers=0)
+    data.render = type(data.render)(size=48, samples=1, vids=(0, 3), positions=(0, 1, 2, 3))
+    data.render_scans()
+    K = data.reader("train", None).view("0000", 0, 0).intrinsics
+    np.testing.assert_allclose(K[:2, 2], [24, 24 + 48 * 25 / 1024], atol=1e-5)
+
+
+def test_the_principal_point_is_25_pixels_of_1024_below_the_middle_and_resizes(rendered):
+    K = module(rendered).reader("train", None).view("0000", 0, 0).intrinsics
+    np.testing.assert_allclose([K[0, 0], K[1, 1]], 0.8 * SIZE, rtol=1e-6)
+    np.testing.assert_allclose(K[:2, 2] - 0.5, [SIZE / 2, SIZE / 2 + SIZE * 25 / 1024], atol=1e-5)
+    half = module(rendered).reader("train", (SIZE // 2, SIZE // 2)).view("0000", 0, 0).intrinsics
+    np.testing.assert_allclose(half[:2], K[:2] / 2, rtol=1e-6)
+
+
+def test_depth_is_inverse_and_scaled_by_2_to_the_15(rendered):
+    reader = module(rendered).reader("train", None)
+    view, body = reader.view("0000", 5, 0), reader.body("0000")
+    height, width = view.mask.shape
+    cameras = Cameras(torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width)
+    points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask]
+    low, high = body.min(0) - 0.1, body.max(0) + 0.1
+    assert ((points > low) & (points < high)).all(-1).mean() > 0.99
+    assert np.median(np.linalg.norm(points[:, None] - body[None, ::20], axis=-1).min(1)) < 0.08
+
+
+def test_every_view_sees_the_body_in_its_mask(rendered):
+    for phase in ("train", "val"):
+        reader = module(rendered).reader(phase, None)
+        fits = [
+            overlap(reader.body(name), reader.view(name, pid, vid))
+            for name, pids in reader.subjects.items()
+            for pid in pids
+            for vid in reader.vids(name, pid)
+        ]
+        assert len(fits) == 80
+        assert min(fit.iou for fit in fits) > 0.75
+        assert min(fit.inside for fit in fits) > 0.99
+
+
+def test_views_between_ring_cameras(rendered):
+    """16 cameras 22.5 degrees apart; vid 1 is the next one, 3 the exact middle, 2 and 4 in the halves."""
+    reader = module(rendered).reader("train", None)
+    yaw = {}
+    for pid in range(16):
+        for vid in range(5):
+            E = reader.view("0000", pid, vid).extrinsics.astype(np.float64)
+            center = -E[:3, :3].T @ E[:3, 3]
+            yaw[pid, vid] = np.degrees(np.arctan2(center[0], center[2]))
+            assert np.linalg.norm(center - [0, 0.85, 0]) == pytest.approx(2, abs=1e-4)
+            assert center[1] == pytest.approx(0.85 + 2 * np.sin(np.radians(8)), abs=1e-4)
+    for pid in range(16):
+        turn = [(yaw[pid, vid] - yaw[pid, 0]) % 360 for vid in range(5)]
+        assert turn[1] == pytest.approx(22.5, abs=0.01)
+        assert turn[3] == pytest.approx(11.25, abs=0.01)
+        assert turn[2] < 11.25 < turn[4] < 22.5
+        assert (yaw[(pid + 1) % 16, 0] - yaw[pid, 1]) % 360 == pytest.approx(0, abs=0.01) or (
+            yaw[(pid + 1) % 16, 0] - yaw[pid, 1]
+        ) % 360 == pytest.approx(360, abs=0.01)
+
+
+def test_files_are_of_the_published_types(rendered):
+    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` is no view."""
+    train = rendered / "train"
+    mask = np.asarray(Image.open(train / "mask/0000_004/2.png"))
+    assert mask.shape == (SIZE, SIZE, 3)
+    assert set(np.unique(mask)) == {0, 255}
+    assert np.asarray(Image.open(train / "depth/0000_004/2.png")).dtype == np.uint16
+    assert np.load(train / "parm/0000_004/2_extrinsic.npy").shape == (3, 4)
+    assert Image.open(train / "img/0000_004/2_hr.jpg").size == (2 * SIZE, 2 * SIZE)
+    assert module(rendered).reader("train", None).vids("0000", 4) == [0, 1, 2, 3, 4]
+
+
+def test_the_first_camera_faces_the_person(raw):
+    """global_orient of the fit turns the ring: a person that looks elsewhere is still seen from the front."""
+    source = THuman2Source(raw, find_fits(raw, None))
+    for name in ("0000", "0426"):
+        scan = miniature._scan(name, 0)
+        assert (source.facing(name) - np.degrees(scan.yaw)) % 360 == pytest.approx(0, abs=1e-3) or (
+            source.facing(name) - np.degrees(scan.yaw)
+        ) % 360 == pytest.approx(360, abs=1e-3)
+    front = people.generate(0, 0).body_vertices
+    person = source.load("0000")
+    turn = np.radians(source.facing("0000"))
+    back = np.array([[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]])
+    turned = person.body_vertices @ back.T
+    ratio = np.ptp(turned, axis=0) / np.ptp(front, axis=0)
+    np.testing.assert_allclose(ratio, ratio[1], rtol=1e-3)
+
+
+def test_scale_comes_before_translation(raw):
+    """The body of the model times scale plus translation is the mesh that lies in the scan."""
+    source = THuman2Source(raw, find_fits(raw, None))
+    fit = read_fit(source.fit("0000") / "smplx_param.pkl")
+    turn = np.radians(fit.facing)
+    rotation = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    posed = people.generate(0, 0).body_vertices @ rotation.T
+    np.testing.assert_allclose(fit.to_scan(posed), source.body("0000"), atol=1e-5)
+    assert np.abs((posed + fit.translation) * fit.scale - source.body("0000")).max() > 0.02
+
+
+def test_bodies_are_computed_where_the_licensed_model_is(raw, monkeypatch, tmp_path):
+    """smplx(...) * scale + translation; without the package or the files one line says so."""
+    from ghgs_lit.synthesis import thuman2_scans
+
+    source = THuman2Source(raw, find_fits(raw, None), tmp_path)
+    fit = read_fit(source.fit("0000") / "smplx_param.pkl")
+    posed = (source_body := THuman2Source(raw, source.fits).body("0000")) - fit.translation
+    monkeypatch.setattr(thuman2_scans, "smplx_vertices", lambda folder, parameters: posed / fit.scale)
+    np.testing.assert_allclose(source.body("0000"), source_body, atol=1e-9)
+    monkeypatch.undo()
+    with pytest.raises(
+        InputError, match=r"data\.body_model: expected the package smplx|expected .*SMPLX_MALE"
+    ):
+        THuman2Source(raw, source.fits, tmp_path).body("0000")
+
+
+@pytest.mark.parametrize("name", ["THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "smplx_2", "smplx"])
+def test_folders_of_fits_go_by_several_names(raw, tmp_path, name):
+    beside, inside = tmp_path / "a" / "scans", tmp_path / "b" / "scans"
+    for scans, fits in ((beside, beside.parent / name), (inside, inside / name)):
+        shutil.copytree(raw / "0000", scans / "0000")
+        shutil.copytree(raw.parent / "THuman2.0_smplx" / "0000", fits / "0000")
+        assert find_fits(scans, None) == fits
+        source = THuman2Source(scans, find_fits(scans, None))
+        assert source.names() == ["0000"]
+        assert len(source.body("0000")) == 13380
+    shutil.move(beside.parent / name / "0000" / "smplx_param.pkl", beside / "0000")
+    shutil.move(beside.parent / name / "0000" / "mesh_smplx.obj", beside / "0000")
+    shutil.rmtree(beside.parent / name)
+    assert len(THuman2Source(beside, find_fits(beside, None)).body("0000")) == 13380
+
+
+def test_scans_without_fits_have_no_body(raw, tmp_path):
+    shutil.copytree(raw / "0000", tmp_path / "0000")
+    source = THuman2Source(tmp_path, find_fits(tmp_path, None))
+    assert source.load("0000").body_vertices is None
+    assert source.facing("0000") == 0
+
+
+def test_fits_of_smpl_call_the_translation_transl(raw, tmp_path):
+    path = raw.parent / "THuman2.0_smplx" / "0000" / "smplx_param.pkl"
+    content = pickle.loads(path.read_bytes())  # our own file
+    assert type(content["translation"]).__name__ == "TrackedArray"
+    assert {k: v.shape for k, v in content.items() if k != "scale"} == {
+        **{k: (1, n) for k, n in miniature.POSE_SIZES.items()},
+        "global_orient": (1, 3),
+        "translation": (3,),
+    }
+    content["transl"] = content.pop("translation")
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
+    np.testing.assert_array_equal(read_fit(tmp_path / "a.pkl").translation, read_fit(path).translation)
+
+
+def test_ghgs_transform_is_applied_to_its_bodies(rendered, raw, tmp_path):
+    """GHG scales by the scan's height, puts its feet on 0 and shifts it; bodies stay beside the raw scans."""
+    root, scans = tmp_path / "root", tmp_path / "raw" / "THuman2.0_Release"
+    shutil.copytree(rendered, root)
+    shutil.copytree(raw.parent, scans.parent)
+    expected = Layout(root, "train").body("0000")
+    shutil.rmtree(root / "train" / "smpl")
+    part = THuman2Source(scans, find_fits(scans, None)).load("0000").parts[0]
+    low, high = part.vertices.min(0).astype(float), part.vertices.max(0).astype(float)
+    tall = 1.8 + Rig().height_jitter * subject_rng(0, "0000").uniform(-1, 1)
+    scale = tall / (high[1] - low[1])
+    shift = -(low + high) / 2 * scale  # the miniature's person stands in the middle of the ring
+    transform = {
+        "vy_max": high[1],
+        "vy_min": low[1],
+        "human_height": np.array([tall]),
+        "offset": low[1] * scale,
+        "move_delta_axis_0": np.array([shift[0]]),
+        "move_delta_axis_2": np.array([shift[2]]),
+    }
+    np.save(scans / "0000" / "0000_transform.npy", transform)
+    body = module(root, source=str(scans)).reader("train", None).body("0000")
+    np.testing.assert_allclose(body, expected, atol=2e-4)
+    assert module(root).reader("train", None).body("0000") is None
+    del transform["offset"]
+    np.save(scans / "0000" / "0000_transform.npy", transform)
+    with pytest.raises(
+        InputError, match=r"0000_transform\.npy: expected a dictionary with 'offset'; found none"
+    ):
+        ghg_body(scans / "0000" / "0000_transform.npy", expected)
+
+
+def test_a_split_need_not_be_that_of_the_folders(rendered, tmp_path):
+    assert module(rendered).subjects("val") == {"0426": tuple(range(16))}
+    swapped = module(rendered, split={"train": ["0426"], "val": ["0000-0400"]})
+    assert list(swapped.subjects("train")) == ["0426"]
+    assert list(swapped.subjects("val")) == ["0000"]
+    assert swapped.training_batch(0).subjects == ("0426",)
+    (tmp_path / "split_train.txt").write_text("0426\n")
+    (tmp_path / "split_val.txt").write_text("0000\n")
+    assert list(module(rendered, split=str(tmp_path)).subjects("val")) == ["0000"]
+
+
+def test_ranges_of_ids():
+    names = [f"{i:04d}" for i in range(0, 526, 25)]
+    split = read_split({"train": ["0000-0425"], "val": ["0426-0525"]}, names)
+    assert (len(split["train"]), len(split["val"])) == (18, 4)
+    with pytest.raises(
+        InputError, match=r"data\.split: expected disjoint train and val; found '0025' in both"
+    ):
+        read_split({"train": ["0000-0025"], "val": ["0025"]}, names)
+    with pytest.raises(InputError, match=r"data\.split: expected a list 'val'"):
+        read_split({"train": ["0000"]}, names)
+
+
+def composed(name, root, *overrides):
+    import hydra
+
+    from ghgs_lit.config import conf_dir
+
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        cfg = hydra.compose(
+            "train", [f"experiment={name}", f"data.root={root}", "data.workers=0", *overrides]
+        )
+    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed), cfg
+
+
+@pytest.mark.parametrize(
+    ("experiment", "size", "inputs", "targets"),
+    [
+        ("thuman2", 512, ["000/0", "004/0", "008/0", "012/0"], ["000/3"]),
+        ("thuman2_ghg", 1024, ["000/0", "006/0", "011/0"], ["003/0", "008/0", "013/0"]),
+        ("thuman2_rogsplat", 512, ["000/0", "004/0", "008/0", "012/0"], [f"{p:03d}/3" for p in range(16)]),
+    ],
+)
+def test_named_protocols(rendered, experiment, size, inputs, targets):
+    data, cfg = composed(experiment, rendered, "data.depths=false")
+    assert data.size == (size, size)
+    assert list(cfg.evaluation.targets) == [data.targets.name]
+    batch = next(iter(data.evaluation_loader(targets=data.targets.name)))
+    assert list(batch.views[0]) == inputs
+    assert list(batch.targets.names[0]) == targets
+    assert batch.images.shape[-2:] == (size, size)
+    assert batch.depths is None
+    training = data.training_batch(0)
+    assert {name[-1] for name in training.targets.names[0]} <= {"2", "3", "4"}
+    assert len(training.targets.names[0]) == (3 if experiment == "thuman2_ghg" else 1)
+
+
+@pytest.mark.parametrize(("views", "inputs"), [(3, [0, 5, 10]), (4, [0, 4, 8, 12]), (5, [0, 3, 6, 9, 12])])
+def test_three_to_five_views(rendered, views, inputs):
+    batch = next(iter(module(rendered).evaluation_loader(views)))
+    assert list(batch.views[0]) == [f"{pid:03d}/0" for pid in inputs]

@@ -1,0 +1,218 @@
+"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that go on."""
+
+import csv
+import importlib.util
+
+import lightning.pytorch as L
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import plugin_data_pb2
+
+from ghgs_lit.config import build
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import Losses
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.callbacks import Memory, StepTime, resident_mb
+from ghgs_lit.training.clock import PARTS, StepClock
+from ghgs_lit.training.loggers import (
+    CsvLog,
+    TensorBoardLog,
+    final_numbers,
+    go_on,
+    hyperparameters,
+    log_hyperparameters,
+    log_results,
+)
+from ghgs_lit.training.validation_pictures import Attention, Pictures, PointClouds
+from tests.helpers.training import Standin, StepData, flat_renderer
+
+
+def events(folder) -> EventAccumulator:
+    found = EventAccumulator(str(folder), size_guidance={"images": 0, "tensors": 0, "scalars": 0})
+    return found.Reload()
+
+
+def hparams(folder, tag) -> plugin_data_pb2.HParamsPluginData:
+    content = events(folder).SummaryMetadata(tag).plugin_data.content
+    return plugin_data_pb2.HParamsPluginData.FromString(content)
+
+
+def loggers(folder):
+    return [
+        TensorBoardLog(folder, name="tensorboard", version=""),
+        CsvLog(folder, name="csv", version="", flush_logs_every_n_steps=1),
+    ]
+
+
+class Staged(Standin):
+    """A stand-in with some stages to time."""
+
+    def __init__(self):
+        super().__init__()
+        self.encoder, self.depth_head = torch.nn.Identity(), torch.nn.Identity()
+
+    def forward(self, batch):
+        self.encoder(batch.images)
+        self.depth_head(batch.images)
+        return super().forward(batch)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    subject = GHGSModule(
+        Staged(),
+        flat_renderer,
+        Losses({"render_l1": 0.8, "chamfer": 1.0}),
+        Optimization(lr=0.05),
+        {"seed": 1},
+    )
+    trainer = L.Trainer(
+        accelerator="cpu", max_steps=8, max_epochs=-1, default_root_dir=folder, logger=loggers(folder),
+        callbacks=[StepTime(), Memory(), Pictures(1), Attention(1), PointClouds(1)],
+        enable_checkpointing=False, enable_model_summary=False, enable_progress_bar=False,
+        num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=2,
+    )  # fmt: skip
+    log_hyperparameters(trainer.loggers, {"ablation": "full", "seed": 1, "lr": 0.1})
+    trainer.fit(subject, StepData())
+    log_results(trainer.loggers, [{"views": 4, "targets": "release", "psnr": 30.0, "ssim": None}], 8)
+    return folder, subject
+
+
+def test_tags_are_grouped_by_what_they_are(run):
+    tags = set(events(run[0] / "tensorboard").Tags()["scalars"])
+    stages = ("01_data", "02_interval", "03_encode", "04_depth", "07_gaussians", "08_render", "09_loss")
+    times = {f"time_ms/{part}" for part in (*stages, "10_backward", "11_optimizer", "step")}
+    assert tags == times | {
+        "loss/total", "loss/render_l1", "loss/chamfer", "memory_mb/process",
+        "train/budget", "train/gaussians", "train/gradient_norm", "train/learning_rate",
+        "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "hparam/psnr",
+    }  # fmt: skip
+
+
+def test_the_numbers_are_those_of_the_steps(run):
+    found = events(run[0] / "tensorboard")
+    rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
+    assert sorted(rates) == [1, 3, 5, 7]
+    assert rates[7] == pytest.approx(0.05 * Optimization(lr=0.05).factor(7 / 8))
+    assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
+    parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("time_ms/") and "step" not in tag]
+    for place, whole in enumerate(found.Scalars("time_ms/step")):
+        assert whole.value == pytest.approx(sum(found.Scalars(p)[place].value for p in parts), rel=1e-4)
+    assert 10 < found.Scalars("memory_mb/process")[0].value < 1e6
+
+
+def test_pictures_and_clouds(run):
+    folder, _ = run
+    found = events(folder / "tensorboard")
+    assert [e.step for e in found.Images("sheet/p0")] == [4, 8]
+    clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
+    kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
+    assert {"points", "body", "points_and_body"} <= {kind.rstrip("_") for kind in kinds}
+    vertices = found.Tensors("p0/body_VERTEX")
+    assert [e.step for e in vertices] == [4, 8]
+    assert list(vertices[0].tensor_proto.tensor_shape.dim)[1].size == 20
+
+
+def test_the_session_says_what_the_run_is_and_that_it_ended(run):
+    folder = run[0] / "tensorboard"
+    start = hparams(folder, "_hparams_/session_start_info").session_start_info
+    assert start.hparams["ablation"].string_value == "full"
+    assert start.hparams["lr"].number_value == 0.1
+    assert hparams(folder, "_hparams_/session_end_info").session_end_info.status == 1
+    assert events(folder).Scalars("hparam/psnr")[0].value == 30
+
+
+def test_nothing_of_the_clock_stays(run):
+    _, subject = run
+    assert subject.clock is None
+    assert not subject.model.encoder._forward_hooks
+    assert not subject.model.encoder._forward_pre_hooks
+
+
+def test_logs_go_on_where_the_checkpoint_was(tmp_path):
+    for logger in (first := loggers(tmp_path)):
+        for step in range(10):
+            logger.log_metrics({"a": step, **({"b": 1} if step % 2 else {})}, step)
+        logger.save()
+    with open(tmp_path / "csv" / "metrics.csv", "a") as file:
+        file.write("7")  # killed while it wrote
+    first[0].experiment.close()
+    second = loggers(tmp_path)
+    go_on(second, 6)
+    for logger in second:
+        for step in range(6, 8):
+            logger.log_metrics({"a": 100 + step, "c": 2}, step)
+        logger.save()
+    expected = [0, 1, 2, 3, 4, 5, 106, 107]
+    with open(tmp_path / "csv" / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["a"]) for row in rows] == expected
+    assert [row["b"] for row in rows] == ["", "1", "", "1", "", "1", "", ""]
+    scalars = events(tmp_path / "tensorboard").Scalars("a")
+    assert [(e.step, e.value) for e in scalars] == list(enumerate(expected))
+
+
+def test_hyperparameters_are_choices_and_changes():
+    data = {"size": 140, "people": {"train": 3}}
+    config = {"seed": 2, "data": data, "optimizer": {"lr": 0.1, "betas": [0, 1]}}
+    choices = {
+        "ablation": "full",
+        "experiment": None,
+        "hydra/output": "ghgs",
+        "logger": "csv",
+        "encoder": "s",
+    }
+    overrides = ["ablation=full", "seed=2", "+data.people.train=3", "optimizer.betas=[0,1]"]
+    overrides += ["hydra.run.dir=x", "~data.rig", "callbacks.last.every_n_train_steps=3"]
+    assert hyperparameters(config, choices, overrides) == {
+        "ablation": "full", "encoder": "s", "seed": 2, "data.people.train": 3, "optimizer.betas": "[0, 1]",
+    }  # fmt: skip
+
+
+def test_final_numbers_name_their_protocol():
+    summary = [
+        {"method": "model", "views": 4, "targets": "release", "subjects": 2, "psnr": 30, "seconds": 1.0},
+        {"method": "model", "views": 4, "targets": "midway", "subjects": 2, "psnr": 28, "lpips": None},
+    ]
+    assert final_numbers(summary) == {"hparam/psnr": 30.0, "hparam_v4_midway/psnr": 28.0}
+
+
+def test_a_clock_gives_each_span_to_the_part_that_ends_it(monkeypatch):
+    now = iter([0.0, 1.0, 3.0, 3.5, 10.0, 10.0, 11.0, 11.0, 12.0, 20.0, 20.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(now))
+    clock = StepClock(torch.device("cpu"))
+    clock.mark("render")  # before the first start: nothing to measure from
+    clock.start()
+    for part in ("data", "encode", "data"):
+        clock.mark(part)
+    clock.end()  # at 10.0
+    clock.mark("data")
+    clock.start()  # a validation: forgotten
+    clock.mark("data")
+    clock.end()
+    means = clock.means()
+    assert means == {"data": 1250.0, "encode": 1000.0, "optimizer": 7250.0, "step": 9500.0}
+    assert clock.means() == {}
+    assert list(means) == [p for p in PARTS if p in means] + ["step"]
+
+
+def test_memory_is_that_of_this_process():
+    before = resident_mb()
+    block = torch.ones(64 * 2**20 // 4)
+    assert resident_mb() - before > 40
+    assert block.sum() > 0
+
+
+def test_wandb_is_built_where_it_is_installed(tmp_path):
+    node = {"_target_": "ghgs_lit.training.loggers.WandbLog", "project": "ghgs_lit", "offline": True}
+    if importlib.util.find_spec("wandb") is None:
+        with pytest.raises(InputError, match=r"logger\.wandb.*ghgs-lit\[wandb\]"):
+            build(node, "logger.wandb", save_dir=str(tmp_path))
+    else:
+        logger = build(node, "logger.wandb", save_dir=str(tmp_path))
+        log_hyperparameters([logger], {"seed": 1})
+        log_results([logger], [{"views": 4, "targets": "release", "psnr": 30.0}], 8)
+        logger.experiment.finish()
+        assert list((tmp_path / "wandb").glob("offline-run-*"))

@@ -1,0 +1,214 @@
+"""The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
+
+from datetime import timedelta
+from types import SimpleNamespace
+
+import lightning.pytorch as L
+import pytest
+import torch
+from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.loggers import CSVLogger
+from torch.utils.data import DataLoader
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import Losses
+from ghgs_lit.training import DivergedError, GHGSModule, Optimization
+from ghgs_lit.training.callbacks import RunProgress, StepTime
+from ghgs_lit.training.checkpoints import Checkpoints
+from ghgs_lit.training.validation_pictures import Pictures
+from tests.helpers.training import Standin, example_batch, flat_renderer
+
+RELEASE = Optimization(lr=1e-4, warmup=0.01, start_factor=0.04, end_factor=5e-4)
+CONFIG = {"encoder": {"width": 3, "layers": [0, 1]}, "seed": 1, "resume": None}
+
+
+def module(renderer=flat_renderer, lr=0.05, **weights) -> GHGSModule:
+    weights = weights or {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 0.5}
+    return GHGSModule(Standin(), renderer, Losses(weights), Optimization(lr=lr, warmup=0.1), CONFIG)
+
+
+def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
+    defaults = {
+        "logger": False,
+        "enable_checkpointing": any(isinstance(c, Checkpoints) for c in callbacks),
+        "enable_progress_bar": any(isinstance(c, RunProgress) for c in callbacks),
+        "val_check_interval": 6,
+    }
+    return L.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        max_epochs=-1,
+        default_root_dir=folder,
+        callbacks=list(callbacks),
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        check_val_every_n_epoch=None,
+        **{**defaults, **options},
+    )
+
+
+def loader(count=3) -> DataLoader:
+    return DataLoader([example_batch(seed=s) for s in range(count)], batch_size=None, collate_fn=lambda b: b)
+
+
+@pytest.mark.parametrize(("step", "rate"), [(0, 4e-6), (2000, 1e-4), (100_000, 5.05e-5), (200_000, 5.0e-8)])
+def test_the_release_schedule_is_the_authors(step, rate):
+    assert RELEASE.lr * RELEASE.factor(step / 200_000) == pytest.approx(rate, rel=2e-3)
+
+
+def test_the_schedule_stays_at_its_end():
+    assert RELEASE.factor(1.5) == pytest.approx(RELEASE.end_factor)
+    assert Optimization(lr=1.0, warmup=0.0, end_factor=0.0).factor(0.0) == 1
+
+
+def test_progress_is_the_further_of_steps_and_time(monkeypatch):
+    timer = Timer(duration=timedelta(seconds=100))
+    used = {"seconds": 0.0}
+    monkeypatch.setattr(timer, "time_elapsed", lambda *_: used["seconds"])
+    subject = module()
+    subject._trainer = SimpleNamespace(global_step=30, max_steps=100, callbacks=[timer], world_size=1)
+    monkeypatch.setattr(GHGSModule, "global_step", property(lambda self: self._trainer.global_step))
+    assert subject.progress() == pytest.approx(0.3)
+    used["seconds"] = 60.0
+    assert subject.progress() == pytest.approx(0.6)
+    used["seconds"] = 500.0
+    assert subject.progress() == 1
+    subject._trainer.max_steps = -1
+    used["seconds"] = 25.0
+    assert subject.progress() == pytest.approx(0.25)
+    subject._trainer.callbacks = []
+    with pytest.raises(InputError, match=r"trainer\.max_steps"):
+        subject.progress()
+
+
+def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
+    torch.manual_seed(0)
+    subject, batch = module(), example_batch()
+    before = subject.losses(*subject(batch), batch)[0].item()
+    run = trainer(tmp_path, steps=25)
+    run.fit(subject, loader(1))
+    assert subject.losses(*subject(batch), batch)[0].item() < 0.8 * before
+    assert run.optimizers[0].param_groups[0]["lr"] == pytest.approx(0, abs=1e-12)
+    assert subject.used_budget == 1
+
+
+def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
+    last = Checkpoints(filename="last", every_n_train_steps=3)
+    best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
+    whole = module()
+    trainer(tmp_path / "a", steps=12, callbacks=[last, best]).fit(whole, loader(), loader(1))
+    files = sorted(p.name for p in (tmp_path / "a" / "checkpoints").iterdir())
+    assert files == ["best.ckpt", "last.ckpt"]
+    path = tmp_path / "a" / "checkpoints" / "last.ckpt"
+    content = torch.load(path, weights_only=True)
+    assert content["config"] == CONFIG
+    assert content["format_version"] == 1
+    assert content["global_step"] == 12
+    assert set(content["state_dict"]) == {"model.depth", "model.shift"}
+    assert "hyper_parameters" not in content
+
+    class Stop(L.Callback):
+        def on_train_batch_end(self, run, *_):
+            run.should_stop = run.global_step == 6
+
+    half = module()
+    saved = Checkpoints(filename="last", every_n_train_steps=3)
+    trainer(tmp_path / "b", steps=12, callbacks=[saved, Stop()]).fit(half, loader())
+    resumed = module()
+    half_path = tmp_path / "b" / "checkpoints" / "last.ckpt"
+    assert torch.load(half_path, weights_only=True)["global_step"] == 6
+    trainer(tmp_path / "b", steps=12).fit(resumed, loader(), ckpt_path=half_path)
+    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_loss_that_is_no_number_names_its_step_term_and_subjects(tmp_path):
+    def broken(gaussians, cameras):
+        rendering = flat_renderer(gaussians, cameras)
+        return type(rendering)(rendering.image * torch.nan, rendering.alpha, rendering.depth)
+
+    with pytest.raises(DivergedError, match=r"step 0: .* render_l1 = nan \(subjects p0, p1\)"):
+        trainer(tmp_path).fit(module(broken, render_l1=1.0, chamfer=1.0), loader())
+
+
+def test_a_gradient_that_is_no_number_names_a_parameter(tmp_path):
+    def broken(gaussians, cameras):
+        rendering = flat_renderer(gaussians, cameras)
+        zero = (rendering.image - rendering.image.detach()).abs()
+        return type(rendering)(rendering.image + zero.sqrt(), rendering.alpha, rendering.depth)
+
+    with pytest.raises(DivergedError, match=r"step 0: .*finite gradient.* first shift"):
+        trainer(tmp_path).fit(module(broken, render_l1=1.0), loader())
+
+
+def test_the_gradient_is_clipped(tmp_path):
+    subject = GHGSModule(
+        Standin(), flat_renderer, Losses({"depth": 100.0}), Optimization(lr=0.1, clip=0.5), CONFIG
+    )
+    norms = []
+
+    class Look(L.Callback):
+        def on_before_optimizer_step(self, run, pl_module, optimizer):
+            norms.append(pl_module.model.depth.grad.norm().item())
+
+    trainer(tmp_path, steps=2, callbacks=[Look()]).fit(subject, loader())
+    assert norms[0] > 0  # before clipping
+    subject.model.depth.grad = torch.tensor(7.0)
+    subject.log = lambda *_, **__: None
+    subject.configure_gradient_clipping(None)
+    assert subject.model.depth.grad.item() == pytest.approx(0.5, rel=1e-4)
+
+
+def test_held_parameters_stay_for_their_share_of_the_run(tmp_path):
+    seen = []
+
+    class Look(L.Callback):
+        def on_train_batch_end(self, run, pl_module, *_):
+            seen.append((pl_module.model.depth.item(), pl_module.model.shift.detach().clone()))
+
+    subject = module()
+    subject.optimization = Optimization(lr=0.05, weight_decay=0.1, hold={"shift": 0.5})
+    trainer(tmp_path, steps=6, callbacks=[Look()]).fit(subject, loader(1))
+    assert [bool(shift.abs().max() > 0) for _, shift in seen] == [False] * 3 + [True] * 3
+    assert seen[0][0] != seen[1][0]
+    subject.optimization = Optimization(lr=0.05, hold={"nothing": 0.5})
+    with pytest.raises(InputError, match=r"optimizer\.hold\.nothing"):
+        trainer(tmp_path, steps=6).fit(subject, loader(1))
+
+
+def test_callbacks_write_pictures_and_numbers(tmp_path):
+    run = trainer(
+        tmp_path, steps=4, callbacks=[Pictures(subjects=1), StepTime(), RunProgress()],
+        logger=CSVLogger(tmp_path, name="csv", version=""), log_every_n_steps=1, val_check_interval=2,
+    )  # fmt: skip
+    run.fit(module(), loader(), loader(2))
+    assert sorted(p.parent.name + "/" + p.name for p in (tmp_path / "pictures").rglob("*.png")) == [
+        "step_000002/p0.png",
+        "step_000004/p0.png",
+    ]
+    header = (tmp_path / "csv" / "metrics.csv").read_text().splitlines()[0].split(",")
+    expected = {
+        "loss/total",
+        "loss/render_l1",
+        "loss/chamfer",
+        "train/gradient_norm",
+        "time_ms/step",
+        "val/psnr",
+    }
+    assert expected <= set(header)
+
+
+@pytest.mark.parametrize(
+    ("values", "key"),
+    [
+        ({"lr": 0.0}, r"optimizer\.lr"),
+        ({"lr": 1.0, "betas": [0.9, 1.0]}, r"optimizer\.betas"),
+        ({"lr": 1.0, "warmup": 1.0}, r"optimizer\.warmup"),
+        ({"lr": 1.0, "clip": 0.0}, r"optimizer\.clip"),
+        ({"lr": 1.0, "end_factor": 2.0}, r"optimizer\.end_factor"),
+        ({"lr": 1.0, "hold": {"head": 2.0}}, r"optimizer\.hold\.head"),
+    ],
+)
+def test_impossible_values_name_their_key(values, key):
+    with pytest.raises(InputError, match=key):
+        Optimization(**values)

@@ -1,0 +1,239 @@
+"""A run that is cut off goes on to the same weights, logs and best checkpoint; its files stay whole."""
+
+import csv
+import os
+import signal
+
+import lightning.pytorch as L
+import pytest
+import torch
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import Losses
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.checkpoints import Checkpoints, WholeFiles
+from ghgs_lit.training.loggers import CsvLog, TensorBoardLog, go_on
+from ghgs_lit.training.start import check_resume, check_start, differences
+from tests.helpers.training import Standin, StepData, flat_renderer
+
+STEPS = 16
+CONFIG = {"seed": 3, "resume": None, "init_from": None, "optimizer": {"lr": 0.05}}
+
+
+class PowerCut(Exception):
+    pass
+
+
+class Cut(L.Callback):
+    """Ends the run after step ``at`` or in the validation after it; counts validations."""
+
+    def __init__(self, at: int | None = None, validating: bool = False):
+        self.at, self.validating, self.validations = at, validating, []
+
+    def on_train_batch_end(self, trainer, *_):
+        if trainer.global_step == self.at and not self.validating:
+            raise PowerCut
+
+    def on_validation_batch_end(self, trainer, pl_module, outputs, batch, batch_idx, *_):
+        if trainer.global_step == self.at and self.validating:
+            raise PowerCut
+        if batch_idx == 0:
+            self.validations.append(trainer.global_step)
+
+
+def module() -> GHGSModule:
+    # Held parameters and points drawn at random: both must know where the run stands.
+    losses = Losses({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
+    return GHGSModule(
+        Standin(), flat_renderer, losses, Optimization(lr=0.05, warmup=0.1, hold={"shift": 0.4}), CONFIG
+    )
+
+
+def fit(folder, cut: Cut, resume=None, every=3, **options):
+    torch.manual_seed(11 if resume else 12)  # what the process drew before must not matter
+    best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
+    last = Checkpoints(filename="last", every_n_train_steps=every)
+    trainer = L.Trainer(
+        accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder, plugins=[WholeFiles()],
+        logger=[CsvLog(folder, name="csv", version="", flush_logs_every_n_steps=1),
+                TensorBoardLog(folder, name="tensorboard", version="")],
+        callbacks=[cut, best, last], enable_model_summary=False, enable_progress_bar=False,
+        num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=1,
+        **options,
+    )  # fmt: skip
+    if resume is not None:
+        go_on(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
+    subject = module()
+    trainer.fit(subject, StepData(), ckpt_path=resume)
+    return subject
+
+
+def rows(folder) -> list[dict[str, str]]:
+    with open(folder / "csv" / "metrics.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)]
+
+
+def score(folder) -> tuple[float, int]:
+    content = torch.load(folder / "checkpoints" / "best.ckpt", weights_only=True)
+    state = next(v for k, v in content["callbacks"].items() if "val/psnr" in k)
+    return state["best_model_score"].item(), content["global_step"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    cut = Cut()
+    return folder, fit(folder, cut), cut.validations
+
+
+@pytest.mark.parametrize(("at", "validating"), [(5, False), (8, False), (8, True), (12, True), (13, False)])
+def test_a_cut_run_ends_as_the_whole_one_does(whole, tmp_path, at, validating):
+    """Cut within an epoch of 5, at a validation (every 4), within one; saved every 3 steps."""
+    first = Cut(at, validating)
+    with pytest.raises(PowerCut):
+        fit(tmp_path, first)
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    step = torch.load(last, weights_only=True)["global_step"]
+    assert step == (at - 1) // 3 * 3  # the cut comes before what is due at its own step
+    second = Cut()
+    subject = fit(tmp_path, second, resume=last)
+    folder, expected, validations = whole
+    for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
+        assert torch.equal(a, b)
+    seen = [s for s in first.validations if s <= step] + second.validations
+    assert seen == validations == [4, 8, 12, 16]
+    assert score(tmp_path) == score(folder)
+    assert rows(tmp_path) == rows(folder)
+
+
+def test_a_checkpoint_that_is_due_at_a_validation_comes_after_it(tmp_path):
+    """A restart does not repeat the validation, which the best checkpoint has seen."""
+    first = Cut(10)
+    with pytest.raises(PowerCut):
+        fit(tmp_path, first, every=4)
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == 8
+    second = Cut()
+    fit(tmp_path, second, resume=last, every=4)
+    assert first.validations == [4, 8]
+    assert second.validations == [12, 16]
+
+
+def test_accumulated_steps_are_saved_whole(whole, tmp_path):
+    expected = fit(tmp_path / "whole", Cut(), accumulate_grad_batches=2)
+    with pytest.raises(PowerCut):
+        fit(tmp_path / "cut", Cut(10), accumulate_grad_batches=2)
+    last = tmp_path / "cut" / "checkpoints" / "last.ckpt"
+    subject = fit(tmp_path / "cut", Cut(), resume=last, accumulate_grad_batches=2)
+    for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_run_that_goes_on_elsewhere_takes_its_best_along(whole, tmp_path):
+    folder, _, _ = whole
+    with pytest.raises(PowerCut):
+        fit(tmp_path / "a", Cut(13))
+    fit(tmp_path / "b", Cut(), resume=tmp_path / "a" / "checkpoints" / "last.ckpt")
+    assert score(tmp_path / "b") == score(folder)
+
+
+def test_time_that_was_used_stays_used(tmp_path):
+    """With a budget of time the learning rate goes on where it was."""
+    seen = []
+
+    class Look(Cut):
+        def on_train_batch_start(self, trainer, pl_module, *_):
+            seen.append(pl_module.used_budget)
+
+        def on_train_batch_end(self, trainer, pl_module, *_):
+            timer = next(c for c in trainer.callbacks if type(c).__name__ == "Timer")
+            if self.at:
+                timer._offset += 200  # as if each step took this many seconds
+            super().on_train_batch_end(trainer, pl_module)
+
+    options = {"max_time": {"seconds": 1000}}
+    with pytest.raises(PowerCut):
+        fit(tmp_path, Look(4), **options)
+    seen.clear()
+    fit(tmp_path, Look(), resume=tmp_path / "checkpoints" / "last.ckpt", **options)
+    assert seen[:2] == pytest.approx([0.6, 0.6], abs=0.02)  # 3 x 200 s of 1000 s, not 3 of 16 steps
+    assert seen[-1] == pytest.approx((STEPS - 1) / STEPS)
+
+
+def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    path, files = tmp_path / "last.ckpt", WholeFiles()
+    files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
+    child = os.fork()
+    if child == 0:
+
+        def half(content, file):
+            file.write(b"half a checkpoint")
+            file.flush()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        monkeypatch.setattr(torch, "save", half)
+        files.save_checkpoint({"step": 2}, path)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    assert files.load_checkpoint(path)["step"] == 1
+    monkeypatch.undo()
+    files.save_checkpoint({"step": 3}, path)
+    assert files.load_checkpoint(path)["step"] == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
+    calls = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, _n=name, _r=real: (calls.append(_n), _r(*a)))
+    WholeFiles().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
+    class Other(Standin):
+        def __init__(self):
+            super().__init__()
+            self.shift = torch.nn.Parameter(torch.zeros(4))
+
+    path = tmp_path / "a.ckpt"
+    content = {"state_dict": {f"model.{k}": v for k, v in Other().state_dict().items()}}
+    content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": []}
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"a\.ckpt: shift.*\(3,\).*\(4,\)"):
+        check_resume(path, Standin(), CONFIG)
+    step, changed = check_resume(path, Other(), {**CONFIG, "optimizer": {"lr": 0.1}, "resume": str(path)})
+    assert (step, changed) == (5, ["optimizer.lr: 0.05 -> 0.1"])
+    del content["optimizer_states"]
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"a\.ckpt.*optimizer_states.*init_from"):
+        check_resume(path, Other(), CONFIG)
+
+
+def test_a_longer_budget_is_no_difference():
+    before = {"trainer": {"max_steps": 10, "precision": 32}, "logger": {"csv": {"name": "a"}}}
+    now = {"trainer": {"max_steps": 20, "precision": 16}, "logger": {}}
+    assert differences(before, now) == ["trainer.precision: 32 -> 16"]
+
+
+def test_one_way_to_start(tmp_path):
+    both = {"resume": "elsewhere/last.ckpt", "init_from": "a.ckpt"}
+    with pytest.raises(InputError, match="init_from"):
+        check_start(both, tmp_path)
+    check_start({**both, "resume": str(tmp_path / "checkpoints" / "last.ckpt")}, tmp_path)
+    check_start({"resume": None, "init_from": "a.ckpt"}, tmp_path)
+
+
+@pytest.mark.parametrize("minutes", [0, -1.0])
+def test_minutes_are_positive(minutes):
+    with pytest.raises(InputError, match="minutes"):
+        Checkpoints(filename="last", minutes=minutes)
+
+
+def test_minutes_and_steps_exclude_one_another():
+    with pytest.raises(MisconfigurationException):
+        Checkpoints(filename="last", minutes=1, every_n_train_steps=3)

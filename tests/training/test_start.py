@@ -1,0 +1,73 @@
+"""Training that starts from the weights of another run."""
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.training.start import initialize, report
+from tests.helpers.training import Standin
+
+
+class Other(torch.nn.Module):
+    """Shares ``depth`` with the stand-in; ``shift`` has another shape, ``more`` is new, ``bias`` is not."""
+
+    def __init__(self):
+        super().__init__()
+        self.depth = torch.nn.Parameter(torch.tensor(7.0))
+        self.shift = torch.nn.Parameter(torch.ones(4))
+        self.more = torch.nn.Parameter(torch.ones(2))
+
+
+def checkpoint(path, model, **changes):
+    state = {f"model.{key}": value for key, value in model.state_dict().items()}
+    content = {"state_dict": {**state, "val.sum": torch.ones(1)}, "config": {}, "format_version": 1}
+    torch.save({**content, **changes}, path)
+    return path
+
+
+def test_each_tensor_has_its_line(tmp_path):
+    path, model = checkpoint(tmp_path / "a.ckpt", Other()), Standin()
+    model.bias = torch.nn.Parameter(torch.full((2,), 5.0))
+    lines = initialize(model, path)
+    assert model.depth.item() == 7
+    assert torch.equal(model.shift, torch.zeros(3))
+    assert torch.equal(model.bias, torch.full((2,), 5.0))
+    assert [line.split()[:2] for line in lines] == [
+        ["loaded", "depth"],
+        ["wrong", "shape"],
+        ["missing", "bias"],
+        ["ignored", "more"],
+    ]
+    assert "(4,), expected (3,)" in lines[1]
+    text = report(lines, path, tmp_path / "init_from.txt")
+    assert text.splitlines()[0].startswith(f"init_from {path}: 1 tensors loaded")
+    assert text.splitlines()[1:] == lines[1:]
+    assert (tmp_path / "init_from.txt").read_text().splitlines() == lines
+
+
+def test_strict_takes_all_or_nothing(tmp_path):
+    model = Standin()
+    with pytest.raises(InputError, match=r"a\.ckpt: shift.*\(3,\).*\(4,\)|a\.ckpt: more"):
+        initialize(model, checkpoint(tmp_path / "a.ckpt", Other()), strict=True)
+    assert model.depth.item() == 2.5
+    other = Standin()
+    with torch.no_grad():
+        other.depth.fill_(3)
+    lines = initialize(model, checkpoint(tmp_path / "b.ckpt", other), strict=True)
+    assert model.depth.item() == 3
+    assert all(line.startswith("loaded") for line in lines)
+
+
+def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
+    path = checkpoint(tmp_path / "a.ckpt", torch.nn.Linear(2, 2))
+    with pytest.raises(InputError, match=r"init_from.*a\.ckpt"):
+        initialize(Standin(), path)
+    with pytest.raises(FileNotFoundError):
+        initialize(Standin(), tmp_path / "nothing.ckpt")
+
+
+def test_a_long_report_ends(tmp_path):
+    lines = [f"missing      layer.{n} (3,): left as initialised" for n in range(50)]
+    text = report(lines, "a.ckpt", tmp_path / "all.txt")
+    assert text.splitlines()[-1] == "... and 30 more"
+    assert len((tmp_path / "all.txt").read_text().splitlines()) == 50

@@ -1,0 +1,124 @@
+"""Attention of one token: the weights are those that the recalibration uses; where they are drawn."""
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.recalibration.inspection import attention_of
+from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.clouds import clouds
+from ghgs_lit.visualization.pictures import grid
+from tests.helpers.models import make_model
+from tests.helpers.scenes import make_batch
+
+
+def seen(model, batch):
+    """The recalibration's arguments and result, and the prediction."""
+    kept = []
+    hook = model.recalibration.register_forward_hook(lambda _, inputs, output: kept.append((inputs, output)))
+    with torch.no_grad():
+        prediction = model(batch)
+    hook.remove()
+    return *kept[0], prediction
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        [f"recalibration.similarity={s}", f"recalibration.neighbors={n}", f"recalibration.tokens={t}"]
+        for s, n, t in [
+            ("product", "all", "subject"),
+            ("product_clamped", "other_views", "subject"),
+            ("log", "mixed", "subject"),
+            ("none", "all", "all"),
+        ]
+    ],
+    ids=lambda o: o[0].split("=")[1],
+)
+def test_the_weights_are_those_of_the_forward(overrides):
+    model, batch = make_model("skip=none", *overrides).eval(), make_batch(2, 3)
+    (tokens, points, own), output, _ = seen(model, batch)
+    block = model.recalibration.block
+    for query in [chosen_token(tokens, points, element) for element in range(2)]:
+        attention = attention_of(model.recalibration, tokens, points, own, query)
+        assert torch.allclose(attention.weights.sum(-1), torch.ones(()), atol=1e-5)
+        for layer, weights in enumerate(attention.weights):
+            x = tokens.latent[layer]
+            v = block.v_proj(block.norm1(x[attention.neighbors])).unflatten(-1, (block.num_heads, -1))
+            y = x[query] + block.o_proj(torch.einsum("ak,kad->ad", weights, v).flatten())
+            expected = y + block.mlp(block.norm2(y))
+            assert torch.allclose(output.latent[layer][query], expected, atol=2e-5)
+
+
+def test_the_chosen_token_is_of_its_element_and_has_a_point():
+    model, batch = make_model("skip=none").eval(), make_batch(2, 3)
+    (tokens, points, own), _, _ = seen(model, batch)
+    for element in range(2):
+        query = chosen_token(tokens, points, element)
+        assert int(tokens.image[query]) == element * 3
+        assert points.tokens_valid[query]
+    query = chosen_token(tokens, points, 1, (2, 0, 0))  # nothing there: the nearest that has a point
+    assert int(tokens.image[query]) == 5
+    with pytest.raises(InputError, match=r"callbacks\.attention\.token"):
+        chosen_token(tokens, points, 0, (3, 0, 0))
+    background = int((~points.tokens_valid).nonzero()[0])
+    assert attention_of(model.recalibration, tokens, points, own, background) is None
+
+
+def test_attention_is_drawn_on_the_tokens_it_names():
+    model, batch = make_model("skip=none").eval(), make_batch(1, 3, height=56, width=70)
+    (tokens, points, own), _, _ = seen(model, batch)
+    attention = attention_of(model.recalibration, tokens, points, own, chosen_token(tokens, points, 0))
+    dark = type(own)(**{**vars(own), "images": torch.zeros_like(own.images)})
+    picture = attention_sheet(dark, tokens, attention)
+    scale, caption, gap = 4, 14, 2
+    width, height = 70 * scale, 56 * scale
+    first = picture[caption : caption + height, : 3 * width + 2 * gap]  # the neighbours
+    drawn = set()
+    for view in range(3):
+        tile = first[:, view * (width + gap) : view * (width + gap) + width].astype(int).sum(-1)
+        patches = tile.reshape(4, 14 * scale, 5, 14 * scale).transpose(0, 2, 1, 3)[..., 8:-8, 8:-8]
+        drawn |= {(view, *place) for place in np.argwhere(patches.max((-1, -2)) > 0).tolist()}
+    named = {
+        (int(tokens.image[t]), int(tokens.row[t]), int(tokens.column[t]))
+        for t in attention.neighbors.tolist()
+    }
+    assert drawn == named
+
+
+def test_attention_of_cropped_views_lies_on_the_crop():
+    model, batch = make_model("skip=balanced").eval(), make_batch(1, 3, height=84, width=112)
+    (tokens, points, own), _, _ = seen(model, batch)
+    attention = attention_of(model.recalibration, tokens, points, own, chosen_token(tokens, points, 0))
+    assert attention_sheet(own, tokens, attention).dtype == np.uint8
+    assert own.images.shape[-2:] == tuple(14 * n for n in tokens.grid[2:])
+
+
+def test_clouds_are_the_subjects_points_and_its_body():
+    model, batch = make_model().eval(), make_batch(2, 3)
+    body = [torch.rand(9, 3), torch.rand(4, 3)]
+    batch = type(batch)(**{**vars(batch), "body_vertices": body})
+    _, _, prediction = seen(model, batch)
+    found = clouds(batch, prediction, 1, limit=50)
+    assert list(found) == ["points", "body", "points_and_body"]
+    positions, colors = found["points"]
+    assert 25 < len(positions) <= 50
+    assert positions.shape == colors.shape
+    valid = prediction.points.valid[1] & batch.masks[1]
+    assert torch.equal(positions[0], prediction.points.pixels[1][valid][0])
+    assert torch.equal(colors[0], batch.images[1].movedim(1, -1)[valid][0])
+    assert torch.equal(found["body"][0], body[1])
+    assert len(found["points_and_body"][0]) == len(positions) + 4
+    nothing = type(batch)(**{**vars(batch), "masks": torch.zeros_like(batch.masks), "body_vertices": None})
+    assert clouds(nothing, prediction, 0) == {}
+
+
+def test_a_grid_is_as_wide_as_asked():
+    tiles = [np.full((100, 40, 3), n, np.uint8) for n in range(5)]
+    wide, square = grid(tiles), grid(tiles, aspect=0.6)
+    assert wide.shape[:2] == (102, 5 * 40 + 4 * 8)
+    assert square.shape[:2] == (204, 3 * 40 + 2 * 8)
+    assert square[5, [5, 53, 101], 0].tolist() == [0, 1, 2]
+    assert square[107, [5, 53, 101], 0].tolist() == [3, 4, 0]
+    assert np.array_equal(grid(tiles[:1])[:100], tiles[0])

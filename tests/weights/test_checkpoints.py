@@ -1,0 +1,206 @@
+"""Checkpoints rebuild their models; what does not fit is refused by name."""
+
+import os
+import pickle
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import FORMAT_VERSION, GHGS
+from ghgs_lit.training.optimization import Optimization
+from tests.helpers.models import close, config, make_model
+from tests.helpers.scenes import make_batch
+
+
+def checkpoint(path, **changes):
+    model = make_model()
+    content = {
+        "state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}
+        | {"loss.weight": torch.ones(1)},
+        "config": config(),
+        "format_version": FORMAT_VERSION,
+    }
+    torch.save({k: v for k, v in (content | changes).items() if v is not None}, path)
+    return model
+
+
+def test_a_checkpoint_rebuilds_its_model(tmp_path):
+    model = checkpoint(tmp_path / "a.ckpt").eval()
+    loaded = GHGS.from_checkpoint(tmp_path / "a.ckpt")
+    assert not loaded.training
+    batch = make_batch(1, 3)
+    with torch.no_grad():
+        close(loaded(batch).gaussians, model(batch).gaussians, 0)
+
+
+def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
+    path = tmp_path / "a.ckpt"
+    checkpoint(path, config=config("gaussian_head.hidden=[64,32]"))
+    with pytest.raises(
+        InputError, match=r"a\.ckpt: gaussian_head\.\w+_header\.0\.weight.*\(64, 16\).*\(32, 16\)"
+    ):
+        GHGS.from_checkpoint(path)
+    checkpoint(path, state_dict={})
+    with pytest.raises(InputError, match=r"a\.ckpt: encoder.*expected a tensor of shape"):
+        GHGS.from_checkpoint(path)
+
+
+class Foreign:
+    """Pickles as code to be called."""
+
+    def __reduce__(self):
+        return os.system, ("false",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"config": None}, "'config'"),
+        ({"state_dict": None}, "'state_dict'"),
+        ({"format_version": None}, "'format_version'"),
+        ({"format_version": FORMAT_VERSION + 1}, "of a newer version"),
+        ({"format_version": 0}, "format_version 1 to"),
+        ({"config": {"encoder": {}}}, "depth_head"),
+    ],
+)
+def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
+    path = tmp_path / "b.ckpt"
+    checkpoint(path, **changes)
+    with pytest.raises(InputError, match=message) as error:
+        GHGS.from_checkpoint(path)
+    assert "b.ckpt" in str(error.value) or "depth_head" in message
+
+
+def a_checkpoint(folder):
+    checkpoint(folder / "whole.ckpt")
+    return (folder / "whole.ckpt").read_bytes()
+
+
+def a_safetensors(folder):
+    save_file(dict(make_model().state_dict()), folder / "whole.safetensors")
+    return (folder / "whole.safetensors").read_bytes()
+
+
+def of_torch(content):
+    """The bytes of a file that ``torch.save`` writes."""
+
+    def make(folder):
+        torch.save(content, folder / "made.pt")
+        return (folder / "made.pt").read_bytes()
+
+    return make
+
+
+def changed_state(change):
+    def make(folder):
+        checkpoint(folder / "changed.ckpt")
+        content = torch.load(folder / "changed.ckpt", weights_only=True)
+        change(content["state_dict"])
+        return of_torch(content)(folder)
+
+    return make
+
+
+TOKEN = "model.encoder.aggregator.camera_token"
+
+#: name: (content, what the one line must say); docs/weights.md has the whole lines.
+BAD_FILES = {
+    "empty": (lambda _: b"", "found an empty file"),
+    "web page": (lambda _: b"<!DOCTYPE html><html><title>Sign in</title>", "found a web page"),
+    "git-lfs pointer": (lambda _: b"version https://git-lfs.github.com/spec/v1\noid 0", "git lfs pull"),
+    "something else": (lambda _: b"no weights at all", "its first bytes are b'no weights at al'"),
+    "truncated .pt": (lambda f: a_checkpoint(f)[:-4000], "end is missing"),
+    "truncated .safetensors": (lambda f: a_safetensors(f)[:-4000], "end is missing"),
+    "truncated header": (lambda f: a_safetensors(f)[:500], "end is missing"),
+    "broken header": (lambda _: (9).to_bytes(8, "little") + b"{nonsense", "invalid JSON"),
+    "code": (of_torch({"state_dict": Foreign()}), r"code \(\w+\.system\), which is never run"),
+    "pickled code": (lambda _: pickle.dumps(Foreign()), "found a pickle that PyTorch did not write"),
+    "a plain pickle": (lambda _: pickle.dumps([1, 2]), "found a pickle that PyTorch did not write"),
+    "foreign state dict": (of_torch({"layer.weight": torch.ones(2)}), r"'state_dict'; found 'layer\.weight'"),
+    "a safetensors model": (a_safetensors, r"'state_dict'; found 'depth_head.* and \d+ more"),
+    "published weights": (of_torch({"network": {}, "optimizer": {}}), "`ghgs import` makes a checkpoint"),
+    "a bare tensor": (of_torch(torch.ones(2)), "'state_dict'; found a Tensor"),
+    "wrong shape": (
+        changed_state(lambda s: s.update({TOKEN: torch.ones(3)})),
+        r"camera_token: expected shape \(1, 2, 1, 32\) .*; found \(3,\)",
+    ),
+    "missing key": (changed_state(lambda s: s.pop(TOKEN)), "camera_token: expected a .*; found 'nothing'"),
+    "extra key": (changed_state(lambda s: s.update({"model.x": torch.ones(3)})), "x: expected no such key"),
+    "no tensor": (changed_state(lambda s: s.update({TOKEN: 3})), "camera_token: .* found 'int'"),
+    "whole numbers": (
+        changed_state(lambda s: s.update({TOKEN: torch.ones(1, 2, 1, 32).int()})),
+        "expected floating point numbers; found torch.int32",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
+    make, message = BAD_FILES[name]
+    path = tmp_path / "bad.ckpt"
+    path.write_bytes(make(tmp_path))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match=message) as error:
+            GHGS.from_checkpoint(path)
+    text = str(error.value)
+    assert text.startswith(f"{path}: ")
+    assert "expected" in text
+    assert "found" in text
+    assert "\n" not in text
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"c\.ckpt: expected a file of weights; found none"):
+        GHGS.from_checkpoint(tmp_path / "c.ckpt")
+    with pytest.raises(InputError, match="found a directory"):
+        GHGS.from_checkpoint(tmp_path)
+
+
+def test_weights_are_mapped_and_may_be_trained_all_the_same(tmp_path):
+    """Nothing is copied on loading; training writes to memory, never to the file."""
+    path = tmp_path / "a.ckpt"
+    checkpoint(path)
+    before = path.read_bytes()
+    model = GHGS.from_checkpoint(path)
+    assert not any(t.is_meta for t in (*model.parameters(), *model.buffers()))
+    mapped = Path("/proc/self/maps")
+    if mapped.exists():
+        assert str(path) in mapped.read_text()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(1)
+    assert path.read_bytes() == before
+    path.unlink()
+    assert all(p.isfinite().all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("trainable", ["none", "last_1", "last_2", "all"])
+def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
+    """Gradients where they should be, none elsewhere, and an optimizer of these parameters alone."""
+    path = tmp_path / "a.ckpt"
+    checkpoint(path, config=config(f"encoder.trainable={trainable}"))
+    model = GHGS.from_checkpoint(path).train()
+    optimizer = Optimization(lr=1e-3).build(model)
+    held = {id(p) for group in optimizer.param_groups for p in group["params"]}
+    before = {name: p.detach().clone() for name, p in model.named_parameters()}
+    g = model(make_batch(1, 3)).gaussians
+    (g.means.square().mean() + g.scales.mean() + g.opacities.mean() + g.quaternions[:, 1].mean()).backward()
+    depth = len(model.encoder.aggregator.frame_blocks)
+    count = {"none": 0, "all": depth}.get(trainable) or int("0" + trainable[5:])
+    blocks = [f"{kind}_blocks.{i}." for kind in ("frame", "global") for i in range(depth - count, depth)]
+    last = tuple(f"encoder.aggregator.{block}" for block in blocks)
+    for name, parameter in model.named_parameters():
+        trained = not name.startswith("encoder.") or trainable == "all" or name.startswith(last)
+        assert parameter.requires_grad == trained == (id(parameter) in held), name
+        assert trained or parameter.grad is None, name
+    optimizer.step()
+    for name, parameter in model.named_parameters():
+        moved = not torch.equal(parameter, before[name])
+        assert moved == (parameter.grad is not None and bool(parameter.grad.any())), name
+    encoder = [n for n, p in model.named_parameters() if n.startswith("encoder.") and p.grad is not None]
+    assert bool(encoder) == (trainable != "none")

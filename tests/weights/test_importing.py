@@ -1,0 +1,309 @@
+"""Published weights come in strictly, run, and go out again as they were."""
+
+import re
+
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from safetensors.torch import load_file, save_file
+
+from ghgs_lit.cli import main as cli
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS, STAGES, read_checkpoint
+from ghgs_lit.training import start
+from ghgs_lit.weights import importing, names
+from ghgs_lit.weights.exporting import export_weights
+from ghgs_lit.weights.importing import Source, assign, import_weights
+from ghgs_lit.weights.reading import cast
+from ghgs_lit.weights.switches import differences
+from tests.helpers.models import close
+from tests.helpers.scenes import make_batch
+from tests.helpers.weights import OTHER_HEADS, PUBLISHED, TINY, config, published_tensors, write_published
+
+
+@pytest.fixture
+def files(tmp_path):
+    (vggt, release), tensors = write_published(tmp_path)
+    return str(vggt), str(release), *tensors
+
+
+def meta(shapes, prefix=""):
+    return {prefix + name: torch.empty(shape, device="meta") for name, shape in shapes.items()}
+
+
+@pytest.mark.parametrize("prefix", ["", "aggregator."])
+def test_the_published_names_and_shapes_are_exactly_the_models(monkeypatch, prefix):
+    """Every published tensor has one place in the full-size model, and every place its tensor."""
+    contents = {
+        "vggt": meta(PUBLISHED["vggt"], prefix) | meta(OTHER_HEADS),
+        "release": {"network": meta(PUBLISHED["network"]), "total_steps": 1},
+    }
+    monkeypatch.setattr(importing, "open_file", contents.__getitem__)
+    files = [
+        Source("vggt", "VGGT", "vggt", "", names.VGGT, names.VGGT_IGNORED),
+        Source("release", "the release", "release", "", names.RELEASE, entry="network"),
+    ]
+    own = GHGS.from_config(config(tiny=False), empty=STAGES).state_dict()
+    assert all(tensor.is_meta for tensor in own.values())
+    assert assign(own, files, fresh=()) == []
+    assert [len(source.used) for source in files] == [1210, 164]
+    assert sum(own[name].numel() for name in files[0].used) == 909_112_320
+    assert sum(own[name].numel() for name in files[1].used) == 77_942_669
+    back = {names.to_published(name, names.VGGT) or names.to_published(name, names.RELEASE) for name in own}
+    expected = {f"aggregator.{name}" for name in PUBLISHED["vggt"]} | set(PUBLISHED["network"])
+    assert back == expected
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_import_and_export_give_the_same_tensors_back(tmp_path, suffix):
+    (vggt, release), (agg, network) = write_published(tmp_path, suffix)
+    out = tmp_path / "out.ckpt"
+    report = import_weights(config(), out, str(vggt), str(release))
+    assert "ignored (camera_head 1, depth_head 62, point_head 1, track_head 1)" in report[0]
+    assert report[1].endswith(f"{len(network)} tensors used, 0 ignored")
+    export_weights(out, tmp_path / f"back{suffix}", tmp_path / "back.pth")
+    back = load_file(tmp_path / "back.safetensors") if suffix == ".safetensors" else torch.load(
+        tmp_path / "back.pt", weights_only=True
+    )  # fmt: skip
+    again = torch.load(tmp_path / "back.pth", weights_only=True)["network"]
+    used = {name: value for name, value in agg.items() if name.startswith("aggregator.")}
+    for found, expected in ((back, used), (again, network)):
+        assert set(found) == set(expected)
+        assert all(torch.equal(found[name], value) for name, value in expected.items())
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
+    vggt, release, agg, network = files
+    out = tmp_path / "out.ckpt"
+    import_weights(config(), out, vggt, release)
+    checkpoint = read_checkpoint(out)
+    assert checkpoint["config"]["encoder"]["weights"] == "vggt.safetensors"
+    assert checkpoint["config"]["compat"]["name"] == "release"
+    assert checkpoint["imported"]["release"]["tensors"] == len(network)
+    assert re.fullmatch("[0-9a-f]{64}", checkpoint["imported"]["vggt"]["sha256"])
+    model = GHGS.from_checkpoint(out)
+    assert not any(tensor.is_meta for tensor in (*model.parameters(), *model.buffers()))
+    expected = GHGS.from_config(config())
+    renamed = {names.to_ours(name, names.VGGT): value for name, value in agg.items()}
+    renamed |= {names.to_ours(name, names.RELEASE): value for name, value in network.items()}
+    expected.load_state_dict({name: value for name, value in renamed.items() if name is not None})
+    batch = make_batch(1, 3, 50, 64)  # padded to 56 x 70
+    with torch.no_grad():
+        close(model(batch).gaussians, expected(batch).gaussians, 0)
+
+
+def test_without_the_release_heads_start_afresh(tmp_path, files):
+    vggt, _, agg, _ = files
+    out = tmp_path / "out.ckpt"
+    settings = config("compat=none")
+    torch.manual_seed(5)
+    report = import_weights(settings, out, vggt)
+    assert "start afresh" in report[-1]
+    model = GHGS.from_checkpoint(out)
+    torch.manual_seed(5)
+    again = import_weights(settings, tmp_path / "again.ckpt", vggt)
+    assert again == report
+    state, other = model.state_dict(), GHGS.from_checkpoint(tmp_path / "again.ckpt").state_dict()
+    assert all(torch.equal(state[name], other[name]) for name in state)
+    assert torch.equal(state["encoder.aggregator.camera_token"], agg["aggregator.camera_token"])
+    last = model.depth_head.dpt.scratch.output_conv2[-1]
+    assert last.weight.eq(0).all()  # depth starts where the safe parameterisation says
+
+
+def test_the_depth_head_can_start_from_vggts(tmp_path, files):
+    vggt, _, agg, _ = files
+    out = tmp_path / "out.ckpt"
+    report = import_weights(config("compat=none"), out, vggt, depth_head="vggt")
+    assert "depth_head 2" in report[0]
+    dpt = GHGS.from_checkpoint(out).depth_head.dpt
+    assert torch.equal(dpt.norm.weight, agg["depth_head.norm.weight"])
+    assert dpt.scratch.output_conv2[-1].weight.eq(0).all()
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
+def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
+    vggt, release, agg, _ = files
+    out = tmp_path / "out.ckpt"
+    import_weights(config(), out, vggt, release, dtype)
+    half = getattr(torch, dtype)
+    model = GHGS.from_checkpoint(out)
+    assert {p.dtype for p in model.encoder.parameters()} == {half}
+    assert {p.dtype for p in (*model.depth_head.parameters(), *model.gaussian_head.parameters())} == {
+        torch.float32
+    }
+    token = agg["aggregator.camera_token"]
+    assert torch.equal(model.encoder.aggregator.camera_token, token.to(half))
+    wide = GHGS.from_checkpoint(out, dtype=torch.float32)
+    assert {p.dtype for p in wide.parameters()} == {torch.float32}
+    batch = make_batch(1, 3)
+    with torch.no_grad():
+        found, expected = model(batch), wide(batch)
+    assert found.gaussians.means.dtype == torch.float32
+    mask = batch.masks
+    inverse = [1 / prediction.depth[mask] for prediction in (found, expected)]
+    assert (inverse[0] - inverse[1]).abs().max() < 0.05 * inverse[1].abs().max()
+
+
+def test_conversion_maps_the_file_anew_and_keeps_what_fits(monkeypatch, tmp_path):
+    monkeypatch.setattr("ghgs_lit.weights.reading._CHUNK", 3000)
+    tensors = {f"a{i}": torch.randn(16, 16) for i in range(8)} | {"b": torch.randn(3)}
+    opened = []
+
+    def open_tensors():
+        opened.append(1)
+        return dict(tensors)
+
+    def precision(name, stored):
+        return torch.bfloat16 if name != "b" else stored
+
+    found = cast(open_tensors, precision)
+    assert list(found) == list(tensors)
+    assert len(opened) == 4
+    assert found["b"] is tensors["b"]
+    assert all(torch.equal(found[name], tensors[name].bfloat16()) for name in tensors if name != "b")
+
+
+def tampered(files, tmp_path, change):
+    """The release's file after ``change(network)``."""
+    network = dict(files[3])
+    change(network)
+    torch.save({"network": network}, tmp_path / "release.pth")
+    return str(tmp_path / "release.pth")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda n: n.pop("blk.norm1.weight"),
+            r"blk\.norm1\.weight: expected a tensor of .*\(64,\); .*not",
+        ),
+        (lambda n: n.update({"blk.lam_s": torch.ones(1)}), r"blk\.lam_s: expected no such tensor"),
+        (
+            lambda n: n.update({"smpl.x": torch.ones(1)}),
+            r"smpl\.x: expected a tensor of the authors' release",
+        ),
+        (
+            lambda n: n.update({"blk.norm1.weight": torch.ones(3)}),
+            r"blk\.norm1\.weight: expected shape \(64,\) of the configured model; found \(3,\)",
+        ),
+        (lambda n: n["blk.norm1.weight"].fill_(float("nan")), r"blk\.norm1\.weight: expected finite numbers"),
+        (lambda n: n.update({"blk.norm1.weight": 3}), r"blk\.norm1\.weight: .* found 'int'"),
+        (
+            lambda n: n.update({"blk.norm1.weight": torch.ones(64, dtype=torch.long)}),
+            r"blk\.norm1\.weight: expected floating point",
+        ),
+    ],
+)
+def test_a_tensor_that_does_not_fit_is_named(tmp_path, files, change, message):
+    release = tampered(files, tmp_path, change)
+    with pytest.raises(InputError, match=r"release\.pth: " + message):
+        import_weights(config(), tmp_path / "out.ckpt", files[0], release)
+    assert not (tmp_path / "out.ckpt").exists()
+
+
+def test_a_tensor_that_comes_twice_is_refused(tmp_path, files):
+    vggt = dict(files[2])
+    vggt["camera_token"] = vggt["aggregator.camera_token"]
+    save_file({name: tensor.clone() for name, tensor in vggt.items()}, tmp_path / "twice.safetensors")
+    with pytest.raises(InputError, match="camera_token too"):
+        import_weights(config(), tmp_path / "out.ckpt", str(tmp_path / "twice.safetensors"), files[1])
+
+
+def test_files_in_the_wrong_place_are_refused(tmp_path, files):
+    vggt, release, *_ = files
+    with pytest.raises(InputError, match=r"release\.pth: network: expected a tensor of VGGT-1B"):
+        import_weights(config(), tmp_path / "out.ckpt", release, None)
+    with pytest.raises(InputError, match=r"expected the entry 'network'; found 'aggregator\..* more"):
+        import_weights(config(), tmp_path / "out.ckpt", vggt, vggt)
+    with pytest.raises(InputError, match="vggt: expected a file or facebook/VGGT-1B"):
+        import_weights(config(), tmp_path / "out.ckpt", None, release)
+    with pytest.raises(InputError, match="out: expected another file"):
+        import_weights(config(), vggt, vggt, release)
+    with pytest.raises(FileNotFoundError, match=r"none\.safetensors"):
+        import_weights(config(), tmp_path / "out.ckpt", str(tmp_path / "none.safetensors"))
+
+
+def test_our_own_variants_have_no_published_names(tmp_path, files):
+    vggt, *_ = files
+    out = tmp_path / "out.ckpt"
+    import_weights(config("compat=none", "gaussian_head.guide=true"), out, vggt)
+    with pytest.raises(InputError, match="guide"):
+        export_weights(out, None, tmp_path / "back.pth")
+    assert not (tmp_path / "back.pth").exists()
+    with pytest.raises(InputError, match="vggt=<file>"):
+        export_weights(out, None, None)
+    import_weights(config("compat=none"), out, vggt)
+    with pytest.raises(InputError, match=r"release: expected a PyTorch file"):
+        export_weights(out, None, tmp_path / "back.safetensors")
+
+
+def command(monkeypatch, capsys, *argv):
+    monkeypatch.setattr("sys.argv", ["ghgs", *argv])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    GlobalHydra.instance().clear()
+    try:
+        code = cli.main()
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    return code, *capsys.readouterr()
+
+
+def test_the_verbs(monkeypatch, capsys, tmp_path, files):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = command(
+        monkeypatch, capsys, "import", "vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY
+    )
+    assert code == 0
+    assert "not as the release computes" not in out
+    assert out.splitlines()[-1] == "wrote a/out.ckpt"
+    code, out, _ = command(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
+    assert code == 0
+    assert out.splitlines()[-2:] == [f"back.pth: {len(files[3])} tensors", "wrote back.pth"]
+    for argv, message in (
+        (["vggt=vggt.safetensors", "out=b.ckpt"], "compat: expected none where there is no release"),
+        (["vggt=none.pt", "compat=none", "out=b.ckpt"], "none.pt: expected a file of weights; found none"),
+    ):
+        code, _, err = command(monkeypatch, capsys, "import", *argv, *TINY)
+        assert code == 1
+        assert err.strip().startswith(f"ghgs import: {message}")
+        assert len(err.strip().splitlines()) == 1
+
+
+def test_switches_that_differ_from_the_releases_are_told():
+    assert differences(config()) == []
+    found = differences(config("points.tokens=subject"))
+    assert found == ["points.tokens=subject for release"]
+    assert any("depth_head.parameterization" in line for line in differences(config("compat=none")))
+    assert differences(config(), config()) == []
+
+
+def test_tiny_files_have_the_published_structure():
+    """The tests' small files miss nothing that the published ones have, numbers of blocks aside."""
+    vggt, network = published_tensors()
+
+    def kinds(tensors):
+        return {re.sub(r"blocks\.\d+", "blocks", name) for name in tensors}
+
+    assert set(network) == set(PUBLISHED["network"])
+    own = {name for name in vggt if name.startswith("aggregator.")}
+    assert kinds(own) == {f"aggregator.{name}" for name in kinds(PUBLISHED["vggt"])}
+
+
+def test_training_from_imported_weights_says_where_they_come_from(tmp_path, files):
+    """Tables read ``encoder.weights``: it follows the encoder's tensors, if all of them come along."""
+    out = str(tmp_path / "out.ckpt")
+    settings = config("compat=none", "encoder.trainable=last_1")
+    import_weights(settings, out, files[0])
+    model = GHGS.from_config(settings)
+    lines = start.initialize(model, out, strict=True)
+    assert all(line.startswith("loaded") for line in lines)
+    run = {**settings, "resume": None, "init_from": out}
+    assert start.with_origin(run, model)["encoder"]["weights"] == "vggt.safetensors"
+    assert start.switched(run) == []
+    assert "weights" not in run["encoder"]
+    assert start.with_origin({**run, "init_from": None}, model) == {**run, "init_from": None}
+    wider = config("compat=none", "encoder.mask_input=true")
+    assert "weights" not in start.with_origin({**run, **wider}, GHGS.from_config(wider))["encoder"]
+    assert start.switched({**run, **config()}) != []
