@@ -238,7 +238,7 @@ def test_neighborhoods():
         after = make(neighborhood=name)(tokens, far, batch)
         assert torch.equal(after.latent[0], before.latent[0]) == (name != "xyz")
     assert not torch.equal(outputs["image_plane"].latent[0], outputs["feature"].latent[0])
-    position = make(neighborhood="image_plane")._positions(tokens, points)
+    position = make(neighborhood="image_plane").positions(tokens, points)
     assert torch.equal(position[:16], position[16:32])
     assert position.min() == 0.125
     assert position.max() == 0.875
@@ -263,7 +263,7 @@ def test_gradients_are_finite_where_points_coincide(similarity):
 def test_dissimilar_neighbors_lose_their_weight_in_log_only():
     cosine = torch.tensor([[1.0, -1.0]])
     weights = {
-        name: make(similarity=name).block._weigh(torch.zeros(2, 1, 2), cosine).softmax(-1)[0, 0, 1].item()
+        name: make(similarity=name).block.apply_similarity(torch.zeros(2, 1, 2), cosine).softmax(-1)[0, 0, 1].item()
         for name in ("product_clamped", "log")
     }
     assert weights["product_clamped"] == 0.5

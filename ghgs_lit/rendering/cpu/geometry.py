@@ -19,7 +19,7 @@ K_SCALE = math.sqrt(0.5 * TO_LOG2)
 def unit(quaternions):
     """Unit quaternions and 1 / norm; identity and 0 for the zero quaternion."""
     w, x, y, z = quaternions
-    norm = simd.root(w * w + x * x + (y * y + z * z))
+    norm = simd.sqrt(w * w + x * x + (y * y + z * z))
     is_zero = norm == 0.0
     inverse = 1.0 / simd.select(is_zero, 1.0, norm)
     w = simd.select(is_zero, 1.0, w * inverse)

@@ -60,7 +60,7 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
     if antialiased:
         n = geometry.normal(m)
         bare, determinant, _, _ = geometry.determinants(m, n, low_pass)
-        d_opacity = d_opacity * simd.root(bare / determinant)
+        d_opacity = d_opacity * simd.sqrt(bare / determinant)
         # d ln(compensation) = (d ln bare - d ln determinant) / 2, of sums of squares in n and in m.
         d_n, d_m = h * (1.0 / bare - 1.0 / determinant), 0.0 - h * low_pass / determinant
         out = (

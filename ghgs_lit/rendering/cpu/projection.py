@@ -15,8 +15,8 @@ _FAR = 1e30
 def _extents(view, u, v, a, c, cutoff):
     """First and last wanted pixels, across and down, whose centres lie in the boxes around splats."""
     reach = (2.0 / geometry.TO_LOG2) * cutoff
-    half_width = simd.minimum(simd.root(reach * a), _FAR)
-    half_height = simd.minimum(simd.root(reach * c), _FAR)
+    half_width = simd.minimum(simd.sqrt(reach * a), _FAR)
+    half_height = simd.minimum(simd.sqrt(reach * c), _FAR)
     left = simd.maximum(0.0 - simd.floor(0.5 - (u - half_width)), view[layout.LEFT])
     right = simd.minimum(simd.floor(u + half_width - 0.5), view[layout.RIGHT])
     top = simd.maximum(0.0 - simd.floor(0.5 - (v - half_height)), view[layout.TOP])
@@ -38,7 +38,7 @@ def _project_vector(
     b = geometry.dot(footprint[0], footprint[1], footprint[2], footprint[3], footprint[4], footprint[5])
     u, v = simd.fma(x, view[layout.FX], view[layout.CX]), simd.fma(y, view[layout.FY], view[layout.CY])
     if antialiased:
-        opacity = opacity * simd.root(simd.minimum(simd.maximum(bare / determinant, 0.0), 1.0))
+        opacity = opacity * simd.sqrt(simd.minimum(simd.maximum(bare / determinant, 0.0), 1.0))
     visible = (z >= near) & (z <= far) & (opacity >= alpha_min)
     visible = visible & (determinant > 0.0) & (determinant < np.inf)
     visible = visible & (u > -_FAR) & (u < _FAR) & (v > -_FAR) & (v < _FAR)
@@ -58,11 +58,11 @@ def _project_vector(
     if seen == 0:
         return seen
     column, row, inverse_a = simd.floor(u), simd.floor(v), 1.0 / a
-    k_yy = geometry.K_SCALE * simd.root(a / determinant)
+    k_yy = geometry.K_SCALE * simd.sqrt(a / determinant)
     tables.store_columns1(depths, m, m + _WIDE, (z,))
     tables.store_lines(records, m, (
         column, row, 0.5 - (u - column), 0.5 - (v - row),
-        geometry.K_SCALE * simd.root(inverse_a), 0.0 - k_yy * b * inverse_a, k_yy,
+        geometry.K_SCALE * simd.sqrt(inverse_a), 0.0 - k_yy * b * inverse_a, k_yy,
         opacity, cutoff, z, b / c, b * inverse_a,
     ))  # fmt: skip
     return seen
