@@ -26,12 +26,12 @@ def _project(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor, Ten
     """Centres [n, 2], inverse covariances (xx, xy, yy), opacities and colours, front to back; radii."""
     index = reference.visible(gaussians, camera, _SETTINGS, 0.01, 1e10)
     splats = reference.project(gaussians.select(index, (len(index),)), camera, _SETTINGS)
-    xx, xy, yy = splats["covariances"].unbind(-1)
-    inverse = torch.stack((yy, -xy, xx), dim=-1) / splats["determinants"][:, None]
+    xx, xy, yy = splats.covariances.unbind(-1)
+    inverse = torch.stack((yy, -xy, xx), dim=-1) / splats.determinants[:, None]
     with torch.no_grad():
         middle = 0.5 * (xx + yy)
-        radii = 3 * (middle + (middle**2 - splats["determinants"]).clamp_min(0.01).sqrt()).sqrt()
-    return splats["centers"], inverse, splats["opacities"], splats["colors"], radii
+        radii = 3 * (middle + (middle**2 - splats.determinants).clamp_min(0.01).sqrt()).sqrt()
+    return splats.centers, inverse, splats.opacities, splats.colors, radii
 
 
 def render_box(gaussians: Gaussians, camera: Cameras) -> Tensor:

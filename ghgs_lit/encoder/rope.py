@@ -1,4 +1,4 @@
-"""Two-dimensional rotary position embedding (RoPE): half of a head's channels for the row, half for the column.
+"""Two-dimensional rotary position embedding (RoPE): half of a head turns with the row, half with the column.
 
 Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would change its
 cosine by up to 6e-2, rounding the cosine itself only by 2e-3.
@@ -16,7 +16,7 @@ BASE = 100.0
 
 
 class Rotary(NamedTuple):
-    """Cosine and signed sine for every token and channel of a head; the sign is that of the partner's term."""
+    """Cosine and sine for every token and channel of a head; the sine has the sign of its term."""
 
     cosine: Float[Tensor, "t d"]
     sine: Float[Tensor, "t d"]

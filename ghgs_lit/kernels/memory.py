@@ -8,7 +8,7 @@ from ghgs_lit.kernels.simd import I32, floats, vector_of
 
 
 def pointer_to(context, builder, array_type, array, index, index_type, kind):
-    """Address of element ``index`` of a contiguous array (flat index), as a pointer to the vector ``kind``."""
+    """Pointer to the vector ``kind`` at element ``index`` (flat index) of a contiguous array."""
     data = context.make_array(array_type)(context, builder, array).data
     position = context.cast(builder, index, index_type, types.intp)
     return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())

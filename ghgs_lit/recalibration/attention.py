@@ -170,7 +170,7 @@ class SemanticAttention(nn.Module):
 
 
 def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
-    """``linear`` with its parameters in autocast's dtype, so they are not cast for every part of the tokens."""
+    """``linear`` with its parameters in autocast's dtype: cast once, not for every part of the tokens."""
     kind = linear.weight.device.type
     if not torch.is_autocast_enabled(kind):
         return linear

@@ -18,7 +18,7 @@ _BLOCK = 1 << 17
 
 @dataclass(frozen=True)
 class Neighbors:
-    """Indices of the ``k`` neighbours of each of ``n`` tokens; entries that are not ``valid`` do not count."""
+    """Indices of the ``k`` neighbours of each of ``n`` tokens; only ``valid`` entries count."""
 
     index: Int[Tensor, "n k"]
     valid: Bool[Tensor, "n k"]

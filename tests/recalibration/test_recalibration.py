@@ -263,7 +263,10 @@ def test_gradients_are_finite_where_points_coincide(similarity):
 def test_dissimilar_neighbors_lose_their_weight_in_log_only():
     cosine = torch.tensor([[1.0, -1.0]])
     weights = {
-        name: make(similarity=name).block.apply_similarity(torch.zeros(2, 1, 2), cosine).softmax(-1)[0, 0, 1].item()
+        name: make(similarity=name)
+        .block.apply_similarity(torch.zeros(2, 1, 2), cosine)
+        .softmax(-1)[0, 0, 1]
+        .item()
         for name in ("product_clamped", "log")
     }
     assert weights["product_clamped"] == 0.5

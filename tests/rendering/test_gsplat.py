@@ -47,16 +47,16 @@ def test_projection_is_that_of_gsplat(distance, antialiased):
     compared = 0
     for view in range(3):
         splats = reference.project(gaussians, views[0, view], settings)
-        xx, xy, yy = splats["covariances"].unbind(-1)
+        xx, xy, yy = splats.covariances.unbind(-1)
         found = [
-            splats["centers"],
-            torch.stack((yy, -xy, xx), dim=-1) / splats["determinants"][:, None],
-            splats["depths"][:, None],
-            splats["opacities"][:, None],
+            splats.centers,
+            torch.stack((yy, -xy, xx), dim=-1) / splats.determinants[:, None],
+            splats.depths[:, None],
+            splats.opacities[:, None],
         ]
         opacities = gaussians.opacities * compensations[view] if antialiased else gaussians.opacities
         wanted = [centers[view], conics[view], depths[view][:, None], opacities[:, None]]
-        front = splats["depths"].detach() > 0.05
+        front = splats.depths.detach() > 0.05
         compared += int(front.sum())
         slopes = []
         for values in (found, wanted):

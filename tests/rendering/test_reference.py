@@ -62,25 +62,25 @@ def test_splats_are_composited_front_to_back_with_every_threshold():
     rendering = render(gaussians, views, "reference", settings=settings)
     index = reference.visible(gaussians, views[0, 0], settings, 0.01, 1e10)
     splats = reference.project(gaussians.select(index, (len(index),)), views[0, 0], settings)
-    depths = splats["depths"].tolist()
+    depths = splats.depths.tolist()
     assert depths == sorted(depths)
     assert len(depths) > 50
     stopped = 0
     for row, column in ((0, 0), (4, 5), (8, 10), (3, 7)):
         transmittance, color, depth = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
         for k in range(len(depths)):
-            xx, xy, yy = splats["covariances"][k]
+            xx, xy, yy = splats.covariances[k]
             covariance = torch.stack((torch.stack((xx, xy)), torch.stack((xy, yy))))
-            offset = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64) - splats["centers"][k]
+            offset = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64) - splats.centers[k]
             sigma = float(0.5 * offset @ torch.linalg.solve(covariance, offset))
-            alpha = min(settings.alpha_max, float(splats["opacities"][k]) * math.exp(-sigma))
+            alpha = min(settings.alpha_max, float(splats.opacities[k]) * math.exp(-sigma))
             if alpha < settings.alpha_min:
                 continue
             if transmittance * (1 - alpha) <= settings.stop:
                 stopped += 1
                 break
             weight = transmittance * alpha
-            color, depth = color + weight * splats["colors"][k], depth + weight * depths[k]
+            color, depth = color + weight * splats.colors[k], depth + weight * depths[k]
             transmittance *= 1 - alpha
         torch.testing.assert_close(rendering.image[0, 0, :, row, column], color, rtol=1e-9, atol=1e-12)
         total = 1 - transmittance
@@ -110,9 +110,9 @@ def test_projection_against_the_derivative_of_the_pinhole():
         )
         covariance = jacobian @ root[n] @ root[n].T @ jacobian.T + 0.3 * torch.eye(2, dtype=torch.float64)
         wanted = covariance[[0, 0, 1], [0, 1, 1]]
-        torch.testing.assert_close(splats["covariances"][n], wanted)
-        torch.testing.assert_close(splats["determinants"][n], torch.linalg.det(covariance))
-        torch.testing.assert_close(splats["centers"][n], center)
+        torch.testing.assert_close(splats.covariances[n], wanted)
+        torch.testing.assert_close(splats.determinants[n], torch.linalg.det(covariance))
+        torch.testing.assert_close(splats.centers[n], center)
 
 
 def test_float32_reference_is_close_to_float64():

@@ -159,7 +159,7 @@ def _add_values(weights, values, key, seen, totals, row, width):
 
 @helper
 def _finish(out, sums, totals, r, width):
-    """Write the weighted values of query ``r``, divided by the sum of its weights, to its row of the result."""
+    """Write the weighted values of query ``r``, divided by the sum of its weights, to ``out``."""
     share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
     for i in range(0, width, LANES):
         store_numbers(out, i // per_word(out), memory.load(totals, r * width + i) * simd.full(share))
