@@ -134,7 +134,7 @@ def test_what_the_kernel_is_asked_for(monkeypatch):
     """The kernel is used only where it is supported and faster."""
     monkeypatch.setattr(attention, "_has", lambda feature: feature == "avx512f")
     q, _, v = scene(1, 4, 1024, 32, torch.float32)
-    assert not cpu.is_supported(q, v)  # a gradient may be wanted
+    assert not cpu.is_supported(q, v)  # a gradient may be needed
     with torch.no_grad():
         assert cpu.is_supported(q, v)
         assert not cpu.is_supported(q[:, :, :100], v[:, :, :100])  # small

@@ -124,7 +124,7 @@ def test_the_module_without_a_gradient_is_the_same(monkeypatch, similarity, neig
 def test_what_the_kernels_are_asked_for():
     """The kernels are used only where they are supported and faster."""
     x = torch.randn(1024, 128)
-    assert not cpu.is_supported(x, 8, 64)  # a gradient may be wanted
+    assert not cpu.is_supported(x, 8, 64)  # a gradient may be needed
     with torch.no_grad():
         assert cpu.is_supported(x, 8, 64)
         assert not cpu.is_supported(x, 16, 64)  # eight numbers a head
