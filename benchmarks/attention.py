@@ -1,6 +1,6 @@
-"""Attention on a CPU, ours beside PyTorch's, in the encoder's shapes: ``python benchmarks/attention.py``.
+"""Attention on a CPU, our kernel and PyTorch's, in the encoder's shapes: ``python benchmarks/attention.py``.
 
-Errors are root mean squares of the difference to float64, as parts of the result's, of one head.
+Errors are root mean squares of the difference to float64, relative to that of the result, for one head.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ghgs_lit.encoder import cpu
 
-#: Sequences, heads and tokens of four views of 518²: within each view, across all.
+#: Sequences, heads, tokens and channels for four views of 518²: within each view, and across all views.
 SHAPES = {"frame": (4, 16, 1374, 64), "global": (1, 16, 5496, 64)}
 
 
@@ -23,13 +23,13 @@ def pytorch(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 
 
 def error(function: Callable, q: Tensor, k: Tensor, v: Tensor, exact: Tensor) -> float:
-    """Of what ``function`` makes of ``q``, ``k`` and ``v``, against float64 of unrounded ones."""
+    """Error of ``function(q, k, v)`` relative to ``exact``, computed in float64 from unrounded inputs."""
     found = function(q, k, v)[0, :, 0].double()
     return float(((found - exact).square().mean() / exact.square().mean()).sqrt())
 
 
 def seconds(functions: dict[str, Callable], repeats: int) -> dict[str, float]:
-    """Medians of calls in turn, after one of each."""
+    """Median seconds of each function, called in turn after one warm-up call."""
     times = {name: [] for name in functions}
     for i in range(repeats + 1):
         for name, function in functions.items():
@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    print("| attention | type | ours, GFLOP/s | PyTorch's | times as fast | error | PyTorch's |")
+    print("| attention | type | ours, GFLOP/s | PyTorch | ratio | error | PyTorch |")
     print("|---|---|---|---|---|---|---|")
     for name, (n, a, t, d) in SHAPES.items():
         qkv = torch.randn(n, t, 3, a, d, generator=torch.Generator().manual_seed(0)).permute(2, 0, 3, 1, 4)

@@ -1,20 +1,18 @@
 """Time, peak memory and FLOPs of a forward pass by stage: ``python benchmarks/encoder.py [--size vggt_1b]``.
 
 Random weights, an ellipsoid in front of a ring of cameras, ``skip=none``: every token and every pixel.
-Rates are beside those of matrix products that are measured before and after in the same run. The
-recalibration is beside a literal version of it (gathers, each layer anew; ``--literal``).
+Rates are compared with those of matrix products, measured before and after in the same run. With
+``--literal`` the recalibration is compared with a literal version (gathers, each layer by itself).
 """
 
 import argparse
-import ctypes
 import json
 import math
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -23,38 +21,22 @@ from omegaconf import OmegaConf
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from literal_recalibration import literal_recalibration
-from stage_scenes import make_batch
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 
 from ghgs_lit import encoder, recalibration
 from ghgs_lit.config import conf_dir
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Points, Tokens
+from tests.helpers.literal_recalibration import literal_recalibration
+from tests.helpers.scenes import make_batch
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-STATUS = Path("/proc/self/status")
-
-
-@dataclass
-class Stage:
-    """What one stage took. GB count from what the process held with weights and photographs."""
-
-    name: str
-    seconds: float
-    before_gb: float
-    peak_gb: float
-    gflop: float = 0.0
-
-
-def merged(name: str, stages: list[Stage]) -> Stage:
-    seconds, gflop = (sum(getattr(stage, field) for stage in stages) for field in ("seconds", "gflop"))
-    return Stage(name, seconds, stages[0].before_gb, max(stage.peak_gb for stage in stages), gflop)
 
 
 def configuration(size: str, options: list[str]) -> dict:
-    """The paper's model around an encoder of ``size``, every token and pixel taking part."""
+    """The paper's model with an encoder of ``size``, without skipping any token or pixel."""
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose("train", overrides=overrides)
@@ -64,7 +46,7 @@ def configuration(size: str, options: list[str]) -> dict:
 
 @torch.no_grad()
 def random_model(config: dict) -> GHGS:
-    """A model of random weights, without the cost of an initialisation that is thrown away."""
+    """A model with random weights, without the time of the usual initialisation."""
     with torch.device("meta"):
         model = GHGS.from_config(config)
     generator = torch.Generator().manual_seed(0)
@@ -81,38 +63,8 @@ def random_model(config: dict) -> GHGS:
     return model.eval()
 
 
-def memory_gb(field: str) -> float:
-    """``VmRSS`` (held now) or ``VmHWM`` (most since the last reset) of this process."""
-    line = next(line for line in STATUS.read_text().splitlines() if line.startswith(field + ":"))
-    return int(line.split()[1]) * 1024 / 1e9
-
-
-def reset_peak() -> None:
-    """Let ``VmHWM`` count anew from what is held now."""
-    Path("/proc/self/clear_refs").write_text("5")
-
-
-class Recorder:
-    """Times stages and reads their peaks from the kernel; ``base`` is what the process holds before."""
-
-    def __init__(self) -> None:
-        ctypes.CDLL(None).malloc_trim(0)
-        self.base = memory_gb("VmRSS")
-        self.stages: list[Stage] = []
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        ctypes.CDLL(None).malloc_trim(0)  # what is free and not yet given back is nobody's
-        before = memory_gb("VmRSS") - self.base
-        reset_peak()
-        start = time.perf_counter()
-        yield
-        seconds = time.perf_counter() - start
-        self.stages.append(Stage(name, seconds, before, memory_gb("VmHWM") - self.base))
-
-
 def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
-    """The encoder in two stages: patch tokens (DINOv2), then alternating attention."""
+    """The encoder, recorded as two stages: patch tokens (DINOv2), then alternating attention."""
     aggregator = model.encoder.aggregator
     embed = aggregator.patch_embed
 
@@ -143,7 +95,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
 
 @torch.no_grad()
 def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points]:
-    """``GHGS._predict``, stage by stage; the tokens and points that the recalibration saw."""
+    """``GHGS._predict``, stage by stage; returns the tokens and points that enter the recalibration."""
     interval = model.depth_head.interval(batch)
     tokens = _patch_tokens_first(model, record)(batch, interval)
     with record("depth head"):
@@ -164,8 +116,10 @@ def gflop_of(function: Callable) -> float:
 
 
 def count_gflop(config: dict, model: GHGS, batch: Batch) -> dict[str, float]:
-    """What each stage needs at least, multiplications and additions: the encoder's on the meta device, the
-    dense heads' on one image."""
+    """GFLOP of each stage without overhead, multiplications and additions.
+
+    The encoder's are counted on the meta device, those of the dense heads on one image.
+    """
     with torch.device("meta"):
         aggregator = GHGS.from_config(config).encoder.aggregator
     b, v, _, height, width = batch.images.shape
@@ -202,7 +156,7 @@ def best_seconds(function: Callable, repeats: int = 3) -> float:
 
 @torch.no_grad()
 def product_rates(tokens: int, width: int, dtype: torch.dtype) -> dict[str, float]:
-    """GFLOP/s of matrix products: ``torch.matmul`` of squares, and ours of squares and the encoder's own."""
+    """GFLOP/s of matrix products by ``torch.matmul`` and by ours: squares, and the encoder's shapes."""
 
     def rate(multiply: Callable, m: int, k: int, n: int) -> float:
         x, weight = torch.randn(m, k, dtype=dtype), torch.randn(n, k, dtype=dtype)
@@ -223,7 +177,7 @@ def product_rates(tokens: int, width: int, dtype: torch.dtype) -> dict[str, floa
 
 @torch.no_grad()
 def load_kernels(dtype: torch.dtype) -> float:
-    """Seconds until compiled kernels of the stages are there: compiled, or found on disk."""
+    """Seconds to compile the kernels of the stages, or to read them from disk."""
     start = time.perf_counter()
     x = torch.zeros(1, 16, 1024, 64, dtype=dtype)
     if encoder.cpu.is_supported(x, x):
@@ -236,7 +190,7 @@ def load_kernels(dtype: torch.dtype) -> float:
 
 @torch.no_grad()
 def literal_stage(model: GHGS, tokens: Tokens, points: Points) -> Stage:
-    """The recalibration of all layers of the first element, as the paper writes it down."""
+    """The recalibration of all layers of the first element, as the paper writes it."""
     record = Recorder()
     with record("recalibration, literal"):
         for layer in tokens.latent:
@@ -247,9 +201,9 @@ def literal_stage(model: GHGS, tokens: Tokens, points: Points) -> Stage:
 
 
 def training_stages(config: dict, batch: Batch) -> list[Stage]:
-    """One forward and backward pass of the encoder alone, all of it trained, without and with recomputing.
+    """One forward and backward pass of the encoder alone, fully trained, without and with checkpointing.
 
-    A whole ``vggt_1b`` takes tens of GB without: choose fewer blocks by ``encoder.depth``.
+    Without it a whole ``vggt_1b`` takes tens of GB: choose fewer blocks with ``encoder.depth``.
     """
     stages = []
     for checkpointing in (False, True):
@@ -266,7 +220,7 @@ def training_stages(config: dict, batch: Batch) -> list[Stage]:
 
 
 def report(stages: list[Stage], rates: dict[str, float], floor: float) -> None:
-    """Print the tables in Markdown; ``floor`` is what the process held with weights and photographs."""
+    """Print the tables in Markdown; ``floor`` is the memory with weights and photographs, in GB."""
     print("| product | GFLOP/s |\n|---|---|")
     for name, rate in rates.items():
         print(f"| {name} | {rate:.0f} |")
@@ -279,7 +233,7 @@ def report(stages: list[Stage], rates: dict[str, float], floor: float) -> None:
         share = f"{rate:.0f} | {rate / yardstick:.0%} | {rate / best:.0%}" if stage.gflop else "- | - | -"
         memory = f"{stage.before_gb:.2f} | {stage.peak_gb:.2f}"
         print(f"| {stage.name} | {stage.gflop:.0f} | {stage.seconds:.2f} | {share} | {memory} |")
-    print(f"\nGB are above the {floor:.2f} GB that the process holds with code, weights and photographs.")
+    print(f"\nGB are in addition to the {floor:.2f} GB of code, weights and photographs.")
 
 
 def main() -> None:

@@ -1,11 +1,11 @@
-"""Samples a second that the data loader gives, by number of workers.
+"""Samples per second of the data loader, by number of workers.
 
     python benchmarks/loading.py                      # a miniature of THuman2.0 at its true size, 1024 x 1024
     python benchmarks/loading.py data=humman data.root=/data/humman
 
-Takes the overrides of ``ghgs prepare`` for the data, and ``--workers 0,1,2`` and ``--seconds 10``. Decoded
-photographs are not kept, so that every sample is read and decoded: the rate of a data set that is larger
-than the memory. The first batch, which starts the processes, does not count.
+The arguments are the overrides of ``ghgs prepare`` for the data, ``--workers 0,1,2`` and ``--seconds 10``.
+Decoded photographs are not kept, so every sample is read and decoded, as for a data set larger than the
+memory. The first batch, which starts the processes, does not count.
 """
 
 import argparse
@@ -32,7 +32,7 @@ def build_data(overrides: list[str]) -> PhotographsDataModule:
 
 
 def rate(data: PhotographsDataModule, workers: int, seconds: float) -> tuple[float, int]:
-    """Samples a second with so many workers, and how many were counted."""
+    """Samples per second with a number of workers, and how many samples were counted."""
     data.workers = workers
     batches = iter(data.train_dataloader())
     next(batches)
@@ -56,7 +56,7 @@ def main() -> None:
             thuman2.make(Path(folder), {"train": 1}, arguments.size, 0, vids=(0, 2, 3, 4), positions=4)
             overrides = ["data=thuman2", f"data.root={folder}", *overrides]
         data = build_data(overrides)
-        table = Table("workers", "samples/s", "ms a sample", "samples")
+        table = Table("workers", "samples/s", "ms per sample", "samples")
         for workers in (int(n) for n in arguments.workers.split(",")):
             measured, samples = rate(data, workers, arguments.seconds)
             table.add_row(str(workers), f"{measured:.1f}", f"{1000 / measured:.1f}", str(samples))

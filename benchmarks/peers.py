@@ -1,11 +1,12 @@
-"""Two other ways to splat on a CPU, against which the project's rasterizer is measured.
+"""Two other rasterizers for CPUs, with which the project's rasterizer is compared.
 
-``box``: what CPU tools do today. Every splat, in depth order, loops over the pixels of its 3-sigma box:
-compiled by Numba with all optimisations, one thread, colours only, forward and hand-written backward.
-``torch``: tiles of 16 x 16 pixels in plain PyTorch, splats in chunks of 64, a tile ending early once all
-of its pixels are opaque; gradients by autograd. Ratios depend on tile and chunk, so they are fixed.
+``box``: the method of today's CPU tools. Every splat, in depth order, loops over the pixels of its 3-sigma
+box; compiled by Numba with all optimisations, one thread, colours only, forward and hand-written backward.
+``torch``: tiles of 16 x 16 pixels in plain PyTorch, splats in chunks of 64; a tile ends early when all of
+its pixels are opaque; gradients by autograd. Results depend on the sizes of tile and chunk, so these are
+fixed.
 
-Both take the splats of the reference's projection (plain PyTorch, differentiable) in float32.
+Both use the reference's projection (plain PyTorch, differentiable) in float32.
 """
 
 import math
@@ -26,20 +27,19 @@ def _project(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor, Ten
     """Centres [n, 2], inverse covariances (xx, xy, yy), opacities and colours, front to back; radii."""
     index = reference.visible(gaussians, camera, _SETTINGS, 0.01, 1e10)
     splats = reference.project(gaussians.select(index, (len(index),)), camera, _SETTINGS)
-    xx, xy, yy = splats["covariances"].unbind(-1)
-    inverse = torch.stack((yy, -xy, xx), dim=-1) / splats["determinants"][:, None]
+    xx, xy, yy = splats.covariances.unbind(-1)
+    inverse = torch.stack((yy, -xy, xx), dim=-1) / splats.determinants[:, None]
     with torch.no_grad():
         middle = 0.5 * (xx + yy)
-        radii = 3 * (middle + (middle**2 - splats["determinants"]).clamp_min(0.01).sqrt()).sqrt()
-    return splats["centers"], inverse, splats["opacities"], splats["colors"], radii
+        radii = 3 * (middle + (middle**2 - splats.determinants).clamp_min(0.01).sqrt()).sqrt()
+    return splats.centers, inverse, splats.opacities, splats.colors, radii
 
 
 def render_box(gaussians: Gaussians, camera: Cameras) -> Tensor:
     """Colours [3, h, w] of one camera."""
     *splats, radii = _project(gaussians, camera)
-    return _Box.apply(*(value.contiguous() for value in splats), radii, camera.height, camera.width).permute(
-        2, 0, 1
-    )
+    image = _Box.apply(*(value.contiguous() for value in splats), radii, camera.height, camera.width)
+    return image.permute(2, 0, 1)
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
@@ -75,7 +75,7 @@ def _box_backward(
     centers, inverse, opacities, colors, radii, transmittance, last, upstream, behind, d_centers, d_inverse,
     d_opacities, d_colors,
 ):  # fmt: skip
-    """Back to front: ``behind`` [h, w] is the gradient's product with all that lies behind, by weight."""
+    """Back to front; ``behind`` [h, w] is the gradient times the weighted colours behind a splat."""
     height, width = transmittance.shape
     for n in range(len(centers) - 1, -1, -1):
         u, v, radius, opacity = centers[n, 0], centers[n, 1], radii[n], opacities[n]

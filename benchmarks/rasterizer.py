@@ -1,8 +1,8 @@
 """Measure the CPU rasterizer: ``python benchmarks/rasterizer.py [--quick] [--json FILE] [--pictures DIR]``.
 
-The scene is a closed body of flat splats that covers 19 % of the frame, one splat's sigma to a splat's
-distance on the surface. Runs are interleaved, so that whatever else the machine does hits all alike;
-ratios are of minima.
+The scene is a closed body of flat splats that covers 19 % of the frame; the sigma of a splat is about the
+distance to the next one. Runs are interleaved, so that other load on the machine affects all alike; ratios
+are those of minima.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 import peers
 import rasterizer_checks as checks
 
@@ -28,7 +28,7 @@ COVERED = 0.19
 
 
 def scene(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
-    """Splats on an ellipsoid seen by one camera, with gradients wanted for all of them."""
+    """Splats that require gradients on an ellipsoid, and one camera."""
     generator = torch.Generator().manual_seed(seed)
     normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     focal, distance = 1.4 * size, 3.0
@@ -41,7 +41,7 @@ def scene(count: int, size: int, seed: int = 0) -> tuple[Gaussians, Cameras]:
     spacing = math.sqrt(surface / count)
     scales = spacing * (0.6 + 0.8 * torch.rand(count, 3, generator=generator))
     scales[:, 2] *= 0.1
-    # The rotation that takes z to the normal of the unit sphere: near enough to the ellipsoid's.
+    # The rotation from z to the normal of the unit sphere, which is close to the ellipsoid's.
     quaternions = torch.stack((1 + normal[:, 2], -normal[:, 1], normal[:, 0], torch.zeros(count)), dim=-1)
     values = {
         "means": normal * axes,
@@ -81,7 +81,7 @@ def time_once(name: str, threads: int, gaussians: Gaussians, cameras: Cameras, u
 
 
 def measure(count: int, size: int, repeats: dict[str, int]) -> dict[tuple[str, int], dict]:
-    """Minima and medians in ms of every contender: ours with one and two threads, box with one."""
+    """Minima and medians in ms of every contender and number of threads."""
     gaussians, cameras = scene(count, size)
     upstream = torch.randn(3, size, size, generator=torch.Generator().manual_seed(1))
     runs = [("ours", 1), ("ours", 2), ("box", 1), ("torch", 2)]
@@ -108,13 +108,13 @@ def _summary(found: list[tuple[float, float]]) -> dict:
 
 
 def repeats(count: int, quick: bool) -> dict[str, int]:
-    """Runs of each contender; pure PyTorch takes minutes at 200 000 splats and has no turn there."""
+    """Number of runs of each contender; none of plain PyTorch for 200 000 splats: it takes minutes."""
     slow = 0 if count > 50_000 else 1 if quick else 3
     return {"ours": 12 if quick else 40, "box": 5 if quick else 12, "torch": slow}
 
 
 def rows_of(count: int, size: int, found: dict[tuple[str, int], dict]) -> list[dict]:
-    """One row for ours with one and with two threads against each peer."""
+    """One row for each number of threads and each peer."""
     rows = []
     for threads in (1, 2):
         own = found["ours", threads]
@@ -133,17 +133,10 @@ def rows_of(count: int, size: int, found: dict[tuple[str, int], dict]) -> list[d
 def print_times(sizes: tuple[int, ...], quick: bool) -> list[dict]:
     """Measure and print the table of times; returns its rows."""
     rows = []
-    columns = (
-        "splats",
-        "size",
-        "threads",
-        "forward ms",
-        "backward ms",
-        "median ms",
-        "peer (threads)",
-        "peer ms",
+    print(
+        "| splats | size | threads | forward ms | backward ms | median ms | peer (threads) | peer ms ", end=""
     )
-    print(f"| {' | '.join(columns)} | peer / ours |\n{'|---' * 9}|")
+    print(f"| peer / ours |\n{'|---' * 9}|")
     for size in sizes:
         for count in (5_000, 50_000, 200_000):
             found = measure(count, size, repeats(count, quick))
@@ -158,7 +151,7 @@ def print_times(sizes: tuple[int, ...], quick: bool) -> list[dict]:
 
 
 def print_checks() -> dict:
-    """Measure and print errors against float64 and the seconds of the first use; returns them."""
+    """Measure and print errors against float64 and the seconds of the first use; returns both."""
     found = {
         "body": checks.errors(*scene(1_500, 64)),
         "person": checks.errors(*checks.person(3_000, 64, 32)),

@@ -1,4 +1,4 @@
-"""What times do not show of the CPU rasterizer: its errors, its first use, and pictures of a person."""
+"""Further measurements of the CPU rasterizer: its errors, its first use, and pictures of a person."""
 
 import os
 import subprocess
@@ -16,9 +16,9 @@ from torch import Tensor
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.synthesis.people import TexturedMesh, generate
 from ghgs_lit.types import Cameras, Gaussians
+from tests.helpers.splats import FIELDS, ambiguous, differentiate, relative_error
 
-FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
-# Differences in pictures are shown this many times larger.
+# Factor by which differences are magnified in pictures.
 AMPLIFIED = 1e6
 
 _FIRST_USE = """
@@ -37,7 +37,7 @@ print(time.perf_counter() - start)
 
 
 def first_use() -> tuple[float, float]:
-    """Seconds of the first forward and backward pass of a new process: nothing compiled yet, then cached."""
+    """Seconds of the first forward and backward pass of a new process: without a cache, and with it."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
         command = [sys.executable, "-c", _FIRST_USE]
@@ -45,50 +45,20 @@ def first_use() -> tuple[float, float]:
     return float(runs[0].stdout), float(runs[1].stdout)
 
 
-def _differentiate(gaussians: Gaussians, cameras: Cameras, backend: str, dtype, weights: list[Tensor]):
-    fields = [getattr(gaussians, name).detach().to(dtype).requires_grad_() for name in FIELDS]
-    rendering = render(Gaussians(*fields, splits=gaussians.splits), cameras, backend)
-    outputs = (rendering.image, rendering.alpha)
-    total = sum((output.double() * weight).sum() for output, weight in zip(outputs, weights, strict=True))
-    slopes = torch.autograd.grad(total, fields)
-    return [output.detach() for output in outputs], slopes
-
-
-@torch.no_grad()
-def _ambiguous(gaussians: Gaussians, cameras: Cameras) -> Tensor:
-    """Pixels whose thresholds float32 may decide otherwise than float64: those that a hair's move changes."""
-    default = RasterSettings()
-    images = []
-    for sign in (-1, 1):
-        moved = RasterSettings(
-            alpha_min=default.alpha_min * (1 + sign * 1e-5),
-            stop=default.stop * (1 + sign * 1e-3),
-            extent=default.extent * (1 + sign * 1e-6),
-        )
-        images.append(render(gaussians.to(torch.float64), cameras, "reference", settings=moved))
-    change = (images[0].image - images[1].image).abs().sum(2, keepdim=True)
-    return (change + (images[0].alpha - images[1].alpha).abs()) != 0
-
-
 def errors(gaussians: Gaussians, cameras: Cameras) -> dict[str, float]:
     """Relative L2 errors of the CPU backend against the reference in float64, without ambiguous pixels."""
     gaussians = gaussians.detach()
-    unsure = _ambiguous(gaussians, cameras)
+    unsure = ambiguous(gaussians, cameras, RasterSettings())
     generator = torch.Generator().manual_seed(1)
     size = (cameras.height, cameras.width)
     weights = [torch.randn(*cameras.shape, c, *size, generator=generator).double() * ~unsure for c in (3, 1)]
-    truth, slopes = _differentiate(gaussians, cameras, "reference", torch.float64, weights)
-    found, others = _differentiate(gaussians, cameras, "cpu", torch.float32, weights)
-
-    def error(value: Tensor, wanted: Tensor) -> float:
-        return float((value.double() - wanted).norm() / wanted.norm())
-
-    images = [error(a * ~unsure, b * ~unsure) for a, b in zip(found, truth, strict=True)]
-    gradients = [error(a, b) for a, b in zip(others, slopes, strict=True)]
+    weights.append(torch.zeros_like(weights[1]))  # depth is left out
+    truth, slopes = differentiate(gaussians, cameras, "reference", torch.float64, weights)
+    found, others = differentiate(gaussians, cameras, "cpu", torch.float32, weights)
     return {
-        "image": images[0],
-        "alpha": images[1],
-        "gradient": max(gradients),
+        "image": relative_error(found.image * ~unsure, truth.image * ~unsure),
+        "alpha": relative_error(found.alpha * ~unsure, truth.alpha * ~unsure),
+        "gradient": max(relative_error(others[name], slopes[name]) for name in FIELDS),
         "ambiguous": float(unsure.double().mean()),
     }
 
@@ -107,7 +77,7 @@ def person(count: int, height: int, width: int, index: int = 0) -> tuple[Gaussia
         torch.from_numpy(np.concatenate(s)).float() for s in zip(*samples, strict=True)
     )
     spacing = float(np.sqrt(total / count))
-    # The rotation that takes z to the normal; a normal of -z is turned about x.
+    # The rotation from z to the normal; 1e-6 avoids the zero quaternion for a normal of -z.
     quaternions = torch.stack(
         (1 + normals[:, 2] + 1e-6, -normals[:, 1], normals[:, 0], torch.zeros(len(points))), dim=-1
     )
@@ -132,7 +102,7 @@ def _areas(part: TexturedMesh) -> np.ndarray:
 
 
 def _sample(part: TexturedMesh, areas: np.ndarray, count: int, generator) -> tuple[np.ndarray, ...]:
-    """Points, normals and colours of ``count`` places on a mesh, less those that its texture cuts away."""
+    """Points, normals and colours at ``count`` random places of a mesh, without transparent texels."""
     chosen = generator.choice(len(areas), count, p=areas / areas.sum())
     weights = generator.dirichlet((1, 1, 1), count)[..., None]
     corners = part.vertices[part.faces[chosen]]
@@ -149,9 +119,9 @@ def _sample(part: TexturedMesh, areas: np.ndarray, count: int, generator) -> tup
 
 @torch.no_grad()
 def pictures(folder: Path, backends: dict[str, Callable[[Gaussians, Cameras], Tensor]]) -> Path:
-    """A person by every backend (images [3, h, w]), and below each its difference from the reference.
+    """A person drawn by every backend (images [3, h, w]), and below each its difference from the reference.
 
-    The reference is drawn in float64; differences are ``AMPLIFIED`` times larger.
+    The reference is drawn in float64; differences are magnified ``AMPLIFIED`` times.
     """
     folder.mkdir(parents=True, exist_ok=True)
     gaussians, cameras = person(15_000, 256, 128)

@@ -2,8 +2,8 @@
 
     python benchmarks/weights.py [--tiny] [--folder DIR]
 
-Every step runs in a process of its own, whose peak resident memory (mapped pages of files included) is
-compared with the size of the model that it makes. Needs 13 GB of disk and 5 GB of memory; ``--tiny`` little.
+Every step runs in its own process, whose peak resident memory (including mapped pages of files) is compared
+with the size of the model. Needs 13 GB of disk and 5 GB of memory; much less with ``--tiny``.
 """
 
 import argparse
@@ -21,16 +21,17 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.files import write_atomically
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights import names
-from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_aside
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_tensors
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.reading import open_file
 
 TINY = ["encoder.width=64", "encoder.depth=4", "encoder.layers=[0,1,2,3]", "encoder.vit.depth=2"]
 
-#: Shapes that stand for what VGGT-1B has beside the aggregator.
+#: Shapes that represent the parts of VGGT-1B other than the aggregator.
 OTHERS = {"camera_head.x": (2048, 9), "point_head.x": (256, 2048), "track_head.x": (384, 384)}
 
 
@@ -41,7 +42,7 @@ def config(tiny: bool) -> dict:
 
 
 def make(folder: Path, tiny: bool) -> None:
-    """Random files under the published names, one after the other."""
+    """Write random weights under the published names, one file at a time."""
     own = GHGS.from_config(config(tiny), empty=STAGES).state_dict()
     torch.manual_seed(0)
     for file, table, entry in (
@@ -52,24 +53,24 @@ def make(folder: Path, tiny: bool) -> None:
         shapes.pop(None)
         shapes |= OTHERS if entry is None else {}
         tensors = {name: torch.randn(shape).mul_(0.02) for name, shape in shapes.items()}
-        write_aside(
+        write_atomically(
             folder / file, lambda path, f=file, t=tensors, e=entry: write_tensors(Path(f).suffix, path, t, e)
         )
 
 
-def bring(folder: Path, tiny: bool, dtype: str = "float32") -> None:
+def import_(folder: Path, tiny: bool, dtype: str = "float32") -> None:
     files = str(folder / "vggt.safetensors"), str(folder / "release.pth")
     print("\n".join(import_weights(config(tiny), folder / f"{dtype}.ckpt", *files, dtype)))
 
 
 def load(folder: Path, dtype: torch.dtype | None = None) -> None:
-    """Every weight is touched, as a forward pass would."""
+    """Load the model and read every weight, as a forward pass would."""
     model = GHGS.from_checkpoint(folder / "float32.ckpt", dtype=dtype)
     assert all(parameter.isfinite().all() for parameter in model.parameters())
 
 
 def compare(folder: Path) -> None:
-    """What came out is what went in, bit by bit."""
+    """Check that exported files equal the imported ones bit by bit."""
     count = 0
     for name, entry in (("vggt.safetensors", None), ("release.pth", names.RELEASE_ENTRY)):
         before, after = (open_file(folder / part / name) for part in (".", "back"))
@@ -83,8 +84,8 @@ def compare(folder: Path) -> None:
 
 
 STEPS = {
-    "import": bring,
-    "import in bfloat16": lambda folder, tiny: bring(folder, tiny, "bfloat16"),
+    "import": import_,
+    "import in bfloat16": lambda folder, tiny: import_(folder, tiny, "bfloat16"),
     "load": lambda folder, tiny: load(folder),
     "load in bfloat16": lambda folder, tiny: load(folder, torch.bfloat16),
     "export": lambda folder, tiny: export_weights(

@@ -6,21 +6,33 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, run
+from ghgs_lit.encoder.block import Block, run_block
 from ghgs_lit.encoder.rope import rotary_tables, token_positions
 from ghgs_lit.errors import require
 
 NORM_EPS = 1e-5
 
+#: Tokens after a frame block and after the global block that follows it.
 Pair = tuple[Float[Tensor, "n t c"], Float[Tensor, "n t c"]]
 
 
 class Aggregator(nn.Module):
-    """``depth`` pairs of a frame and a global block on the patch tokens of ``patch_embed``.
+    """``depth`` pairs of a frame block and a global block on the patch tokens of ``patch_embed``.
 
-    Each view's sequence is [camera, registers, patches]. The first view has camera and register tokens
-    of its own and so fixes the frame of reference: exchanging it for another changes the result, any
-    other permutation of views only permutes it.
+    Each view's sequence is [camera, registers, patches]. The first view has its own camera and register
+    tokens, so it defines the frame of reference: another first view changes the result; any other
+    permutation of the views only permutes it.
+
+    Args:
+        patch_embed: [n, i, H, W] images to [n, p, width] patch tokens.
+        patch_size: side of a patch in pixels.
+        width: channels of a token.
+        heads: attention heads of each block.
+        depth: number of pairs of blocks.
+        registers: register tokens of each view.
+        layers: indices of the pairs that are read out, ascending; the last pair must be among them.
+        layer_scale: initial value of LayerScale.
+        checkpointing: recompute activations in the backward pass instead of keeping them.
     """
 
     def __init__(
@@ -67,13 +79,20 @@ class Aggregator(nn.Module):
         self.frame_blocks, self.global_blocks = blocks(), blocks()
 
     def special_tokens(self, views: int) -> Float[Tensor, "v s c"]:
-        """Camera and register tokens: slot 0 for the first view, slot 1 for the others."""
+        """Camera and register tokens: number 0 for the first view, number 1 for all others."""
         tokens = torch.cat((self.camera_token, self.register_token), dim=2)[0]
         return torch.cat((tokens[:1], tokens[1:].expand(views - 1, -1, -1)))
 
     def forward(self, images: Float[Tensor, "b v i H W"]) -> tuple[list[Pair], Float[Tensor, "bv p c"]]:
-        """Normalised images to the tokens after the frame and the global block of each read-out layer
-        (special tokens included, ``[B*V, special + P, C]`` each) and the patch tokens that entered."""
+        """Tokens of the layers that are read out.
+
+        Args:
+            images: normalised images, [B, V, channels, H, W].
+
+        Returns:
+            For each layer in ``layers`` the tokens after its frame block and after its global block, special
+            tokens included ([B * V, special + P, C] each); and the patch tokens that entered.
+        """
         b, v, _, height, width = images.shape
         patches = self.patch_embed(images.flatten(0, 1))
         special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)
@@ -89,9 +108,9 @@ class Aggregator(nn.Module):
         for i, (frame_block, global_block) in enumerate(
             zip(self.frame_blocks, self.global_blocks, strict=True)
         ):
-            frame = run(frame_block, x, self.checkpointing, inside)
+            frame = run_block(frame_block, x, self.checkpointing, inside)
             sequence = frame.unflatten(0, (b, v)).flatten(1, 2)
-            x = run(global_block, sequence, self.checkpointing, across).view_as(frame)
+            x = run_block(global_block, sequence, self.checkpointing, across).view_as(frame)
             if i in self.layers:
                 pairs.append((frame, x))
         return pairs, patches

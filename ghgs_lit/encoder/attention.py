@@ -13,7 +13,13 @@ from ghgs_lit.kernels.linear import Linear
 
 
 class Attention(nn.Module):
-    """``qk_norm`` normalises q and k over the channels of a head, before they are rotated."""
+    """Multi-head self-attention.
+
+    Args:
+        width: channels of a token.
+        heads: number of heads.
+        qk_norm: normalise q and k over the channels of each head, before they are rotated.
+    """
 
     def __init__(self, width: int, heads: int, qk_norm: bool):
         super().__init__()
@@ -26,18 +32,18 @@ class Attention(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
         q, k, v = rearrange(self.qkv(x), "n t (s a d) -> s n a t d", s=3, a=self.heads)
-        q, k = self._place(q, self.q_norm, rotary), self._place(k, self.k_norm, rotary)
+        q, k = self._norm_and_rotate(q, self.q_norm, rotary), self._norm_and_rotate(k, self.k_norm, rotary)
         if cpu.is_supported(q, v):
             return self.proj(cpu.attend(q, k, v).flatten(2))
         y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
         return self.proj(rearrange(y, "n a t d -> n t (a d)"))
 
-    def _place(self, x: Float[Tensor, "n a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
-        """Normalise queries or keys and turn them by their positions; without a gradient in place."""
+    def _norm_and_rotate(self, x: Float[Tensor, "n a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
+        """Normalise queries or keys and rotate them by their positions; in place without a gradient."""
         if rotary is None:
             return norm(x)
         if torch.is_grad_enabled():
             return rotate(norm(x), rotary)
-        for head in x.unbind(1):  # one by one: nothing of the size of all is held besides
+        for head in x.unbind(1):  # one head at a time, so no second tensor of the full size is held
             head.copy_(rotate(norm(head), rotary))
         return x

@@ -1,4 +1,4 @@
-"""Pre-norm transformer block with LayerScale, shared by the ViT and the aggregator."""
+"""Pre-norm transformer block with LayerScale, used by the ViT and the aggregator."""
 
 import torch
 import torch.nn.functional as F
@@ -11,12 +11,12 @@ from ghgs_lit.encoder.rope import Rotary
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.parts import even_parts
 
-#: Values inside the MLP that are held at once where no gradient is kept.
+#: Hidden values of the MLP that are held at once without a gradient (bounds memory).
 _HIDDEN = 1 << 23
 
 
 class LayerScale(nn.Module):
-    """Adds a branch to the residual stream, each channel scaled by its own learned ``gamma``."""
+    """Adds a branch to the residual stream, scaled by a learned ``gamma`` for each channel."""
 
     def __init__(self, width: int, init: float):
         super().__init__()
@@ -27,7 +27,7 @@ class LayerScale(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two linear layers, four times as wide inside, with the exact GELU."""
+    """Two linear layers with the exact GELU between them; the hidden width is ``4 * width``."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -54,22 +54,26 @@ class Block(nn.Module):
         x = self.ls1(x, self.attn(self.norm1(x), rotary))
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))
-        # What ls1 has just made is nobody else's: it is added to in place, some tokens at a time.
+        # x is the fresh result of ls1, so it can be changed in place, a part of the tokens at a time.
         tokens = x.flatten(0, 1)
         for rows in even_parts(len(tokens), _HIDDEN // (4 * x.shape[-1])):
             tokens[rows].addcmul_(self.mlp(self.norm2(tokens[rows])), self.ls2.gamma)
         return x
 
 
-def run(
+def run_block(
     block: Block, x: Float[Tensor, "n t c"], checkpointing: bool, rotary: Rotary | None = None
 ) -> Float[Tensor, "n t c"]:
-    """``block(x)``, with a gradient only where something before or inside the block wants one.
+    """``block(x)``; no gradient is recorded where neither ``x`` nor the block needs one.
 
-    With ``checkpointing`` the block's activations are recomputed in the backward pass.
+    Args:
+        block: the block to run.
+        x: tokens.
+        checkpointing: recompute the block's activations in the backward pass instead of keeping them.
+        rotary: tables that rotate queries and keys; None for no rotation.
     """
-    wanted = x.requires_grad or any(p.requires_grad for p in block.parameters())
-    with torch.set_grad_enabled(wanted and torch.is_grad_enabled()):
+    needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
+    with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):
         if checkpointing and torch.is_grad_enabled():
             return checkpoint(block, x, rotary, use_reentrant=False)
         return block(x, rotary)

@@ -1,4 +1,4 @@
-"""From normalised pictures to patch tokens by convolution: one linear patch, or a small stem."""
+"""Normalised images to patch tokens: one linear projection of each patch, or a small convolutional stem."""
 
 import torch.nn.functional as F
 from einops import rearrange
@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class PatchEmbed(nn.Module):
-    """One convolution whose kernel is a patch."""
+    """One convolution whose kernel and stride are the patch size (a linear projection of each patch)."""
 
     def __init__(self, in_channels: int, width: int, patch_size: int):
         super().__init__()
@@ -18,17 +18,23 @@ class PatchEmbed(nn.Module):
 
 
 class ChannelNorm(nn.LayerNorm):
-    """LayerNorm over the channels of a map ``[n, c, h, w]``."""
+    """LayerNorm over the channels of feature maps [n, c, h, w]."""
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class ConvStem(nn.Module):
-    """Halve while the patch size is even, take the odd rest in one strided convolution, mix neighbours.
+    """Overlapping convolutions: with them a small encoder learns edges and the silhouette much sooner.
 
-    A few overlapping convolutions let a small encoder that is trained from scratch see edges and the
-    silhouette much sooner than a linear patch does.
+    The image is halved while the patch size is even; one strided convolution does the odd remainder; a last
+    convolution mixes neighbouring patches.
+
+    Args:
+        in_channels: channels of the image.
+        width: channels of a token.
+        patch_size: side of a patch in pixels.
+        channels: channels after the first convolution; doubled at each halving, up to ``width``.
     """
 
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):

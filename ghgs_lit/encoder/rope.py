@@ -1,7 +1,7 @@
-"""Two-dimensional rotary positions: the first half of a head turns with the row, the second with the column.
+"""Two-dimensional rotary position embedding (RoPE): half of a head turns with the row, half with the column.
 
-Angles are float32 or wider whatever the precision of the tokens: in bfloat16 a rounded angle would move
-its cosine by up to 6e-2, a rounded cosine only by 2e-3.
+Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would change its
+cosine by up to 6e-2, rounding the cosine itself only by 2e-3.
 """
 
 from typing import NamedTuple
@@ -16,25 +16,31 @@ BASE = 100.0
 
 
 class Rotary(NamedTuple):
-    """Factors of every token and channel of a head; ``sine`` carries the sign of its partner's term."""
+    """Cosine and sine for every token and channel of a head; the sine has the sign of its term."""
 
     cosine: Float[Tensor, "t d"]
     sine: Float[Tensor, "t d"]
 
     def repeat(self, views: int) -> "Rotary":
-        """Tables for ``views`` sequences laid end to end: every view has the same positions."""
+        """Tables for the concatenated sequences of ``views`` views; all views have the same positions."""
         return Rotary(self.cosine.repeat(views, 1), self.sine.repeat(views, 1))
 
 
 def token_positions(height: int, width: int, special: int, device=None) -> Int[Tensor, "t 2"]:
-    """``(row, column)`` of a sequence: ``special`` tokens at (0, 0), then patches from (1, 1), row-major."""
+    """``(row, column)`` of each token: ``special`` tokens at (0, 0), then patches from (1, 1), row by row."""
     rows = torch.arange(1, height + 1, device=device).repeat_interleave(width)
     columns = torch.arange(1, width + 1, device=device).repeat(height)
     return torch.nn.functional.pad(torch.stack((rows, columns), dim=-1), (0, 0, special, 0))
 
 
 def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
-    """Tables for heads of ``head_width`` channels (divisible by 4), wide enough for tokens ``like``."""
+    """Tables of all tokens.
+
+    Args:
+        positions: row and column of each token.
+        head_width: channels of a head, divisible by 4.
+        like: tokens; the tables are float32, or float64 for tokens in float64.
+    """
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
     angles = angles.to(at_least_float32(like).dtype)
@@ -45,6 +51,6 @@ def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) 
 
 
 def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*batch t d"]:
-    """Turn channel ``m`` of each half of a head with its partner ``m + d/4``; in the tables' type."""
+    """Rotate channel ``m`` of each half of a head with its partner ``m + d/4``; in the tables' dtype."""
     quarters = x.unflatten(-1, (2, 2, x.shape[-1] // 4))
     return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, run
+from ghgs_lit.encoder.block import Block, run_block
 from ghgs_lit.encoder.patch import PatchEmbed
 from ghgs_lit.errors import require
 
@@ -15,7 +15,19 @@ NORM_EPS = 1e-6
 
 
 class VisionTransformer(nn.Module):
-    """Tokens in the order class, registers, patches; stored positions of ``image_size`` are resampled."""
+    """DINOv2 ViT; tokens are in the order class, registers, patches.
+
+    Args:
+        in_channels: channels of the image.
+        width: channels of a token.
+        depth: number of blocks.
+        heads: attention heads of each block.
+        patch_size: side of a patch in pixels.
+        image_size: side in pixels of the square image whose position embedding is stored; for other sizes
+            it is resampled.
+        registers: number of register tokens.
+        checkpointing: recompute activations in the backward pass instead of keeping them.
+    """
 
     def __init__(
         self,
@@ -37,7 +49,7 @@ class VisionTransformer(nn.Module):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + (image_size // patch_size) ** 2, width))
         self.register_tokens = nn.Parameter(torch.zeros(1, registers, width))
-        # Stands in for hidden patches in DINOv2's own training; kept so that its weights load strictly.
+        # Replaces masked patches in DINOv2's own training; kept so that its weights load strictly.
         self.mask_token = nn.Parameter(torch.zeros(1, width), requires_grad=False)
         self.blocks = nn.ModuleList(
             Block(width, heads, qk_norm=False, norm_eps=NORM_EPS, layer_scale=1.0) for _ in range(depth)
@@ -55,7 +67,7 @@ class VisionTransformer(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def positions(self, height: int, width: int, dtype: torch.dtype) -> Float[Tensor, "1 t c"]:
-        """Class and patch positions on a grid of ``height`` x ``width`` patches, resampled in float32."""
+        """Position embedding of class and patches on ``height`` x ``width`` patches, resampled in float32."""
         side = math.isqrt(self.pos_embed.shape[1] - 1)
         if (height, width) == (side, side):
             return self.pos_embed.to(dtype)
@@ -65,7 +77,7 @@ class VisionTransformer(nn.Module):
         return torch.cat((table[:, :1], grid.flatten(2).mT), dim=1).to(dtype)
 
     def embed(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n t c"]:
-        """The sequence that enters the first block."""
+        """The input sequence of the first block."""
         n, _, height, width = images.shape
         patches = self.patch_embed(images)
         positions = self.positions(height // self.patch_size, width // self.patch_size, patches.dtype)
@@ -76,7 +88,7 @@ class VisionTransformer(nn.Module):
         """Class, register and patch tokens after the final norm."""
         x = self.embed(images)
         for block in self.blocks:
-            x = run(block, x, self.checkpointing)
+            x = run_block(block, x, self.checkpointing)
         return self.norm(x)
 
     def forward(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n p c"]:

@@ -1,1 +1,1 @@
-"""What the kernels of a CPU share: compilation and its cache, vectors, memory, threads."""
+"""Shared parts of the CPU kernels: compilation with a cache on disk, vectors, memory access, threads."""

@@ -1,4 +1,4 @@
-"""Compile a kernel with Numba and keep its machine code on disk for as long as it is right."""
+"""Compile kernels with Numba and keep their machine code on disk while their sources stay the same."""
 
 import hashlib
 from functools import cache
@@ -7,7 +7,7 @@ from pathlib import Path
 import llvmlite.binding
 import numba
 
-# Kernels are called from Python only, helpers from kernels only: no other way in is compiled.
+# Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
@@ -23,10 +23,10 @@ def _digest(folder: Path) -> str:
 def kernel(function):
     """Compile ``function`` on first use; it runs without the interpreter lock.
 
-    Numba's cache notices a changed file, but neither changed globals nor other modules whose code was
+    Numba's cache notices a changed file, but not changed globals or other modules whose code was
     inlined, and installers may keep a file's time stamp. So cached code is stamped with the digest of all
-    sources of this package and of the kernel's folder. Without a writable place for a cache, kernels
-    compile in each process.
+    sources of this package and of the kernel's folder. Where no folder for the cache is writable, each
+    process compiles again.
     """
     try:
         compiled = numba.njit(cache=True, **_OPTIONS)(function)
@@ -36,13 +36,24 @@ def kernel(function):
     return compiled
 
 
+def kernel_for(function, *argument_types):
+    """:func:`kernel` for one signature, compiled or read from the cache now.
+
+    No other signature is compiled later: contiguous arrays would cause another compilation for no gain.
+    """
+    compiled = kernel(function)
+    compiled.compile(argument_types)
+    compiled.disable_compile()
+    return compiled
+
+
 def helper(function):
-    """A function that kernels call; it is compiled into them."""
+    """A function that only kernels call; it is inlined into them."""
     return numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)(function)
 
 
 def processor_features() -> set[str]:
-    """Names that LLVM has for what kernels may use of this processor, such as ``avx512bf16``."""
+    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``."""
     names = numba.config.CPU_FEATURES
     if names is None:
         names = llvmlite.binding.get_host_cpu_features().flatten()

@@ -1,8 +1,8 @@
-"""Matrix products by the faster of the two libraries that PyTorch has on a CPU.
+"""Matrix products by the faster of the two libraries that PyTorch uses on a CPU.
 
-The float32 product of ``nn.Linear`` is MKL's, which on CPUs of other makers than Intel uses half of their
-vectors' width. A 1x1 convolution is the same product in oneDNN, which uses all of it: 2.1 times as fast
-on an AMD CPU of 2024. On other devices and for small products nothing changes.
+``nn.Linear`` in float32 calls MKL, which uses only half of the vector width on CPUs that Intel did not
+make. A 1x1 convolution computes the same product with oneDNN, which uses the full width: 2.1 times as fast
+on an AMD CPU of 2024. Nothing changes on other devices and for small products.
 """
 
 import torch
@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from ghgs_lit.kernels.parts import even_parts
 
-#: Multiplications of a product from which the other library's greater cost of a call pays, and inputs
-#: from which PyTorch takes oneDNN's convolution (on two threads or more).
+#: Multiplications above which oneDNN is faster in spite of its slower calls, and number of inputs above
+#: which PyTorch uses oneDNN's convolution (with two threads or more).
 _LARGE, _PIXELS = 1 << 24, 20480
-#: Numbers of a weight that are copied at once where there are fewer rows than they have channels.
+#: Weight values that oneDNN copies at once where the input has fewer rows than channels.
 _COPY = 1 << 20
 
 
@@ -33,27 +33,36 @@ def prefers_convolution(device: torch.device) -> bool:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias`` for ``x`` [..., k], ``weight`` [n, k] and ``bias`` [n]."""
+    """``x @ weight.T + bias``.
+
+    Args:
+        x: [..., k].
+        weight: [n, k].
+        bias: [n], or None for no bias.
+
+    Returns:
+        [..., n].
+    """
     large = x.numel() * len(weight) >= _LARGE and x.numel() > _PIXELS and x.dtype == torch.float32
     if not (large and prefers_convolution(x.device)) or torch.is_autocast_enabled("cpu"):
         return F.linear(x, weight, bias)
     k = x.shape[-1]
     if x.numel() >= k * k or weight.numel() <= _COPY:
         return _convolve(x, weight, bias)
-    # oneDNN copies the weight into an order of its own: for few rows that would take most of the memory.
+    # oneDNN copies the weight to its own layout; for few rows that copy would need most of the memory.
     parts = even_parts(len(weight), _COPY // k)
     return torch.cat([_convolve(x, weight[p], None if bias is None else bias[p]) for p in parts], dim=-1)
 
 
 def _convolve(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Rows are pixels whose channels lie innermost, so neither side is copied."""
+    """The product as a convolution: rows are pixels with the channels innermost, so nothing is copied."""
     pixels = x.reshape(1, 1, -1, x.shape[-1]).permute(0, 3, 1, 2)
     found = F.conv2d(pixels, weight[:, :, None, None], bias)
     return found.permute(0, 2, 3, 1).reshape(*x.shape[:-1], len(weight))
 
 
 class Linear(nn.Linear):
-    """``nn.Linear`` by :func:`linear`."""
+    """``nn.Linear`` computed by :func:`linear`."""
 
     def forward(self, input: Tensor) -> Tensor:
         return linear(input, self.weight, self.bias)

@@ -1,4 +1,4 @@
-"""Whole vectors from memory and to it."""
+"""Loading and storing whole vectors."""
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -8,7 +8,7 @@ from ghgs_lit.kernels.simd import I32, floats, vector_of
 
 
 def pointer_to(context, builder, array_type, array, index, index_type, kind):
-    """Address of element ``index`` of a contiguous array, counted in its flat order, as one of a vector."""
+    """Pointer to the vector ``kind`` at element ``index`` (flat index) of a contiguous array."""
     data = context.make_array(array_type)(context, builder, array).data
     position = context.cast(builder, index, index_type, types.intp)
     return builder.bitcast(builder.gep(data, [position]), kind.as_pointer())
@@ -28,7 +28,7 @@ def _make_access(alignment_of):
 
     @intrinsic
     def store(typing_context, array, index, value):
-        """Write a vector to ``array[index]`` and after."""
+        """Write a vector to ``array[index]`` and the elements that follow."""
         kind = vector_of(array.dtype)
 
         def emit(context, builder, sig, args):
@@ -41,21 +41,21 @@ def _make_access(alignment_of):
     return load, store
 
 
-# Vectors of floats where a cache line begins, vectors of doubles anywhere.
+# ``load`` and ``store`` need vectors of floats to start on a cache line; the others take any address.
 load, store = _make_access(lambda kind: 64 if kind is floats else 8)
 load_anywhere, store_anywhere = _make_access(lambda kind: 4 if kind is floats else 8)
 
 
 @intrinsic
 def prefetch(typing_context, array, index):
-    """Ask for the cache line of element ``index`` of a contiguous array, counted in its flat order."""
+    """Prefetch the cache line of element ``index`` (flat index) of a contiguous array."""
 
     def emit(context, builder, sig, args):
         byte = ir.IntType(8).as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
         callee = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         address = pointer_to(context, builder, array, *args, index, ir.IntType(8))
-        # For reading, into all levels, as data.
+        # For reading, into all cache levels, as data.
         builder.call(callee, [address, ir.Constant(I32, 0), ir.Constant(I32, 3), ir.Constant(I32, 1)])
         return context.get_dummy_value()
 

@@ -1,4 +1,4 @@
-"""A few threads for each process, to run kernels that hold no interpreter lock."""
+"""A thread pool in each process for kernels, which run without the interpreter lock."""
 
 import os
 import threading
@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
-# Splats or entries that are worth another thread: about a millisecond's.
+# Number of splats or entries that justifies one more thread: about a millisecond of work.
 GRAIN = 8192
 
 _lock = threading.Lock()
@@ -16,7 +16,7 @@ _owner: tuple[int, int] | None = None
 
 
 def _reset_lock() -> None:
-    """A forked child may inherit a lock that is held by a thread that it does not have."""
+    """A forked child may inherit a lock held by a thread that exists only in its parent."""
     global _lock
     _lock = threading.Lock()
 
@@ -26,7 +26,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def _workers(count: int) -> ThreadPoolExecutor:
-    """The pool of this process; a fork or a changed number of threads makes a new one."""
+    """The pool of this process; a new one after a fork or a change of the number of threads."""
     global _pool, _owner
     with _lock:
         if _owner != (os.getpid(), count):
@@ -36,9 +36,11 @@ def _workers(count: int) -> ThreadPoolExecutor:
 
 
 def run(tasks: list, work: int) -> None:
-    """Call every task, on at most ``torch.get_num_threads()`` threads, the caller's among them.
+    """Call every task, on at most ``torch.get_num_threads()`` threads including the caller's.
 
-    ``work`` counts the splats or entries that the tasks handle: for a few, no thread is woken.
+    Args:
+        tasks: functions without arguments.
+        work: number of splats or entries that all tasks process; small work uses no extra thread.
     """
     helpers = min(torch.get_num_threads(), len(tasks), 1 + work // GRAIN) - 1
     queue = deque(tasks)
@@ -54,6 +56,6 @@ def run(tasks: list, work: int) -> None:
     futures = [_workers(torch.get_num_threads() - 1).submit(drain) for _ in range(helpers)]
     drain()
     for future in futures:
-        # A helper that never got a turn has nothing left to do, and waiting for it could block.
+        # A helper that has not started has nothing left to do, and waiting for it could block.
         if not future.cancel():
             future.result()

@@ -1,12 +1,12 @@
-"""Explicit vectors inside Numba kernels, lowered straight to LLVM vector instructions.
+"""Explicit vectors inside Numba kernels, compiled directly to LLVM vector instructions.
 
-LLVM's loop vectoriser does not see through the masked inner loop of a rasterizer; explicit vectors do
-not need it to. A vector is 64 bytes, 16 floats or 8 doubles: one AVX-512 register; on AVX2 and NEON LLVM
-splits each operation into two or four of the machine's own, so the same kernels run everywhere. A mask
-is one bit per lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says.
+LLVM cannot vectorise the masked inner loop of a rasterizer automatically, so the kernels use explicit
+vectors. A vector is 64 bytes, 16 floats or 8 doubles: one AVX-512 register; on AVX2 and NEON LLVM splits
+each operation into two or four of the machine's own, so the same kernels run everywhere. A mask is one bit
+per lane. No fast-math flag is set: NaN and infinity behave as IEEE 754 says.
 
-Wherever a vector is expected beside another, a number stands for that number in every lane. How vectors
-come from memory and go there is told in ``memory``.
+A number that is combined with a vector means that number in every lane. ``memory`` loads and stores
+vectors.
 """
 
 import math
@@ -68,18 +68,25 @@ def _fill(context, builder, source, kind, value):
 
 
 def _common(*args):
-    """The kind of vector among the arguments, if the others are of that kind or numbers."""
+    """The one kind of vector among the arguments; None where there are two kinds or none."""
     kinds = {a for a in args if isinstance(a, _Lanes)}
     fits = len(kinds) == 1 and all(isinstance(a, (_Lanes, types.Number)) for a in args)
     return kinds.pop() if fits else None
 
 
 def _operator(function, family, result, emit):
-    """Give a Python operator a meaning for vectors or masks, whose kind ``result`` maps to the value's."""
+    """Define a Python operator for a ``family`` of vectors.
+
+    Args:
+        function: the operator, such as ``operator.add``.
+        family: class of the operands, floats or masks.
+        result: maps the kind of the operands to that of the value.
+        emit: writes the LLVM instruction.
+    """
 
     class Template(AbstractTemplate):
         key = function
-        # Asked before Numba's own templates, of which operators have dozens.
+        # Found before Numba's own templates, of which each operator has dozens.
         metadata = {"target": "cpu"}  # noqa: RUF012
 
         def generic(self, args, keywords):
@@ -135,42 +142,28 @@ def full(typing_context, value):
 
 
 @intrinsic
-def lane_columns(typing_context):
-    """Column of each lane in a 4 x 4 block: 0 1 2 3 0 1 2 3 ..."""
-    values = [float(i % 4) for i in range(LANES)]
-    return floats(), lambda context, builder, sig, args: ir.Constant(floats.llvm, values)
-
-
-@intrinsic
-def lane_rows(typing_context):
-    """Row of each lane in a 4 x 4 block: 0 0 0 0 1 1 1 1 ..."""
-    values = [float(i // 4) for i in range(LANES)]
-    return floats(), lambda context, builder, sig, args: ir.Constant(floats.llvm, values)
-
-
-@intrinsic
 def fma(typing_context, a, b, c):
-    """``a * b + c``, fused where the machine can."""
+    """``a * b + c``, fused where the machine has an instruction for it."""
     kind = _common(a, b, c)
     return kind(kind, kind, kind), lambda context, builder, sig, args: call(builder, "fmuladd", kind, *args)
 
 
 @intrinsic
-def root(typing_context, a):
-    """Square root, lane by lane; NaN of negative numbers."""
+def sqrt(typing_context, a):
+    """Square root of each lane; NaN for negative numbers."""
     return a(a), lambda context, builder, sig, args: call(builder, "sqrt", a, *args)
 
 
 @intrinsic
 def floor(typing_context, a):
-    """The largest whole number that is not larger, lane by lane."""
+    """Each lane rounded down to a whole number."""
     return a(a), lambda context, builder, sig, args: call(builder, "floor", a, *args)
 
 
 def _make_extreme(sign: str):
     @intrinsic
     def extreme(typing_context, a, b):
-        """The smaller or larger of two numbers, lane by lane; ``b`` where either is NaN."""
+        """The smaller or larger number of each lane; ``b`` where either is NaN."""
 
         def emit(context, builder, sig, args):
             return builder.select(builder.fcmp_ordered(sign, *args), *args)
@@ -186,7 +179,7 @@ minimum, maximum = _make_extreme("<"), _make_extreme(">")
 
 @intrinsic
 def select(typing_context, where, a, b):
-    """``a`` in the lanes of the mask, ``b`` in the others."""
+    """``a`` in the lanes where the mask is set, ``b`` in the others."""
     kind = _common(a, b)
     return kind(where, kind, kind), lambda context, builder, sig, args: builder.select(*args)
 
@@ -203,7 +196,7 @@ def bits(typing_context, where):
 
 @intrinsic
 def mask(typing_context, bits):
-    """The mask of eight lanes whose bits are given, lane 0 in bit 0."""
+    """The mask of eight lanes given by an integer, lane 0 in bit 0."""
 
     def emit(context, builder, sig, args):
         return builder.bitcast(builder.trunc(args[0], ir.IntType(DOUBLES)), mask8.llvm)
@@ -213,7 +206,7 @@ def mask(typing_context, bits):
 
 @intrinsic
 def lane_sum(typing_context, x):
-    """The sum of all lanes of floats, halves added to halves."""
+    """Sum of all lanes of floats; the upper half is added to the lower half until one lane is left."""
 
     def emit(context, builder, sig, args):
         total, width = args[0], LANES
@@ -228,8 +221,8 @@ def lane_sum(typing_context, x):
 
 
 @intrinsic
-def highest_lane(typing_context, x):
-    """The largest lane of floats; NaN is passed over."""
+def lane_max(typing_context, x):
+    """The largest lane of floats; NaN is ignored."""
 
     def emit(context, builder, sig, args):
         kind = ir.FunctionType(ir.FloatType(), [floats.llvm])
@@ -249,13 +242,15 @@ def trailing_zeros(typing_context, value):
     return types.int64(types.int64), emit
 
 
-# 2^f on [-1/2, 1/2], exact at 0: minimax in relative error, 7e-8.
+# Polynomial of 2^f on [-1/2, 1/2], exact at 0, least maximal relative error: 7e-8.
 _EXP2 = (1.0, 0.69314660, 0.24022166, 0.055510474, 0.0096749520, 0.0013202982)
+#: 2^-126 is the smallest normal float32.
+EXP2_LIMIT = np.float32(126)
 
 
 @intrinsic
 def exp2_minus(typing_context, x):
-    """``2^-x`` of floats for ``0 <= x <= 126``, within 2 ulp."""
+    """``2^-x`` of floats for ``0 <= x <= EXP2_LIMIT``, within 2 ulp."""
 
     def emit(context, builder, sig, args):
         whole = call(builder, "rint", floats, args[0])
@@ -272,13 +267,13 @@ def exp2_minus(typing_context, x):
 
 # log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2, sqrt 2).
 _LOG2 = [2 / math.log(2) / k for k in range(1, 19, 2)]
-# Subtracted from the bits of x, so that the mantissa that is left lies in [1/sqrt 2, sqrt 2).
+# Subtracted from the bits of x, so that the remaining mantissa lies in [1/sqrt 2, sqrt 2).
 _ROOT_HALF = int(np.float64(math.sqrt(0.5)).view(np.int64))
 
 
 @intrinsic
 def log2(typing_context, x):
-    """Binary logarithm of positive, normal doubles, within 1e-13; of others anything."""
+    """Binary logarithm of positive, normal doubles, within 1e-13; undefined for other numbers."""
 
     def emit(context, builder, sig, args):
         integers = ir.VectorType(I64, DOUBLES)
@@ -299,7 +294,7 @@ def log2(typing_context, x):
 
 
 def length(values):
-    """``len(values)``, known to the compiler when it is a tuple; an integer stands for itself."""
+    """``len(values)`` of a tuple, which the compiler knows; an integer is returned as it is."""
 
 
 @overload(length)
@@ -310,9 +305,12 @@ def _length(values):
     return lambda values: values
 
 
-@helper
-def aligned(count):
-    """``count`` floats whose memory starts on a cache line."""
+def aligned_floats(count):
+    """``count`` floats, not initialised, whose memory starts on a cache line."""
     buffer = np.empty(count + LANES, np.float32)
     skip = (-(buffer.ctypes.data // 4)) % LANES
     return buffer[skip : skip + count]
+
+
+#: :func:`aligned_floats` inside kernels.
+aligned = helper(aligned_floats)

@@ -1,4 +1,4 @@
-"""The weighted sum of the loss terms that a configuration asks for."""
+"""The weighted sum of the loss terms of a configuration."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -16,10 +16,14 @@ DEPTH_UNITS = ("metres", "relative")
 class Losses:
     """``losses(prediction, rendering, batch)`` gives the weighted total and each unweighted term by name.
 
-    ``weights`` maps ``render_l1``, ``render_ssim``, ``chamfer`` and ``depth`` to numbers; a term of weight
-    0 is not computed. ``chamfer`` is ``squared`` (the paper), ``huber`` or ``truncated``, the latter two
-    beyond ``chamfer_scale`` metres; ``chamfer_points`` bounds how many of each set are matched (None: all).
-    ``depth`` measures in ``metres`` or ``relative`` to the true depth.
+    Args:
+        weights: of ``render_l1``, ``render_ssim``, ``chamfer`` and ``depth``; a term of weight 0 is not
+            computed.
+        chamfer: penalty of a distance: ``squared`` (the paper), ``huber`` or ``truncated``; the last two
+            differ from the first beyond ``chamfer_scale``.
+        chamfer_scale: metres.
+        chamfer_points: how many points of each set are matched in a step, chosen at random; None for all.
+        depth: unit of the depth error: ``metres``, or ``relative`` to the true depth.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The terms of the training loss: one signature, one value each.
+"""The terms of the training loss.
 
 Every term takes ``(prediction, rendering, batch)`` and returns a scalar in float32 or wider.
 """
@@ -37,8 +37,16 @@ def chamfer(
 ) -> Scalar:
     """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean.
 
-    The points are those before the Gaussian head's offset. ``points`` bounds how many of each set are
-    matched. Raises ``InputError`` when the data has no body vertices.
+    Args:
+        prediction: its points are those before the Gaussian head's offset.
+        rendering: not used.
+        batch: with body vertices.
+        kind: ``squared``, ``huber`` or ``truncated``.
+        scale: metres beyond which ``huber`` and ``truncated`` differ from ``squared``.
+        points: how many points of each set are matched; None for all.
+
+    Raises:
+        InputError: the data has no body vertices.
     """
     if batch.body_vertices is None:
         raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
@@ -51,9 +59,16 @@ def chamfer(
 
 
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: bool = False) -> Scalar:
-    """Mean |z - true z| in metres (or divided by the true z) over the subject's pixels; 0 without any.
+    """Mean |z - true z| over the subject's pixels with a true depth; 0 where there are none.
 
-    Raises ``InputError`` when the data does not know depth.
+    Args:
+        prediction: its depth, where valid.
+        rendering: not used.
+        batch: with depth maps.
+        relative: divide by the true depth; otherwise metres.
+
+    Raises:
+        InputError: the data has no depth maps.
     """
     if batch.depths is None:
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")

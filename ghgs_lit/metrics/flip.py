@@ -1,4 +1,4 @@
-"""FLIP: a perceptual difference that needs no weights.
+"""FLIP: a perceptual image difference that needs no trained weights.
 
 P. Andersson, J. Nilsson, T. Akenine-Möller, M. Oskarsson, K. Åström, M. D. Fairchild, "FLIP: A Difference
 Evaluator for Alternating Images", HPG 2020. Section numbers below are that paper's. Images are sRGB in
@@ -16,7 +16,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import correlate
 
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
-"""The paper's viewer: 0.7 m away from a 0.7 m wide screen of 3840 pixels."""
+"""The paper's viewer: 0.7 m away from a screen 0.7 m wide with 3840 pixels."""
 
 # Contrast sensitivity as sums of Gaussians (table 1): amplitude and width for each opponent channel.
 _SENSITIVITY = {"Y": ((1.0, 0.0047),), "Cx": ((1.0, 0.0053),), "Cz": ((34.1, 0.04), (13.5, 0.025))}
@@ -31,36 +31,38 @@ _RGB_TO_XYZ = (
 )
 
 
-def _mix(image: Tensor, matrix: Tensor) -> Tensor:
+def _transform_colors(image: Tensor, matrix: Tensor) -> Tensor:
+    """``matrix`` times the colour of every pixel."""
     return torch.einsum("ij,njhw->nihw", matrix, image)
 
 
-def _constants(like: Tensor) -> tuple[Tensor, Tensor]:
+def _xyz_matrices(like: Tensor) -> tuple[Tensor, Tensor]:
     """The matrix to XYZ divided by the white point, and its inverse."""
     matrix = torch.tensor(_RGB_TO_XYZ, dtype=torch.float64)
     relative = matrix / matrix.sum(1, keepdim=True)
     return relative.to(like), torch.linalg.inv(relative).to(like)
 
 
-def _linear(image: Tensor) -> Tensor:
+def _linear_rgb(image: Tensor) -> Tensor:
     """sRGB to linear RGB."""
     steep = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(image > 0.04045, steep, image / 12.92)
 
 
 def _opponent(xyz: Tensor) -> Tensor:
-    """XYZ relative to white, to YCxCz (a linear CIELab)."""
+    """XYZ relative to white to YCxCz (a linear CIELab)."""
     x, y, z = xyz.split(1, dim=1)
     return torch.cat((116 * y - 16, 500 * (x - y), 200 * (y - z)), dim=1)
 
 
 def _from_opponent(ycc: Tensor) -> Tensor:
+    """The inverse of :func:`_opponent`."""
     y = (ycc[:, :1] + 16) / 116
     return torch.cat((y + ycc[:, 1:2] / 500, y, y - ycc[:, 2:] / 200), dim=1)
 
 
 def _hunt_lab(xyz: Tensor) -> Tensor:
-    """XYZ relative to white, to CIELab with chroma scaled by lightness (Hunt effect, section 4.1.3)."""
+    """XYZ relative to white to CIELab with chroma scaled by lightness (Hunt effect, section 4.1.3)."""
     delta = 6 / 29
     root = torch.where(xyz > delta**3, xyz.clamp(min=delta**3) ** (1 / 3), xyz / (3 * delta**2) + 4 / 29)
     x, y, z = root.split(1, dim=1)
@@ -70,13 +72,13 @@ def _hunt_lab(xyz: Tensor) -> Tensor:
 
 
 def _hyab(a: Tensor, b: Tensor) -> Float[Tensor, "n h w"]:
-    """City-block in lightness, Euclidean in chroma."""
+    """Colour distance: city-block in lightness, Euclidean in chroma."""
     difference = a - b
     return difference[:, 0].abs() + difference[:, 1:].square().sum(1).sqrt()
 
 
 def _filter(maps: Tensor, along_y: Tensor, along_x: Tensor) -> Tensor:
-    """Separable filter of [n, c, h, w] with the edge pixels repeated outside."""
+    """Separable filter of [n, c, h, w]; pixels at the border are repeated outside."""
     ry, rx = len(along_y) // 2, len(along_x) // 2
     return correlate(F.pad(maps, (rx, rx, ry, ry), mode="replicate"), along_y, along_x)
 
@@ -98,12 +100,12 @@ def _filter_sensitivity(ycc: Tensor, ppd: float) -> Tensor:
 
 
 def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor, "n h w"]:
-    """Colour pipeline of section 4.1 on YCxCz images, redistributed to [0, 1]."""
-    to_xyz, to_rgb = _constants(first)
+    """Colour difference of YCxCz images, scaled to [0, 1] (section 4.1)."""
+    to_xyz, to_rgb = _xyz_matrices(first)
 
     def perceived(ycc: Tensor) -> Tensor:
-        rgb = _mix(_from_opponent(_filter_sensitivity(ycc, ppd)), to_rgb).clamp(0, 1)
-        return _hunt_lab(_mix(rgb, to_xyz))
+        rgb = _transform_colors(_from_opponent(_filter_sensitivity(ycc, ppd)), to_rgb).clamp(0, 1)
+        return _hunt_lab(_transform_colors(rgb, to_xyz))
 
     error = _hyab(perceived(first), perceived(second)) ** _COLOR_EXPONENT
     green, blue = (_hunt_lab(to_xyz[None, :, i, None, None]) for i in (1, 2))
@@ -114,7 +116,7 @@ def _color_difference(first: Tensor, second: Tensor, ppd: float) -> Float[Tensor
 
 
 def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
-    """Strength of edges and of points in a [n, 1, h, w] channel (section 4.2)."""
+    """Strength of edges and of points in a lightness channel [n, 1, h, w] (section 4.2)."""
     sigma = 0.5 * _FEATURE_WIDTH * ppd
     radius = math.ceil(3 * sigma)
     x = torch.arange(-radius, radius + 1, dtype=lightness.dtype, device=lightness.device)
@@ -134,12 +136,17 @@ def flip_map(
     target: Float[Tensor, "n 3 h w"],
     pixels_per_degree: float = PIXELS_PER_DEGREE,
 ) -> Float[Tensor, "n h w"]:
-    """FLIP of each pixel; values outside [0, 1] are clamped first."""
-    # Each image by itself: elementwise kernels round by position, and equal images must give 0.
+    """FLIP of each pixel, in [0, 1].
+
+    Args:
+        image, target: values outside [0, 1] are clamped first.
+        pixels_per_degree: resolution in the viewer's eye.
+    """
+    # Each image separately: rounding can depend on the position in memory, and equal images must give 0.
     with torch.autocast(image.device.type, enabled=False):
         image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)
-        to_xyz, _ = _constants(image)
-        first, second = (_opponent(_mix(_linear(i), to_xyz)) for i in (image, target))
+        to_xyz, _ = _xyz_matrices(image)
+        first, second = (_opponent(_transform_colors(_linear_rgb(i), to_xyz)) for i in (image, target))
         color = _color_difference(first, second, pixels_per_degree)
         edges, points = zip(
             *(_features((i[:, :1] + 16) / 116, pixels_per_degree) for i in (first, second)), strict=True

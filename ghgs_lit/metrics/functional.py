@@ -1,7 +1,7 @@
-"""Image metrics as pure functions. Images are RGB in [0, 1] (data range 1); one value an image.
+"""Image metrics as pure functions: one value for each RGB image in [0, 1] (data range 1).
 
-A ``region`` selects the pixels that count. Where it is empty the value is nan, meaning "undefined", and
-averages leave it out.
+A ``region`` selects the pixels that count. Where it is empty the value is nan ("undefined"), and averages
+leave it out.
 """
 
 import torch
@@ -9,13 +9,15 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
 
 REGIONS = ("image", "box", "subject")
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
-"""PSNR in dB of equal images, and the most that is reported: float32 cannot tell more apart."""
+"""PSNR in dB of equal images, and the largest value reported: float32 resolves no smaller errors."""
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+"""Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
 
 def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | None) -> Float[Tensor, " n"]:
@@ -30,7 +32,7 @@ def mean_over(values: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"] | No
 def mean_inside(
     values: Float[Tensor, "n hh ww"], region: Bool[Tensor, "n h w"] | None
 ) -> Float[Tensor, " n"]:
-    """:func:`mean_over` for maps that lack a border of the image: the region loses it too."""
+    """:func:`mean_over` for maps without the border of the image; the same border of the region is cut."""
     if region is not None:
         top, left = (
             (big - small) // 2 for big, small in zip(region.shape[1:], values.shape[1:], strict=True)
@@ -40,9 +42,11 @@ def mean_inside(
 
 
 def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n h w"]:
-    """The smallest upright box around each mask, as a mask; empty where the mask is.
+    """The bounding box of each mask, as a mask; empty where the mask is empty.
 
-    ``margin`` is the share of the box's height and width that is added on each side, inside the image.
+    Args:
+        mask: one mask for each image.
+        margin: part of the box's height and width that is added on each side, inside the image.
     """
 
     def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
@@ -58,7 +62,7 @@ def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n 
 def region_of(
     mask: Bool[Tensor, "n h w"], name: str, box_margin: float = 0.0
 ) -> Bool[Tensor, "n h w"] | None:
-    """Region ``image`` (None: all pixels), ``box`` or ``subject`` of a subject's mask."""
+    """The pixels of region ``image`` (None: all), ``box`` or ``subject``, from the subject's mask."""
     choice("region", name, REGIONS)
     if name == "image":
         return None
@@ -68,7 +72,7 @@ def region_of(
 def squared_error(
     image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"]
 ) -> Float[Tensor, "n h w"]:
-    """Squared error of each pixel, mean over the channels."""
+    """Squared error of each pixel, averaged over the channels."""
     return (at_least_float32(image) - at_least_float32(target)).square().mean(1)
 
 
@@ -86,19 +90,19 @@ def psnr(
     return decibels(mean_over(squared_error(image, target), region))
 
 
-def gaussian_window(size: int, sigma: float, like: Tensor) -> Float[Tensor, " size"]:
-    """Normalised samples of a Gaussian, centred."""
-    x = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
-    weights = torch.exp(-x.square() / (2 * sigma**2))
+def _gaussian_window(like: Tensor) -> Float[Tensor, " size"]:
+    """SSIM's window along one axis; its sum is 1."""
+    x = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - (SSIM_WINDOW - 1) / 2
+    weights = torch.exp(-x.square() / (2 * SSIM_SIGMA**2))
     return weights / weights.sum()
 
 
 def correlate(
     maps: Float[Tensor, "n c h w"], along_y: Float[Tensor, " ky"], along_x: Float[Tensor, " kx"]
 ) -> Float[Tensor, "n c hh ww"]:
-    """Separable filter of every map, where its window lies inside the image."""
+    """Separable filter of every map, at the pixels whose window lies inside the image."""
     n, c, h, w = maps.shape
-    # All maps as channels of one depthwise convolution: ten times faster on a CPU than as a batch.
+    # All maps are channels of one depthwise convolution: ten times faster on a CPU than a batch of maps.
     flat = maps.reshape(1, n * c, h, w)
     flat = F.conv2d(flat, along_y.expand(n * c, 1, -1)[..., None].contiguous(), groups=n * c)
     flat = F.conv2d(flat, along_x.expand(n * c, 1, 1, -1).contiguous(), groups=n * c)
@@ -106,30 +110,28 @@ def correlate(
 
 
 def ssim_map(
-    image: Float[Tensor, "n c h w"],
-    target: Float[Tensor, "n c h w"],
-    padding: str = "valid",
-    window: int = 11,
-    sigma: float = 1.5,
+    image: Float[Tensor, "n c h w"], target: Float[Tensor, "n c h w"], padding: str = "valid"
 ) -> Float[Tensor, "n c hh ww"]:
     """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider.
 
-    ``valid`` gives the pixels whose window lies inside the image (what scikit-image averages); the others
-    keep the image's size: ``reflect`` mirrors it outside (torchmetrics), ``zeros`` continues it black (the
-    authors' evaluation).
+    Args:
+        image, target: at least as large as the window.
+        padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image averages
+            these); the others keep the image's size: ``reflect`` mirrors the image at its border
+            (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
     """
     choice("ssim.padding", padding, PADDINGS)
-    if min(image.shape[-2:]) < window:
-        raise InputError(
-            f"ssim: expected images of at least {window}x{window} pixels; found {tuple(image.shape[-2:])}"
-        )
+    found = tuple(image.shape[-2:])
+    require(
+        min(found) >= SSIM_WINDOW, "ssim", f"images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels", found
+    )
     with torch.autocast(image.device.type, enabled=False):
         x, y = at_least_float32(image), at_least_float32(target)
         if padding != "valid":
-            border, mode = [window // 2] * 4, "reflect" if padding == "reflect" else "constant"
+            border, mode = [SSIM_WINDOW // 2] * 4, "reflect" if padding == "reflect" else "constant"
             x, y = F.pad(x, border, mode), F.pad(y, border, mode)
         moments = torch.cat((x, y, x * x, y * y, x * y), dim=1)
-        weights = gaussian_window(window, sigma, moments)
+        weights = _gaussian_window(moments)
         blurred = correlate(moments, weights, weights)
         mx, my, xx, yy, xy = blurred.chunk(5, dim=1)
         c1, c2 = 0.01**2, 0.03**2
@@ -142,17 +144,20 @@ def ssim(
     target: Float[Tensor, "n c h w"],
     padding: str = "valid",
     region: Bool[Tensor, "n h w"] | None = None,
-    window: int = 11,
-    sigma: float = 1.5,
 ) -> Float[Tensor, " n"]:
-    """Mean of :func:`ssim_map` over the channels and over the pixels of ``region`` that it covers."""
-    return mean_inside(ssim_map(image, target, padding, window, sigma).mean(1), region)
+    """Mean of :func:`ssim_map` over the channels and over the pixels of ``region`` that the map covers."""
+    return mean_inside(ssim_map(image, target, padding).mean(1), region)
 
 
 def depth_error_mm(
     depth: Float[Tensor, "n h w"], truth: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
-    """Mean |z - true z| in millimetres over all pixels of ``region`` with a true depth; nan without any."""
+    """Mean |z - true z| in millimetres over all pixels of ``region`` with a true depth; nan without any.
+
+    Args:
+        depth, truth: metres; a truth of 0 is unknown.
+        region: the pixels that count.
+    """
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()

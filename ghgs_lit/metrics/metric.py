@@ -1,4 +1,4 @@
-"""The pure functions as ``torchmetrics.Metric``: the mean over all images seen."""
+"""The pure functions as ``torchmetrics.Metric``: means over all images."""
 
 import warnings
 
@@ -16,12 +16,18 @@ Masks = Bool[Tensor, "n h w"]
 
 
 class PerImageMetric(Metric):
-    """Mean of one value an image; undefined values (nan) are left out, nan when all are."""
+    """Mean of one value per image; undefined values (nan) are left out; nan where all are undefined.
+
+    Args:
+        region: the pixels that count: ``image``, ``box`` or ``subject``.
+        box_margin: part of the box's height and width that is added on each side.
+        kwargs: of ``torchmetrics.Metric``.
+    """
 
     full_state_update = False
     is_differentiable = False
-    source: tuple = ()
-    """What :meth:`maps` depends on: metrics of equal source can share one map."""
+    map_key: tuple = ()
+    """Identifies the result of :meth:`maps`: metrics of equal key can share it."""
 
     def __init__(self, region: str = "image", box_margin: float = 0.0, **kwargs):
         super().__init__(**kwargs)
@@ -36,11 +42,11 @@ class PerImageMetric(Metric):
         raise NotImplementedError
 
     def pool(self, maps: Tensor, mask: Masks) -> Float[Tensor, " n"]:
-        """One value an image; ``mask`` is the subject's in the target."""
+        """One value per image; ``mask`` is the subject's mask in the target."""
         raise NotImplementedError
 
     def region_of(self, mask: Masks) -> Masks | None:
-        """The pixels that count; None for all."""
+        """The pixels that count; None for all pixels."""
         return functional.region_of(mask, self.region, self.box_margin)
 
     def per_image(self, image: Images, target: Images, mask: Masks) -> Float[Tensor, " n"]:
@@ -57,15 +63,15 @@ class PerImageMetric(Metric):
         return self.total / self.count
 
     def set_dtype(self, dst_type):
-        """States keep their dtype: a mean over many images is accumulated in float64."""
+        """Keep the dtype of the states: a mean over many images is accumulated in float64."""
         return self
 
 
 class PSNR(PerImageMetric):
-    """PSNR in dB over a region; equal images count as ``functional.PSNR_CAP``."""
+    """PSNR in dB over a region, at most ``functional.PSNR_CAP`` (equal images)."""
 
     higher_is_better = True
-    source = ("squared_error",)
+    map_key = ("squared_error",)
 
     def maps(self, image: Images, target: Images) -> Tensor:
         return functional.squared_error(image, target)
@@ -82,7 +88,7 @@ class SSIM(PerImageMetric):
     def __init__(self, padding: str = "reflect", region: str = "image", **kwargs):
         super().__init__(region, **kwargs)
         choice("ssim.padding", padding, functional.PADDINGS)
-        self.padding, self.source = padding, ("ssim", padding)
+        self.padding, self.map_key = padding, ("ssim", padding)
 
     def maps(self, image: Images, target: Images) -> Tensor:
         return functional.ssim_map(image, target, self.padding).mean(1)
@@ -92,7 +98,7 @@ class SSIM(PerImageMetric):
 
 
 class FLIP(PerImageMetric):
-    """Mean FLIP over a region, seen at ``pixels_per_degree``."""
+    """Mean FLIP over a region, for a viewer who sees ``pixels_per_degree``."""
 
     higher_is_better = False
 
@@ -100,7 +106,7 @@ class FLIP(PerImageMetric):
         super().__init__(region, **kwargs)
         require(pixels_per_degree > 0, "pixels_per_degree", "a positive number", pixels_per_degree)
         self.pixels_per_degree = pixels_per_degree
-        self.source = ("flip", pixels_per_degree)
+        self.map_key = ("flip", pixels_per_degree)
 
     def maps(self, image: Images, target: Images) -> Tensor:
         return flip_map(image, target, self.pixels_per_degree)
@@ -110,10 +116,15 @@ class FLIP(PerImageMetric):
 
 
 class LPIPS(PerImageMetric):
-    """LPIPS of the whole image through torchmetrics, which needs torchvision and its weights.
+    """LPIPS of the whole image by torchmetrics, which needs torchvision and its weights.
 
-    ``signed`` maps [0, 1] to the [-1, 1] that the network was calibrated on; the authors' evaluation
-    does not. Raises ``InputError`` where the package or the weights cannot be had.
+    Args:
+        net: ``vgg``, ``alex`` or ``squeeze``.
+        signed: map [0, 1] to [-1, 1], for which the network was calibrated; the authors' evaluation does not.
+        kwargs: of :class:`PerImageMetric`.
+
+    Raises:
+        InputError: torchvision or the weights are not available.
     """
 
     higher_is_better = False
@@ -131,13 +142,13 @@ class LPIPS(PerImageMetric):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 self.network = LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=signed)
-        except Exception as error:  # the download fails in as many ways as networks do
+        except Exception as error:  # a download can fail in many ways
             reason = " ".join(str(error).split())
-            raise InputError(f"LPIPS: the weights of {net!r} could not be had: {reason}") from error
-        self.net, self.signed, self.source = net, signed, ("lpips", net, signed)
+            raise InputError(f"LPIPS: the weights of {net!r} could not be loaded: {reason}") from error
+        self.net, self.signed, self.map_key = net, signed, ("lpips", net, signed)
 
     def maps(self, image: Images, target: Images) -> Tensor:
-        # Told to map [0, 1], the network refuses what a render overshoots by.
+        # With ``signed`` the network refuses values outside [0, 1], which renders can have.
         low, high = (0, 1) if self.signed else (-1, None)
         singles = (images.float().clamp(low, high).split(1) for images in (image, target))
         return torch.stack([self.network(a, b) for a, b in zip(*singles, strict=True)])

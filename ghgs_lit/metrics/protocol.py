@@ -1,4 +1,4 @@
-"""A measuring protocol: which metrics, how each is computed, under which names."""
+"""A measuring protocol: which metrics are computed, how, and under which names."""
 
 from collections.abc import Sequence
 
@@ -15,22 +15,22 @@ LPIPS_POLICIES = ("auto", "require", "off")
 
 
 class ImageMetrics:
-    """All metrics of a protocol at once: ``metrics(image, target, mask)`` gives a value an image by name.
+    """All metrics of a protocol: ``metrics(image, target, mask)`` gives one value per image by name.
 
-    Names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
-    ``_subject`` for the other ``regions`` (FLIP: not the subject's pixels alone, since it is a blur).
+    The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
+    ``_subject`` added for the other ``regions`` (no FLIP for the subject's pixels alone, since it blurs).
 
     Args:
-        protocol: the name that every reported figure carries.
-        regions: where PSNR and SSIM are taken: ``image``, ``box``, ``subject``.
-        box_margin: share of the box's height and width that is added to it on each side.
+        protocol: the name that is reported with every number.
+        regions: where PSNR and SSIM are measured: ``image``, ``box``, ``subject``.
         ssim_padding: ``reflect`` (torchmetrics), ``valid`` (scikit-image) or ``zeros`` (the authors).
-        clamp: whether renders are clamped to [0, 1] first.
-        lpips: ``auto`` leaves LPIPS out where it cannot be had (``left_out`` says why); ``require`` fails;
-            ``off``.
+        clamp: clamp renders to [0, 1] first.
+        lpips: ``auto`` leaves LPIPS out where it is not available (``left_out`` says why), ``require`` raises
+            an error there, ``off`` never computes it.
         lpips_net: ``vgg``, ``alex`` or ``squeeze``.
-        lpips_signed: whether LPIPS sees [-1, 1] (as it was calibrated) or [0, 1].
+        lpips_signed: feed LPIPS [-1, 1] (its calibration) instead of [0, 1].
         flip_pixels_per_degree: FLIP's viewing distance.
+        box_margin: part of the box's height and width that is added to it on each side.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class ImageMetrics:
 
     @property
     def definitions(self) -> dict[str, str]:
-        """What each name means, for whoever reads the numbers later."""
+        """How each metric and region is defined, to be stored beside the numbers."""
         said = {
             "image": f"renders {'clamped to [0, 1]' if self.clamp else 'as they are'}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
@@ -99,10 +99,10 @@ class ImageMetrics:
         target: Float[Tensor, "n 3 h w"],
         mask: Bool[Tensor, "n h w"],
     ) -> dict[str, Tensor]:
-        """One value an image for each metric; nan where a region is empty."""
+        """One value per image for each metric; nan where a region is empty."""
         image = image.clamp(0, 1) if self.clamp else image
         maps: dict[tuple, Tensor] = {}
         for metric in self.metrics.values():
-            if metric.source not in maps:
-                maps[metric.source] = metric.maps(image, target)
-        return {name: metric.pool(maps[metric.source], mask) for name, metric in self.metrics.items()}
+            if metric.map_key not in maps:
+                maps[metric.map_key] = metric.maps(image, target)
+        return {name: metric.pool(maps[metric.map_key], mask) for name, metric in self.metrics.items()}

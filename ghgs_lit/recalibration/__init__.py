@@ -1,4 +1,4 @@
-"""The recalibration stage: cross-view attention among tokens that are near to one another in space."""
+"""The recalibration stage: attention across views among tokens that are close in space."""
 
 from ghgs_lit.recalibration.attention import SIMILARITIES, SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors

@@ -17,21 +17,21 @@ from ghgs_lit.recalibration.neighbors import Neighbors
 
 SIMILARITIES = ("product", "product_clamped", "log", "none")
 
-#: Tokens that are handled at once where no gradient is kept: in half precision, fewer are as fast on a CPU.
+#: Tokens computed at once without a gradient; in half precision a smaller number is as fast on a CPU.
 _ROWS, _HALF_ROWS = 424, 256
 
 
 class SemanticAttention(nn.Module):
-    """``x + o(softmax(q . k / sqrt(d) * s) v)``, then a residual network; names as published.
+    """``x + o(softmax(q . k / sqrt(d) * s) v)``, then a residual MLP; parameters are named as published.
 
     Args:
-        dim: width C of the tokens; queries, keys and values have C / 4.
-        num_heads: of width C / 4 / num_heads.
-        similarity: how the cosine s of two tokens' semantic features acts on the logit:
-            ``product`` multiplies (Eq. 3), ``product_clamped`` multiplies by max(s, 0) (the authors'
-            release), ``log`` adds log(max(s, s_min)), which weighs dissimilar neighbours down in place of
-            drawing their logit to 0, ``none`` ignores it (s = 1).
-        s_min: the least similarity of ``log``.
+        dim: width C of the tokens; queries, keys and values have C / 4 channels.
+        num_heads: number of heads, each with C / 4 / num_heads channels.
+        similarity: how the cosine s of two tokens' semantic features changes the logit:
+            ``product`` multiplies by s (Eq. 3), ``product_clamped`` multiplies by max(s, 0) (the authors'
+            release), ``log`` adds log(max(s, s_min)), which lowers the weight of dissimilar neighbours
+            instead of pulling their logit to 0, ``none`` ignores it (s = 1).
+        s_min: lower limit of the similarity with ``log``.
     """
 
     def __init__(self, dim: int, num_heads: int = 8, similarity: str = "product", s_min: float = 0.01):
@@ -63,37 +63,64 @@ class SemanticAttention(nn.Module):
         """Recalibrated tokens.
 
         Args:
-            x: the tokens of all batch elements, one after the other.
-            neighbors: of the ``n_b`` tokens of each element, as indices within the element.
+            x: the tokens of all batch elements, one element after the other.
+            neighbors: for each element, the neighbours of its ``n_b`` tokens, as indices within the element.
             cosines: ``[n_b, k_b]`` for each element; None where ``similarity`` is ``none``.
         """
         counts = [len(element.index) for element in neighbors]
-        parts = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
-        found = [self._recalibrated(*part) for part in parts]
-        return found[0] if len(found) == 1 else torch.cat(found)
+        elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
+        results = [self._recalibrate_element(*element) for element in elements]
+        return results[0] if len(results) == 1 else torch.cat(results)
 
-    def _recalibrated(
-        self, x: Float[Tensor, "n C"], neighbors: Neighbors, cosine: Float[Tensor, "n k"] | None
+    def attention_weights(
+        self, x: Float[Tensor, "n C"], query: int, neighbors: Neighbors, cosines: Tensor | None
+    ) -> Float[Tensor, "a k"]:
+        """Softmax weights of each head from one token to its neighbours, to look at.
+
+        Args:
+            x: the tokens of one batch element.
+            query: index of the token that attends.
+            neighbors: of all ``n`` tokens.
+            cosines: ``[n, k]``; None where ``similarity`` is ``none``.
+        """
+        index, valid = neighbors.index[query], neighbors.valid[query]
+        normed = self.norm1(x)
+        q = self.q_proj(normed[query]).unflatten(-1, (self.num_heads, -1))
+        k = self.k_proj(normed[index]).unflatten(-1, (self.num_heads, -1))
+        logits = at_least_float32(torch.einsum("ad,kad->ak", q * q.shape[-1] ** -0.5, k))[:, None]
+        if cosines is not None:
+            logits = self.apply_similarity(logits, cosines[query][None])
+        return logits[:, 0].masked_fill(~valid, float("-inf")).softmax(-1)
+
+    def apply_similarity(
+        self, logits: Float[Tensor, "a m k"], cosines: Float[Tensor, "m k"]
+    ) -> Float[Tensor, "a m k"]:
+        """Logits changed by the semantic similarity of query and neighbour, as ``similarity`` says."""
+        factor, bias = self._factor_and_bias(cosines)
+        return logits * factor + bias
+
+    def _recalibrate_element(
+        self, x: Float[Tensor, "n C"], neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
     ) -> Float[Tensor, "n C"]:
-        """One element: keys and values of all, then some tokens at a time."""
+        """One batch element: keys and values of all tokens first, then a part of the tokens at a time."""
         linears = (self.q_proj, self.k_proj, self.v_proj, self.o_proj, self.mlp[0], self.mlp[2])
-        ask, key, value, answer, first, second = map(_ready, linears)
+        q_proj, k_proj, v_proj, o_proj, mlp_in, mlp_out = map(_cast_once, linears)
 
         def keys_values(rows: slice) -> Float[Tensor, "m kv"]:
             normed = self.norm1(x[rows])
-            return at_least_float32(torch.cat((key(normed), value(normed)), dim=-1))
+            return at_least_float32(torch.cat((k_proj(normed), v_proj(normed)), dim=-1))
 
-        k, v = _by_rows(keys_values, len(x)).chunk(2, dim=-1)
+        k, v = _in_parts(keys_values, len(x)).chunk(2, dim=-1)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
-            q = at_least_float32(ask(self.norm1(x[rows])))
-            y = self._attend(q, k, v, near, None if cosine is None else cosine[rows])
-            residual = x[rows] + answer(y)
-            # Layer by layer: what one has read is freed before the next one runs.
-            return residual + second(self.mlp[1](first(self.norm2(residual))))
+            q = at_least_float32(q_proj(self.norm1(x[rows])))
+            y = self._attend(q, k, v, near, None if cosines is None else cosines[rows])
+            residual = x[rows] + o_proj(y)
+            # One expression: the input of each layer is freed before the next layer runs.
+            return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
 
-        return _by_rows(recalibrate, len(x))
+        return _in_parts(recalibrate, len(x))
 
     def _attend(
         self,
@@ -101,54 +128,49 @@ class SemanticAttention(nn.Module):
         k: Float[Tensor, "n i"],
         v: Float[Tensor, "n i"],
         neighbors: Neighbors,
-        cosine: Float[Tensor, "m k"] | None,
+        cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "m i"]:
-        """What ``m`` tokens take from their neighbours. Elsewhere than on a CPU, all pairs are scored, then
-        the neighbours' picked: a product of all is faster than gathers, and no m x k x C is ever held."""
+        """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider."""
         with torch.autocast(q.device.type, enabled=False):
             if cpu.is_supported(q, self.num_heads, neighbors.index.shape[1]):
-                influence = (x.expand(neighbors.index.shape) for x in self._influence(cosine))
-                return cpu.attend(q, k, v, self.num_heads, neighbors.index, neighbors.valid, *influence)
+                changes = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
+                return cpu.attend(q, k, v, self.num_heads, neighbors.index, neighbors.valid, *changes)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
-            return self._mix(q, k, v, neighbors, cosine).transpose(0, 1).flatten(1)
+            return self._attend_dense(q, k, v, neighbors, cosines).transpose(0, 1).flatten(1)
 
-    def _mix(
+    def _attend_dense(
         self,
         q: Float[Tensor, "a m d"],
         k: Float[Tensor, "a n d"],
         v: Float[Tensor, "a n d"],
         neighbors: Neighbors,
-        cosine: Float[Tensor, "m k"] | None,
+        cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "a m d"]:
-        """Values of the neighbours of ``m`` queries, weighed by Eq. 3."""
+        """Eq. 3 by a product of all tokens: faster than gathering, and nothing of size m x k x C is held."""
         index = neighbors.index[None].expand(len(q), -1, -1)
         scores = q * q.shape[-1] ** -0.5 @ k.mT
         logits = scores.gather(2, index)
-        if cosine is not None:
-            logits = self._weigh(logits, cosine)
+        if cosines is not None:
+            logits = self.apply_similarity(logits, cosines)
         logits = logits.masked_fill(~neighbors.valid, float("-inf"))
-        # Without a gradient nothing needs the scores any more, and weights take their place.
+        # Without a gradient the scores are not needed any more, and the weights reuse their memory.
         weights = torch.zeros_like(scores) if torch.is_grad_enabled() else scores.zero_()
-        # Invalid neighbours weigh 0 and may repeat a valid index, so weights are added, not set.
+        # Invalid neighbours have weight 0 and may repeat a valid index, so weights are added, not set.
         weights = weights.scatter_add_(2, index, logits.softmax(-1))
         return weights @ v
 
-    def _weigh(self, logits: Float[Tensor, "a m k"], cosine: Float[Tensor, "m k"]) -> Float[Tensor, "a m k"]:
-        factor, term = self._influence(cosine)
-        return logits * factor + term
-
-    def _influence(self, cosine: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
+    def _factor_and_bias(self, cosines: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
         """What logits are multiplied by, and what is added to them."""
-        one = torch.ones((), device=cosine.device if cosine is not None else None)
-        if cosine is None:
+        one = torch.ones((), device=cosines.device if cosines is not None else None)
+        if cosines is None:
             return one, one * 0
         if self.similarity == "log":
-            return one, cosine.clamp(min=self.s_min).log()
-        return (cosine.clamp(min=0) if self.similarity == "product_clamped" else cosine), one * 0
+            return one, cosines.clamp(min=self.s_min).log()
+        return (cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines), one * 0
 
 
-def _ready(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
-    """``linear`` with its numbers in autocast's type: cast once, not again for every part of the tokens."""
+def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
+    """``linear`` with its parameters in autocast's dtype: cast once, not for every part of the tokens."""
     kind = linear.weight.device.type
     if not torch.is_autocast_enabled(kind):
         return linear
@@ -156,8 +178,8 @@ def _ready(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
     return partial(F.linear, weight=linear.weight.to(dtype), bias=linear.bias.to(dtype))
 
 
-def _by_rows(function: Callable[[slice], Tensor], count: int) -> Float[Tensor, "count _"]:
-    """``function`` of all rows, some at a time where no gradient is kept (bounds memory)."""
+def _in_parts(function: Callable[[slice], Tensor], count: int) -> Float[Tensor, "count _"]:
+    """``function`` of all rows; without a gradient a part of them at a time, to bound memory."""
     most = _HALF_ROWS if torch.is_autocast_enabled("cpu") else _ROWS
     if torch.is_grad_enabled() or count <= most:
         return function(slice(None))

@@ -12,13 +12,13 @@ from ghgs_lit.kernels.parts import even_parts
 
 MODES = ("all", "other_views", "mixed")
 
-#: Distances that are held at once: bounds memory, and keeps a block in a CPU's cache.
+#: Number of distances that are held at once: bounds memory, and keeps a block in a CPU's cache.
 _BLOCK = 1 << 17
 
 
 @dataclass(frozen=True)
 class Neighbors:
-    """Of each of ``n`` tokens, the indices of ``k`` others (or itself); where not ``valid``, none."""
+    """Indices of the ``k`` neighbours of each of ``n`` tokens; only ``valid`` entries count."""
 
     index: Int[Tensor, "n k"]
     valid: Bool[Tensor, "n k"]
@@ -28,18 +28,24 @@ class Neighbors:
 def nearest_neighbors(
     points: Float[Tensor, "n d"], view: Int[Tensor, " n"], k: int, mode: str = "all"
 ) -> Neighbors:
-    """The ``k`` nearest points of each point, or as many as there are, nearest first, ties by index.
+    """The ``min(k, n)`` nearest points of each point, nearest first, ties by index.
 
-    Distances come from differences in float32 or wider (no expansion into products, which loses digits
-    far from the origin). ``mode``: ``all`` takes any view, the point itself included;
-    ``other_views`` no point of the query's own view, unless there is no other (then the query itself);
-    ``mixed`` up to ``k // 2`` of the own view, itself included, and the rest from others.
+    Distances are computed from differences in float32 or wider (the expansion into products would lose
+    digits far from the origin).
+
+    Args:
+        points: positions of the tokens, of any dimension d.
+        view: the view of each token.
+        k: number of neighbours.
+        mode: ``all`` searches all views, the point itself included; ``other_views`` all views but the
+            query's own (where there is no such point, the query itself); ``mixed`` takes up to ``k // 2``
+            from the query's own view, itself included, and the rest from other views.
     """
     choice("recalibration.neighbors", mode, MODES)
     require(k >= 1, "recalibration.k", "1 or more", k)
     points = at_least_float32(points)
     n = points.shape[0]
-    # Filled, not joined: small results kept among freed distances would hold all their memory.
+    # Filled, not concatenated: small results between freed distances would keep that memory occupied.
     index = torch.empty(n, min(k, n), dtype=torch.int64, device=points.device)
     valid = torch.empty_like(index, dtype=torch.bool)
     for rows in even_parts(n, _BLOCK // max(n, 1)):
@@ -68,15 +74,15 @@ def _nearest_to_block(points: Tensor, view: Tensor, block: slice, k: int, mode: 
 
 
 def _allowed(distance: Tensor, mask: Tensor, k: int) -> Neighbors:
-    """The nearest among those in ``mask``; distances that are not allowed sort behind all others."""
+    """The nearest points inside ``mask``; the distances of all others become NaN, which sorts last."""
     index = _smallest(torch.where(mask, distance, float("nan")), k)
     return Neighbors(index, mask.gather(1, index))
 
 
 def _smallest(distance: Float[Tensor, "m n"], k: int) -> Int[Tensor, "m k"]:
-    """Columns of the ``k`` smallest of each row, ascending, ties by column; NaN is largest.
+    """Columns of the ``k`` smallest values of each row, ascending, ties by column; NaN is largest.
 
-    ``topk`` promises no order among equals, so the column is part of the key: the bits of a
+    ``topk`` does not define the order of equal values, so the column is part of the key: the bits of a
     non-negative float32 sort like its value, and the column fills the lower half.
     """
     if distance.dtype == torch.float64:

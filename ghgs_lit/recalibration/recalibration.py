@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
@@ -16,24 +16,26 @@ from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
 from ghgs_lit.types import Batch, Points, Tokens
 
-#: Cosines that are held at once.
-_SIMILARITIES = 1 << 21
+#: Number of cosines that are held at once (bounds memory).
+_COSINES = 1 << 21
 
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
 
 class Recalibration(nn.Module):
-    """One :class:`SemanticAttention` for all layers; neighbours and cosines are found once a forward.
+    """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward.
 
     Args:
         dim_latent: width of the tokens (from the encoder).
-        k: neighbours of a token, or as many as there are.
+        k: number of neighbours of a token; all tokens where there are fewer.
         num_heads, similarity, s_min: see :class:`SemanticAttention`.
-        neighborhood: near in what: ``xyz``, the token points; ``image_plane``, token centres in units of the
-            image's longer side, shared by all views (the paper without unprojection); ``feature``, directions
-            of the semantic features.
-        neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
-        tokens: ``subject``, tokens with a valid point; others pass unchanged. ``all``, the release's.
+        neighborhood: the space in which neighbours are searched: ``xyz``, the token points; ``image_plane``,
+            token centres in units of the image's longer side, shared by all views (the paper without
+            unprojection); ``feature``, directions of the semantic features.
+        neighbors: views of the neighbours: ``all``, ``other_views`` or ``mixed`` (see
+            :func:`nearest_neighbors`).
+        tokens: ``subject``, tokens with a valid point (the others pass unchanged); ``all`` (the authors'
+            release).
     """
 
     def __init__(
@@ -56,10 +58,9 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, num_heads, similarity, s_min)
 
     def forward(self, tokens: Tokens, points: Points, batch: Batch) -> Tokens:
-        """Tokens with recalibrated layers; the semantic features and the order stay."""
+        """Tokens with recalibrated layers; their order and the semantic features do not change."""
         batch_size, views = batch.masks.shape[:2]
-        takes_part = points.tokens_valid | (self.tokens == "all")
-        chosen = takes_part.nonzero()[:, 0]
+        chosen = self.takes_part(points).nonzero()[:, 0]
 
         def part(values: Tensor) -> Tensor:
             return values if len(chosen) == len(values) else values[chosen]
@@ -69,7 +70,7 @@ class Recalibration(nn.Module):
         neighbors = [
             nearest_neighbors(positions, views_of, self.k, self.neighbors)
             for positions, views_of in zip(
-                part(self._positions(tokens, points)).split(counts), image.split(counts), strict=True
+                part(self.positions(tokens, points)).split(counts), image.split(counts), strict=True
             )
         ]
         cosines = None
@@ -82,7 +83,12 @@ class Recalibration(nn.Module):
             layers.append(found if len(found) == len(layer) else layer.index_copy(0, chosen, found))
         return dataclasses.replace(tokens, latent=tuple(layers))
 
-    def _positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
+    def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
+        """Which tokens are recalibrated and can be neighbours."""
+        return points.tokens_valid | (self.tokens == "all")
+
+    def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
+        """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
         if self.neighborhood == "xyz":
             return points.tokens.detach()
         if self.neighborhood == "feature":
@@ -94,15 +100,16 @@ class Recalibration(nn.Module):
 def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Float[Tensor, "n k"]:
     """Cosines of the semantic features of tokens and their neighbours (Eq. 4), float32 or wider.
 
-    Features are normalised once, before they are picked; a feature of length 0 has cosine 0 to all.
+    Features are normalised once, before the neighbours are gathered. A feature of length 0 has cosine 0 with
+    every other.
     """
     with torch.autocast(semantic.device.type, enabled=False):
         semantic = at_least_float32(semantic)
         if cpu.is_supported(semantic, 1, neighbors.index.shape[1]):
             return cpu.cosines(semantic, neighbors.index)
-        # What stays is made first: behind freed features it would hold their memory.
+        # Allocated first: after the features it would keep their memory occupied once they are freed.
         cosines = semantic.new_empty(neighbors.index.shape)
         unit = F.normalize(semantic, dim=-1, eps=1e-12)
-        for rows in even_parts(len(unit), _SIMILARITIES // max(1, len(unit))):
+        for rows in even_parts(len(unit), _COSINES // max(1, len(unit))):
             torch.gather(linear(unit[rows], unit), 1, neighbors.index[rows], out=cosines[rows])
     return cosines

@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import math
 from collections.abc import Sequence
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.rendering import gsplat_backend
-from ghgs_lit.rendering.settings import RasterSettings
+from ghgs_lit.rendering.settings import RasterSettings, is_finite_number
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 BACKENDS = ("auto", "gsplat", "cpu", "reference")
@@ -31,28 +30,37 @@ def render(
     settings: RasterSettings | None = None,
     region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
 ) -> Rendering:
-    """Images [B, T, C, h, w], alphas and depths of ``B`` sets of Gaussians from cameras [B, T].
+    """Render ``B`` sets of Gaussians from cameras [B, T].
 
-    Differentiable in means, quaternions, scales, opacities, colours and background; any number ``C`` of
-    colour channels, any image size, any number of Gaussians per element, none included.
+    Differentiable in means, quaternions, scales, opacities, colours and background. Any number ``C`` of
+    colour channels, any image size and any number of Gaussians per element, including none.
 
-    ``backend``: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
-    means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
-    ``background``: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
-    ``near`` and ``far`` in metres: only Gaussians whose centre has ``near <= z <= far`` are seen.
-    ``region``: the box (top, left, height, width) in pixels that is wanted, one for all or one for each
-    view; what lies outside is background, has no gradient, and costs the CPU backend nothing.
-    ``depth`` is the expectation ``sum(w z) / max(sum(w), 1e-10)``, 0 where nothing is seen.
+    Args:
+        gaussians: a zero quaternion is the identity; a Gaussian with NaN in its geometry or opacity is not
+            drawn.
+        cameras: [B, T].
+        backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
+            means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
+        background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
+        near, far: metres; only Gaussians whose centre has ``near <= z <= far`` are drawn.
+        settings: constants of the image; None for the defaults.
+        region: the box to draw (top, left, height, width) in pixels, one for all views or one for each.
+            Outside it the image is background and has no gradient; the CPU backend skips that work.
 
-    Zero quaternions are identity; a Gaussian with a NaN in its geometry or opacity is not seen.
-    Raises ``InputError`` for inputs that do not fit, ``BackendUnavailable`` where gsplat cannot run.
+    Returns:
+        Image [B, T, C, h, w], alpha and depth [B, T, 1, h, w]; depth is the expectation
+        ``sum(w z) / max(sum(w), 1e-10)``, 0 where no Gaussian is seen.
+
+    Raises:
+        InputError: inputs that do not fit together.
+        BackendUnavailable: gsplat cannot run on this machine.
     """
     settings = settings or RasterSettings()
     _check_range(near, far)
     _check_inputs(gaussians, cameras)
-    backend = resolve(backend, gaussians.means.device)
+    backend = resolve_backend(backend, gaussians.means.device)
     module = importlib.import_module(f"ghgs_lit.rendering.{_MODULES[backend]}")
-    gaussians = _wide_gaussians(gaussians)
+    gaussians = _in_one_dtype(gaussians)
     cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
     with torch.autocast(gaussians.means.device.type, enabled=False):
         options = (settings, float(near), float(far))
@@ -61,15 +69,20 @@ def render(
             rendering = module.rasterize(gaussians, cameras, *options, regions)
         else:
             rendering = module.rasterize(gaussians, cameras, *options)
-            rendering = rendering if regions is None else _cut(rendering, regions)
-        if _is_finite(background) and background == 0:
+            rendering = rendering if regions is None else _masked(rendering, regions)
+        if is_finite_number(background) and background == 0:
             return rendering
         behind = (1 - rendering.alpha) * _background(background, rendering.image)
         return dataclasses.replace(rendering, image=rendering.image + behind)
 
 
-def resolve(backend: str, device: torch.device) -> str:
-    """The backend that ``auto`` means on ``device``; refuses one that cannot run there."""
+def resolve_backend(backend: str, device: torch.device) -> str:
+    """The backend for tensors on ``device``, with ``auto`` resolved.
+
+    Raises:
+        InputError: a backend that does not run on ``device``.
+        BackendUnavailable: gsplat cannot run on this machine.
+    """
     choice("renderer.backend", backend, BACKENDS)
     is_cuda = device.type == "cuda"
     if backend == "auto":
@@ -89,7 +102,12 @@ def resolve(backend: str, device: torch.device) -> str:
 
 
 class Renderer:
-    """``render`` with its options bound, as ``conf/renderer`` describes it."""
+    """:func:`render` with fixed options, as ``conf/renderer`` configures it.
+
+    Args:
+        backend, background, near, far: see :func:`render`.
+        settings: fields of :class:`RasterSettings`.
+    """
 
     def __init__(
         self,
@@ -105,7 +123,7 @@ class Renderer:
         _check_range(near, far)
         numbers = background if isinstance(background, Sequence) else (background,)
         require(
-            not isinstance(background, str) and all(_is_finite(number) for number in numbers),
+            not isinstance(background, str) and all(is_finite_number(number) for number in numbers),
             "renderer.background",
             "a number or one for each channel",
             background,
@@ -122,20 +140,16 @@ class Renderer:
         background: Background | None = None,
         region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
     ) -> Rendering:
-        """Render; ``background`` replaces the configured one. See :func:`render`."""
+        """See :func:`render`; a ``background`` that is given here replaces the configured one."""
         background = self.background if background is None else background
         return render(
             gaussians, cameras, self.backend, background, self.near, self.far, self.settings, region
         )
 
 
-def _is_finite(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _check_range(near: float, far: float) -> None:
-    require(_is_finite(near) and near > 0, "renderer.near", "a number of metres > 0", near)
-    require(_is_finite(far) and far > near, "renderer.far", f"more than near = {near}", far)
+    require(is_finite_number(near) and near > 0, "renderer.near", "a number of metres > 0", near)
+    require(is_finite_number(far) and far > near, "renderer.far", f"more than near = {near}", far)
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
@@ -172,8 +186,8 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
     )
 
 
-def _wide_gaussians(gaussians: Gaussians) -> Gaussians:
-    """Gaussians in float32, or all in float64 if any of their fields are."""
+def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
+    """All fields in float64 if one of them is, else in float32."""
     fields = ("means", "quaternions", "scales", "opacities", "colors")
     tensors = {name: at_least_float32(getattr(gaussians, name)) for name in fields}
     is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
@@ -182,6 +196,7 @@ def _wide_gaussians(gaussians: Gaussians) -> Gaussians:
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor | float:
+    """The background as a number or a tensor that broadcasts with ``color``."""
     if isinstance(background, (int, float)):
         return background
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
@@ -197,7 +212,7 @@ def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Te
 
 
 def _regions(region: Sequence[int] | Tensor, cameras: Cameras) -> Int[Tensor, "B T 4"]:
-    """One box (top, left, height, width) inside the image for each view."""
+    """``region`` as one checked box (top, left, height, width) for each view."""
     expected = "(top, left, height, width) inside the image, one box or [B, T, 4]"
     boxes = torch.as_tensor(region)
     is_whole = not boxes.is_floating_point() and not boxes.is_complex()
@@ -209,8 +224,8 @@ def _regions(region: Sequence[int] | Tensor, cameras: Cameras) -> Int[Tensor, "B
     return boxes.expand(*cameras.shape, 4)
 
 
-def _cut(rendering: Rendering, regions: Int[Tensor, "B T 4"]) -> Rendering:
-    """Nothing but the regions of a rendering on black."""
+def _masked(rendering: Rendering, regions: Int[Tensor, "B T 4"]) -> Rendering:
+    """A rendering on black with zeros outside the regions."""
     device = rendering.image.device
     rows = torch.arange(rendering.image.shape[-2], device=device)[:, None]
     columns = torch.arange(rendering.image.shape[-1], device=device)

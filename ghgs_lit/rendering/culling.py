@@ -1,5 +1,6 @@
-"""Leave Gaussians out before rendering: those that no camera sees; faint and tiny ones at a known error."""
+"""Remove Gaussians before rendering: those that no camera sees, and faint or tiny ones with a known error."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -12,18 +13,17 @@ from ghgs_lit.rendering.api import render
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians
 
-# Pixels around a splat's box, more than rounding could move it.
+# Margin in pixels around a splat's box; rounding moves the box by less.
 _SLACK = 1.0
 
 
 @dataclass(frozen=True)
 class Culled:
-    """The Gaussians that are kept, which ones those are, and the error of every pixel at most.
+    """The Gaussians that are kept, their mask, and a bound of the error of each pixel.
 
-    Along a ray, ``1 - prod(1 - alpha_i)`` over the Gaussians that were left out is the part of the light
-    that may come from elsewhere without them. So no alpha changes by more than ``bound``, and no colour
-    by more than ``bound`` times the range of the colours (background included). It is their own alpha, and
-    holds where a pixel does not end early (``stop``); ``bound`` is 0 where all that was left out is unseen.
+    ``bound`` is the alpha ``1 - prod(1 - alpha_i)`` of the removed Gaussians drawn alone, 0 where none of
+    them is seen. No alpha of the image changes by more than ``bound``, and no colour by more than ``bound``
+    times the range of the colours (background included), in pixels that do not end early (``stop``).
     """
 
     gaussians: Gaussians
@@ -41,12 +41,18 @@ def cull(
     far: float = 1e10,
     settings: RasterSettings | None = None,
 ) -> Culled:
-    """Leave out what no camera [B, T] of its batch element sees, and faint and tiny Gaussians.
+    """Remove Gaussians that no camera of their batch element sees, and optionally faint and tiny ones.
 
-    By default only what cannot change a single bit of ``render`` goes: behind ``near`` or beyond ``far``,
-    outside every frame, or less opaque than ``alpha_min``. With ``opacity``, Gaussians less opaque than
-    that go too; with ``size``, those whose larger standard deviation on the image, before the low-pass
-    filter, is below that many pixels in all views. The kept Gaussians keep their gradients.
+    By default only Gaussians that cannot change a bit of ``render`` are removed: nearer than ``near``, beyond
+    ``far``, outside every frame, or with an opacity below ``alpha_min``. The kept ones keep their gradients.
+
+    Args:
+        gaussians: of ``B`` elements.
+        cameras: [B, T].
+        opacity: remove Gaussians with a smaller opacity as well.
+        size: remove Gaussians whose larger standard deviation on the image, before the low-pass filter, is
+            less than this number of pixels in all views as well.
+        near, far, settings: as for :func:`~ghgs_lit.rendering.render`.
     """
     settings = settings or RasterSettings()
     require(0 <= opacity <= 1, "cull.opacity", "a number from 0 to 1", opacity)
@@ -62,8 +68,8 @@ def cull(
     none = gaussians.means.new_zeros(0, dtype=torch.bool)
     seen, small = torch.cat([*seen, none]), torch.cat([*small, none])
     dropped = _subset(gaussians, seen & small)
-    open_ended = RasterSettings(**{**vars(settings), "stop": 0.0})
-    bound = render(dropped, cameras, near=near, far=far, settings=open_ended).alpha
+    without_stop = dataclasses.replace(settings, stop=0.0)
+    bound = render(dropped, cameras, near=near, far=far, settings=without_stop).alpha
     kept = seen & ~small
     with torch.enable_grad():
         return Culled(_subset(gaussians, kept), kept, bound)
@@ -72,14 +78,11 @@ def cull(
 def _seen(gaussians: Gaussians, camera: Cameras, near: float, far: float, settings: RasterSettings):
     """Which Gaussians may reach a pixel of one camera, and their larger standard deviation in pixels."""
     splats = reference.project(gaussians, camera.to(torch.float64), settings)
-    xx, xy, yy = splats["covariances"].unbind(-1)
-    x, y = splats["centers"].unbind(-1)
-    z, slack = splats["depths"], 1e-6
-    seen = (
-        (z >= near * (1 - slack))
-        & (z <= far * (1 + slack))
-        & (splats["opacities"] >= settings.alpha_min * (1 - slack))
-    )
+    xx, xy, yy = splats.covariances.unbind(-1)
+    x, y = splats.centers.unbind(-1)
+    z, slack = splats.depths, 1e-6
+    seen = (z >= near * (1 - slack)) & (z <= far * (1 + slack))
+    seen &= splats.opacities >= settings.alpha_min * (1 - slack)
     reach_x, reach_y = settings.extent * xx.sqrt() + _SLACK, settings.extent * yy.sqrt() + _SLACK
     seen &= (x > -reach_x) & (x < camera.width + reach_x) & (y > -reach_y) & (y < camera.height + reach_y)
     middle, half = 0.5 * (xx + yy) - settings.low_pass, torch.hypot(0.5 * (xx - yy), xy)

@@ -1,4 +1,4 @@
-"""gsplat on CUDA. It is imported where it is used; its constants are compiled in."""
+"""The gsplat backend (CUDA). gsplat is imported on first use; most constants are compiled into it."""
 
 import importlib
 
@@ -13,11 +13,15 @@ _FIXED = ("alpha_max", "alpha_min", "stop", "extent", "frustum_margin")
 
 
 class BackendUnavailable(ValueError):
-    """The renderer asked for cannot run on this machine; the message says what was tried."""
+    """The chosen renderer cannot run on this machine; the message says what was tried."""
 
 
 def load():
-    """The ``rasterization`` function of gsplat, or ``BackendUnavailable`` with what was tried."""
+    """gsplat's function ``rasterization``.
+
+    Raises:
+        BackendUnavailable: no CUDA device, or gsplat cannot be imported.
+    """
     if not torch.cuda.is_available():
         raise BackendUnavailable(
             "renderer.backend=gsplat: needs a CUDA device, but torch.cuda.is_available() is false "
@@ -26,7 +30,7 @@ def load():
     try:
         return importlib.import_module("gsplat").rasterization
     except Exception as error:
-        # Building gsplat's kernels fails in many ways; whatever it says belongs in the message.
+        # Building gsplat's kernels can fail in many ways; the message repeats the reason.
         reason = str(error).strip().splitlines()
         raise BackendUnavailable(
             "renderer.backend=gsplat: `import gsplat` failed with "
@@ -43,7 +47,7 @@ def rasterize(
     default = RasterSettings()
     for name in _FIXED:
         value, fixed = getattr(settings, name), getattr(default, name)
-        require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which gsplat has compiled in", value)
+        require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)
     rasterization = load()
     channels = gaussians.colors.shape[1]
     elements = [
@@ -59,12 +63,12 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
     """All views of one batch element, [T, C + 2, h, w]: colours, expected depth, alpha."""
     channels = gaussians.colors.shape[1]
     if len(gaussians) == 0 or cameras.shape[0] == 0:
-        # Keeps the graph, so that a batch of empty elements can be differentiated.
+        # Stays part of the graph, so that a batch of empty elements can be differentiated.
         nothing = gaussians.means.sum() + gaussians.colors.sum()
         return nothing.float() * torch.zeros(
             cameras.shape[0], channels + 2, cameras.height, cameras.width, device=gaussians.means.device
         )
-    safe = _safe(gaussians)
+    safe = _sanitized(gaussians)
     values, alpha, _ = rasterization(
         means=safe.means,
         quats=safe.quaternions,
@@ -85,25 +89,26 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
     return torch.cat((values, alpha), dim=-1).permute(0, 3, 1, 2)
 
 
-def _safe(gaussians: Gaussians) -> Gaussians:
+def _sanitized(gaussians: Gaussians) -> Gaussians:
     """Float32 Gaussians that gsplat draws as this project defines them.
 
-    Its kernels square quaternions in float32 and do not expect what is not a number: norms become one,
-    the zero quaternion identity, and a Gaussian with a geometry or opacity that is not finite invisible.
+    gsplat's kernels square quaternions in float32 and do not expect NaN or infinity. So quaternions are
+    normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity is not
+    finite becomes invisible.
     """
     means, scales, opacities = gaussians.means.float(), gaussians.scales.float(), gaussians.opacities.float()
     quaternions = gaussians.quaternions.float()
     geometry = torch.cat((means, quaternions, scales, opacities[:, None]), dim=-1)
-    is_sound = geometry.isfinite().all(-1)
+    is_finite = geometry.isfinite().all(-1)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], device=means.device)
     largest = quaternions.abs().amax(-1, keepdim=True).detach()
-    is_turned = is_sound[:, None] & (largest > 0)
-    scaled = torch.where(is_turned, quaternions, identity) / torch.where(is_turned, largest, 1)
+    is_rotated = is_finite[:, None] & (largest > 0)
+    scaled = torch.where(is_rotated, quaternions, identity) / torch.where(is_rotated, largest, 1)
     return Gaussians(
-        means=torch.where(is_sound[:, None], means, 0),
+        means=torch.where(is_finite[:, None], means, 0),
         quaternions=torch.nn.functional.normalize(scaled, dim=-1),
-        scales=torch.where(is_sound[:, None], scales, 1),
-        opacities=torch.where(is_sound, opacities, 0),
+        scales=torch.where(is_finite[:, None], scales, 1),
+        opacities=torch.where(is_finite, opacities, 0),
         colors=gaussians.colors.float(),
         splits=gaussians.splits,
     )

@@ -1,10 +1,11 @@
-"""The definition of the image in plain PyTorch, in the dtype of its input: the truth for tests.
+"""The image in plain PyTorch, in the dtype of its input: the truth for tests.
 
-Every Gaussian meets every pixel, so it is slow and takes memory; gradients come from autograd. What is
-computed is told in :class:`ghgs_lit.rendering.settings.RasterSettings`.
+Every Gaussian is evaluated in every pixel, so it is slow and needs much memory; gradients come from autograd.
+:class:`ghgs_lit.rendering.settings.RasterSettings` defines the image.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -15,8 +16,20 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
-# Gaussians times pixels held at once.
+# Gaussians times pixels that are held at once (bounds memory).
 _CHUNK = 1 << 19
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians projected into one camera: pixels, and covariances as (xx, xy, yy) in px^2."""
+
+    centers: Float[Tensor, "n 2"]
+    covariances: Float[Tensor, "n 3"]
+    determinants: Float[Tensor, " n"]
+    depths: Float[Tensor, " n"]
+    opacities: Float[Tensor, " n"]
+    colors: Float[Tensor, "n C"]
 
 
 def rasterize(
@@ -32,7 +45,7 @@ def rasterize(
 def _sums(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Float[Tensor, "B T channels h w"]:
-    """Sums over the Gaussians of a pixel: ``w colour`` (C channels), ``w z`` and ``w``."""
+    """Sums over the Gaussians that a pixel sees: ``w colour`` (C channels), ``w z`` and ``w``."""
     images = []
     for element in range(len(gaussians.splits)):
         images += [
@@ -50,8 +63,8 @@ def _view(
 ) -> Float[Tensor, "channels h w"]:
     index = visible(gaussians, camera, settings, near, far)
     splats = project(gaussians.select(index, (len(index),)), camera, settings)
-    centers = pixel_centers(camera.height, camera.width, splats["centers"]).flatten(0, 1)
-    step = max(1, _CHUNK // max(1, len(splats["depths"])))
+    centers = pixel_centers(camera.height, camera.width, splats.centers).flatten(0, 1)
+    step = max(1, _CHUNK // max(1, len(splats.depths)))
     image = torch.cat([_blend(splats, chunk, settings) for chunk in centers.split(step)])
     return image.mT.unflatten(1, (camera.height, camera.width))
 
@@ -60,31 +73,35 @@ def _view(
 def visible(
     gaussians: Gaussians, camera: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Int[Tensor, " n"]:
-    """Gaussians between near and far with a positive, finite determinant and an opacity that counts, by
-    float32 depth, ties by index. What is not a number is none of these."""
+    """Indices of the Gaussians to draw, sorted by float32 depth, ties by index.
+
+    They lie between near and far, their determinant is positive and finite, and their opacity is at least
+    ``alpha_min``. NaN fails each of these conditions.
+    """
     splats = project(gaussians, camera, settings)
-    depths, determinants = splats["depths"], splats["determinants"]
+    depths, determinants = splats.depths, splats.determinants
     keep = (depths >= near) & (depths <= far) & (determinants > 0) & determinants.isfinite()
-    keep &= (splats["opacities"] >= settings.alpha_min) & splats["centers"].isfinite().all(-1)
+    keep &= (splats.opacities >= settings.alpha_min) & splats.centers.isfinite().all(-1)
     index = keep.nonzero()[:, 0]
     return index[depths[index].float().argsort(stable=True)]
 
 
-def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> dict[str, Tensor]:
-    """Splats: centres [n, 2] px, covariances (xx, xy, yy), determinants, depths, opacities, colours."""
+def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> Splats:
+    """All Gaussians as splats of one camera, whether it sees them or not."""
     rotation, translation = camera.extrinsics[:3, :3], camera.extrinsics[:3, 3]
     points = gaussians.means @ rotation.mT + translation
     x, y, z = points.unbind(-1)
     focal, center = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
     size = focal.new_tensor([camera.width, camera.height])
     margin = settings.frustum_margin * 0.5 * size / focal
-    held = torch.stack((x / z, y / z), dim=-1)
-    held = torch.minimum(torch.maximum(held, -center / focal - margin), (size - center) / focal + margin)
+    tangents = torch.stack((x / z, y / z), dim=-1)
+    low, high = -center / focal - margin, (size - center) / focal + margin
+    tangents = torch.minimum(torch.maximum(tangents, low), high)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         (
-            torch.stack((focal[0] / z, zero, -focal[0] / z * held[:, 0]), dim=-1),
-            torch.stack((zero, focal[1] / z, -focal[1] / z * held[:, 1]), dim=-1),
+            torch.stack((focal[0] / z, zero, -focal[0] / z * tangents[:, 0]), dim=-1),
+            torch.stack((zero, focal[1] / z, -focal[1] / z * tangents[:, 1]), dim=-1),
         ),
         dim=-2,
     )
@@ -99,34 +116,33 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
         ratio = bare / determinant
         is_flat = ~(ratio > 0)
         opacities = opacities * torch.where(is_flat, zero, torch.where(is_flat, 1, ratio).sqrt())
-    centers = focal * points[:, :2] / z[:, None] + center
-    return {
-        "centers": centers,
-        "covariances": torch.stack((xx + settings.low_pass, xy, yy + settings.low_pass), dim=-1),
-        "determinants": determinant,
-        "depths": z,
-        "opacities": opacities,
-        "colors": gaussians.colors,
-    }
+    return Splats(
+        centers=focal * points[:, :2] / z[:, None] + center,
+        covariances=torch.stack((xx + settings.low_pass, xy, yy + settings.low_pass), dim=-1),
+        determinants=determinant,
+        depths=z,
+        opacities=opacities,
+        colors=gaussians.colors,
+    )
 
 
-def _blend(splats: dict[str, Tensor], pixels: Tensor, settings: RasterSettings) -> Tensor:
-    """Composite all splats over pixels [P, 2]; returns [P, C + 2]."""
-    dx, dy = (pixels[None] - splats["centers"][:, None]).unbind(-1)
-    xx, xy, _ = splats["covariances"][:, None].unbind(-1)
-    sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats["determinants"][:, None])
+def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSettings) -> Float[Tensor, "P c"]:
+    """Composite all splats over ``P`` pixels: sums of ``w colour``, ``w z`` and ``w``."""
+    dx, dy = (pixels[None] - splats.centers[:, None]).unbind(-1)
+    xx, xy, _ = splats.covariances[:, None].unbind(-1)
+    sigma = 0.5 * (dx * dx / xx + (dy - xy / xx * dx).square() * xx / splats.determinants[:, None])
     near_enough = sigma <= 0.5 * settings.extent**2
-    raw = splats["opacities"][:, None] * torch.exp(-torch.where(near_enough, sigma, 0))
-    # The gradient of a clamped alpha is zero, also at equality.
+    raw = splats.opacities[:, None] * torch.exp(-torch.where(near_enough, sigma, 0))
+    # A clamped alpha has no gradient, also at equality.
     alpha = torch.where(raw < settings.alpha_max, raw, settings.alpha_max)
     hit = near_enough & (alpha >= settings.alpha_min)
     behind = torch.log1p(-torch.where(hit, alpha, 0)).cumsum(0)
-    # T only falls, so all that follow a splat that was left out are left out too.
+    # Transmittance only falls, so every splat after the first one that is left out is left out too.
     seen = hit & (behind > (math.log(settings.stop) if settings.stop > 0 else -math.inf))
     alpha = torch.where(seen, alpha, 0)
     step = torch.log1p(-alpha)
     weights = alpha * torch.exp(step.cumsum(0) - step)
-    ones = torch.ones_like(splats["depths"])
-    values = torch.cat((splats["colors"], splats["depths"][:, None], ones[:, None]), dim=-1)
-    # Not a matrix product: a colour that is not finite must not reach pixels that do not see it.
+    ones = torch.ones_like(splats.depths)
+    values = torch.cat((splats.colors, splats.depths[:, None], ones[:, None]), dim=-1)
+    # Not a matrix product: a colour that is not finite must not reach pixels that do not see its splat.
     return (weights[..., None] * torch.where(seen[..., None], values[:, None], 0)).sum(0)

@@ -1,4 +1,4 @@
-"""The attention kernel of a CPU against PyTorch's own in float64."""
+"""The CPU kernel for attention against PyTorch in float64."""
 
 import numba
 import pytest
@@ -18,7 +18,7 @@ DTYPES = [torch.float32, HALF]
 
 
 def scene(n, heads, tokens, width, dtype, scale=1.0, seed=0):
-    """Queries, keys and values [n, heads, tokens, width] as the encoder has them: parts of one tensor."""
+    """Queries, keys and values [n, heads, tokens, width], parts of one tensor as in the encoder."""
     g = torch.Generator().manual_seed(seed)
     qkv = torch.randn(n, tokens, 3, heads, width, generator=g)
     qkv[:, :, :2] *= scale
@@ -26,7 +26,7 @@ def scene(n, heads, tokens, width, dtype, scale=1.0, seed=0):
 
 
 def error(found, q, k, v):
-    """Root mean square of the difference to float64, as a part of the result's."""
+    """Root mean square of the difference to float64, relative to that of the result."""
     expected = F.scaled_dot_product_attention(q.double(), k.double(), v.double()).transpose(1, 2)
     return ((found.double() - expected).square().mean() / expected.square().mean()).sqrt()
 
@@ -50,6 +50,7 @@ def pytorch(q, k, v):
 )
 @pytest.mark.parametrize("scale", [0.0, 1.0, 4.0])
 def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype, scale):
+    """The kernel is as accurate as PyTorch for all sizes around its block sizes."""
     q, k, v = scene(n, heads, tokens, width, dtype, scale)
     found = cpu.attend(q, k, v)
     assert found.dtype == dtype
@@ -60,6 +61,7 @@ def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype, scale)
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_fewer_queries_than_keys_and_more(dtype):
+    """Queries and keys may differ in number, which uses the padding of both."""
     q, k, v = scene(1, 2, 300, 64, dtype)
     for queries, keys in ((5, 300), (300, 7), (1, 1)):
         args = q[:, :, :queries], k[:, :, :keys], v[:, :, :keys]
@@ -67,7 +69,7 @@ def test_fewer_queries_than_keys_and_more(dtype):
 
 
 def test_scores_that_rise_and_fall_by_hundreds():
-    """The running maximum moves in every block of keys, or in none after the first."""
+    """A running maximum that changes in every block of keys, or only in the first, loses no accuracy."""
     v = scene(1, 1, 5 * KEYS, 32, torch.float32)[2]
     slope = torch.linspace(-300, 300, 5 * KEYS)[:, None]
     q = torch.ones_like(v)
@@ -77,6 +79,7 @@ def test_scores_that_rise_and_fall_by_hundreds():
 
 
 def test_weights_below_the_smallest_float_count_for_nothing():
+    """Keys with tiny weights do not add up to an error, even with huge values."""
     q = torch.full((1, 1, 1, 32), 10.0)
     k = torch.zeros(1, 1, 64, 32)
     k[0, 0, 0] = 10
@@ -88,6 +91,7 @@ def test_weights_below_the_smallest_float_count_for_nothing():
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_what_is_not_finite_reaches_the_same_values_as_in_pytorch(dtype, bad):
+    """NaN and infinity are neither hidden nor spread to other queries or heads."""
     for part in range(3):
         q, k, v = (x.clone() for x in scene(1, 2, 300, 32, dtype))
         (q, k, v)[part][0, 1, 290, 3] = bad
@@ -99,6 +103,7 @@ def test_what_is_not_finite_reaches_the_same_values_as_in_pytorch(dtype, bad):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("heads", "tokens"), [(5, 40), (1, 7 * QUERIES + 3)])
 def test_the_same_bits_with_any_number_of_threads(dtype, heads, tokens):
+    """Results do not depend on how heads are divided among threads."""
     before = torch.get_num_threads()
     args = scene(2, heads, tokens, 32, dtype)
     found = []
@@ -112,21 +117,24 @@ def test_the_same_bits_with_any_number_of_threads(dtype, heads, tokens):
 
 
 def test_types_may_differ_and_that_of_the_values_is_taken():
+    """Queries and keys in another dtype than the values are converted."""
     q, k, v = scene(1, 2, 50, 32, torch.float32)
     halves = [x.bfloat16() for x in (q, k)]
     assert error(cpu.attend(*halves, v), *halves, v) < 1e-6
 
 
 def test_inputs_whose_numbers_lie_apart():
+    """Inputs whose channels are not contiguous are copied, not misread."""
     q, k, v = (x.transpose(2, 3).contiguous().transpose(2, 3) for x in scene(1, 2, 50, 32, torch.float32))
     assert q.stride(-1) != 1
     assert error(cpu.attend(q, k, v), q, k, v) < 1e-6
 
 
 def test_what_the_kernel_is_asked_for(monkeypatch):
+    """The kernel is used only where it is supported and faster."""
     monkeypatch.setattr(attention, "_has", lambda feature: feature == "avx512f")
     q, _, v = scene(1, 4, 1024, 32, torch.float32)
-    assert not cpu.is_supported(q, v)  # a gradient may be wanted
+    assert not cpu.is_supported(q, v)  # a gradient may be needed
     with torch.no_grad():
         assert cpu.is_supported(q, v)
         assert not cpu.is_supported(q[:, :, :100], v[:, :, :100])  # small
@@ -140,5 +148,6 @@ def test_what_the_kernel_is_asked_for(monkeypatch):
 
 
 def test_features_of_the_processor_may_be_limited(monkeypatch):
+    """Features that a user disables by Numba's setting are not used."""
     monkeypatch.setattr(numba.config, "CPU_FEATURES", "+avx2,-avx512f")
     assert processor_features() == {"avx2"}

@@ -1,7 +1,7 @@
 """Encoder and dense head against numbers of the published architecture (random weights, CPU).
 
-``fixtures/<case>.safetensors`` holds ``state/``, ``in/``, ``out/`` (float32) and ``out64/`` (float64, with
-the same tables kept in float32 as here); ``encoder_cases.json`` holds options and float32 bounds.
+``fixtures/<case>.safetensors`` contains ``state/``, ``in/``, ``out/`` (float32) and ``out64/`` (float64, with
+the tables that are float32 here in float32, too); ``encoder_cases.json`` has options and float32 bounds.
 """
 
 import gzip
@@ -58,6 +58,7 @@ def _names(prefix: str) -> list[str]:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", _names("vit_"))
 def test_vit(name, dtype):
+    """The DINOv2 ViT reproduces the published architecture's numbers."""
     groups = _load(name)
     vit = VisionTransformer(3, patch_size=14, **CASES[name]["options"])
     vit.load_state_dict(groups["state"])
@@ -72,6 +73,7 @@ def test_vit(name, dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", _names("agg_"))
 def test_encoder(name, dtype):
+    """The aggregator reproduces the published numbers, and the encoder reads the right tokens out of it."""
     groups = _load(name)
     encoder = VGGTEncoder(**CASES[name]["options"])
     encoder.aggregator.load_state_dict(groups["state"])
@@ -93,6 +95,7 @@ def test_encoder(name, dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", _names("rope_"))
 def test_rotary_positions(name, dtype):
+    """Rotary position embedding reproduces the published numbers."""
     groups = _load(name)
     inputs = _inputs(groups, dtype)
     assert (inputs["positions"] == inputs["positions"][:1]).all()
@@ -103,6 +106,7 @@ def test_rotary_positions(name, dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", ["dpt_depth_tall", "dpt_features_nonsquare", "dpt_small_variance"])
 def test_dpt(name, dtype):
+    """The DPT head reproduces the published numbers."""
     case, groups = CASES[name], _load(name)
     head = DPTHead(**case["options"])
     head.load_state_dict(groups["state"])
@@ -124,6 +128,7 @@ def test_dpt(name, dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_dpt_positions(dtype):
+    """The DPT head's position embedding reproduces the published numbers."""
     name = "dpt_posembed"
     groups = _load(name)
     like = _inputs(groups, dtype)["like"]
@@ -137,6 +142,7 @@ def test_dpt_positions(dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_activations(dtype):
+    """All activations of the dense heads reproduce the published numbers."""
     name = "dpt_head_activations"
     groups = _load(name)
     raw = _inputs(groups, dtype)["raw"]
@@ -146,6 +152,7 @@ def test_activations(dtype):
 
 
 def test_published_names_and_shapes():
+    """Published weights fit: names and shapes of all parameters are unchanged."""
     with gzip.open(FIXTURES / "encoder_keys.json.gz") as file:
         published = json.load(file)
     with torch.device("meta"):

@@ -1,4 +1,4 @@
-"""The fast paths of a CPU against PyTorch's own, and what they may not touch."""
+"""The fast paths on a CPU against plain PyTorch, half precision, and what must not change."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def convolutions(monkeypatch):
-    """Products of any size as convolutions, whatever the machine."""
+    """Compute products of any size as convolutions, on any machine."""
     monkeypatch.setattr(ghgs_lit.kernels.linear, "_LARGE", 0)
     monkeypatch.setattr(ghgs_lit.kernels.linear, "_PIXELS", 0)
     monkeypatch.setattr(ghgs_lit.kernels.linear, "prefers_convolution", lambda _: True)
@@ -31,7 +31,7 @@ def convolutions(monkeypatch):
 
 @pytest.fixture
 def kernels(monkeypatch):
-    """Attention of any size by the project's kernel: without 512-bit vectors it is slow, and the same."""
+    """Use the attention kernel for any size (without 512-bit vectors it is slow but gives the same)."""
     features = processor_features() | {"avx512f"}
     monkeypatch.setattr("ghgs_lit.encoder.cpu.attention._LARGE", 0)
     monkeypatch.setattr("ghgs_lit.encoder.cpu.attention._has", features.__contains__)
@@ -44,6 +44,7 @@ def kernels(monkeypatch):
 @pytest.mark.parametrize("shape", [(7, 12), (2, 5, 12), (2, 3, 4, 12), (1, 12)])
 @pytest.mark.parametrize("bias", [False, True])
 def test_product_is_the_linear_layer(convolutions, monkeypatch, shape, bias):
+    """A product computed as a convolution equals the linear layer, values and gradients."""
     g = torch.Generator().manual_seed(0)
     x, weight, b = (torch.randn(s, generator=g, requires_grad=True) for s in (shape, (9, 12), (9,)))
     calls, convolve = [], F.conv2d
@@ -60,6 +61,7 @@ def test_product_is_the_linear_layer(convolutions, monkeypatch, shape, bias):
 
 @pytest.mark.parametrize(("rows", "calls"), [(11, 5), (12, 1), (40, 1)])
 def test_weights_of_products_of_few_rows_are_copied_in_parts(convolutions, monkeypatch, rows, calls):
+    """Large weights with few rows are divided, so that oneDNN's copy does not fill the memory."""
     monkeypatch.setattr(ghgs_lit.kernels.linear, "_COPY", 24)
     g = torch.Generator().manual_seed(0)
     x, weight, b = (torch.randn(s, generator=g) for s in ((rows, 12), (9, 12), (9,)))
@@ -70,6 +72,7 @@ def test_weights_of_products_of_few_rows_are_copied_in_parts(convolutions, monke
 
 
 def test_product_of_other_kinds_is_left_alone(convolutions):
+    """Float64 and autocast do not use the float32 fast path."""
     x, weight = torch.randn(5, 8), torch.randn(6, 8)
     assert torch.equal(linear(x.double(), weight.double()), x.double() @ weight.double().T)
     with torch.autocast("cpu", torch.bfloat16):
@@ -77,6 +80,7 @@ def test_product_of_other_kinds_is_left_alone(convolutions):
 
 
 def test_even_parts_cover_all_rows():
+    """Parts cover every row once, keep the size limit and differ by at most one row."""
     for count in (0, 1, 5, 16, 17):
         for most in (0, 1, 4, 100):
             parts = even_parts(count, most)
@@ -91,6 +95,7 @@ def test_even_parts_cover_all_rows():
 def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
     convolutions, kernels, monkeypatch, qk_norm
 ):
+    """The in-place path without a gradient gives the same result and does not overwrite its input."""
     monkeypatch.setattr("ghgs_lit.encoder.block._HIDDEN", 200)
     torch.manual_seed(0)
     block = Block(64, 2, qk_norm, 1e-5, 0.5)
@@ -107,6 +112,7 @@ def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
 
 
 def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels):
+    """All fast paths together do not change the encoder's tokens."""
     torch.manual_seed(0)
     vit = {"kind": "dinov2", "depth": 2, "heads": 2}
     encoder = VGGTEncoder(
@@ -123,6 +129,7 @@ def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels)
 
 @pytest.mark.parametrize(("trainable", "recorded"), [("none", 0), ("last_1", 2), ("all", 4)])
 def test_frozen_blocks_record_no_gradient(monkeypatch, trainable, recorded):
+    """Frozen blocks keep no activations, which would cost memory in training."""
     seen = []
     forward = Block.forward
 
@@ -140,6 +147,7 @@ def test_frozen_blocks_record_no_gradient(monkeypatch, trainable, recorded):
 
 @pytest.mark.parametrize("model", ["paper", "hull"])
 def test_predictions_in_bfloat16_stay_near_and_geometry_is_float32(model):
+    """Half precision changes predictions little and never rounds geometry."""
     module = make_model(f"model={model}").eval()
     batch = make_batch(height=140, width=112, views=3)
     with torch.no_grad():
@@ -155,12 +163,13 @@ def test_predictions_in_bfloat16_stay_near_and_geometry_is_float32(model):
         assert tensor.dtype == torch.float32
         assert tensor.isfinite().all()
     valid = exact.depth_valid
-    # Depths are not steps of bfloat16: at 2 m those would be 16 mm apart.
+    # Depths are not rounded to bfloat16, whose steps at 2 m are 16 mm.
     assert len(low.depth[valid].unique()) > valid.sum() // 2
     assert (low.depth - exact.depth)[valid].abs().median() < 0.02
 
 
 def test_training_under_autocast_gives_float32_gradients():
+    """Mixed-precision training gives finite float32 gradients."""
     module = make_model("model=paper")
     batch = make_batch(height=56, width=56, views=2)
     with torch.autocast("cpu", torch.bfloat16):
@@ -172,6 +181,7 @@ def test_training_under_autocast_gives_float32_gradients():
 
 
 def test_precision_is_what_the_model_is_told(monkeypatch):
+    """The model's precision setting overrides the caller's autocast."""
     monkeypatch.setattr("ghgs_lit.kernels.precision.has_bfloat16", lambda _: True)
     module = make_model("model=paper").eval()
     batch = make_batch(height=56, width=56, views=2)
@@ -188,6 +198,7 @@ def test_precision_is_what_the_model_is_told(monkeypatch):
 
 
 def test_precision_that_a_device_lacks_is_refused(monkeypatch):
+    """A precision that a device lacks is an error, not a slow emulation."""
     monkeypatch.setattr(
         "torch.cpu.get_capabilities", lambda: {"avx512_bf16": False, "architecture": "x86_64"}
     )
@@ -205,6 +216,7 @@ def test_precision_that_a_device_lacks_is_refused(monkeypatch):
 
 
 def test_checkpointing_keeps_fewer_bytes_and_the_same_gradients():
+    """Recomputing activations saves memory and leaves the gradients bit for bit the same."""
     found = {}
     for checkpointing in (False, True):
         torch.manual_seed(0)
@@ -230,6 +242,7 @@ def test_checkpointing_keeps_fewer_bytes_and_the_same_gradients():
 
 
 def test_tokens_in_half_precision_weights_pass_the_fast_path(convolutions, kernels):
+    """An encoder with bfloat16 weights uses the kernels and stays close to float32."""
     torch.manual_seed(0)
     encoder = VGGTEncoder(width=64, heads=2, depth=2, layers=(0, 1), vit={"kind": "conv"}, layer_scale=0.5)
     images, masks = torch.rand(1, 2, 3, 56, 56), torch.ones(1, 2, 56, 56, dtype=torch.bool)

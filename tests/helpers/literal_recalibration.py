@@ -1,13 +1,20 @@
-"""The recalibration as the paper writes it down, one layer a call: neighbours, gathers, cosines anew."""
+"""The recalibration as the paper writes it, one layer per call, without shared neighbours or cosines."""
 
 import torch
 import torch.nn.functional as F
 
 
 def literal_recalibration(block, x, points, semantic, k):
-    """Tokens ``x`` [n, C] of one element, recalibrated; neighbours are those in space, all views alike.
+    """Recalibrated tokens of one batch element.
 
     Keys, values and features of the neighbours are gathered, [n, k, ...] each.
+
+    Args:
+        block: the ``SemanticAttention`` whose parameters are used.
+        x: tokens [n, C].
+        points: positions in space [n, 3]; neighbours may be in any view.
+        semantic: semantic features [n, s].
+        k: number of neighbours.
     """
     near = torch.cat(
         [torch.cdist(part, points).topk(k, largest=False).indices for part in points.split(1024)]

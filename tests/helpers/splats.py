@@ -1,4 +1,4 @@
-"""Scenes and comparisons that the tests of the renderer share."""
+"""Scenes and comparisons for the tests and benchmarks of the renderer."""
 
 import dataclasses
 import math
@@ -12,22 +12,26 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
 
-def cameras(
+def camera_ring(
     views: int, height: int, width: int, batch: int = 1, distance: float = 3.0, focal: float = 1.3
 ) -> Cameras:
-    """Cameras around the y axis that look at the origin; unequal focal lengths, off-centre axis."""
-    intrinsics = torch.tensor(
-        [
-            [focal * width, 0.0, 0.5 * width + 0.3],
-            [0.0, 1.1 * focal * width, 0.5 * height - 0.2],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    """Cameras [batch, views] on a circle around the y axis that look at the origin.
+
+    Focal lengths of x and y differ and the principal point is off-centre, so that mixed-up axes are seen.
+
+    Args:
+        views, height, width, batch: number and image size of the cameras.
+        distance: from the origin, in metres.
+        focal: focal length along x as a part of the image's width.
+    """
+    intrinsics = torch.eye(3)
+    intrinsics[0, 0], intrinsics[1, 1] = focal * width, 1.1 * focal * width
+    intrinsics[0, 2], intrinsics[1, 2] = 0.5 * width + 0.3, 0.5 * height - 0.2
     extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
     for view in range(views):
         angle = 2 * math.pi * view / views + 0.2 if views > 1 else 0.0
-        extrinsics[:, view, 0, 0] = extrinsics[:, view, 2, 2] = math.cos(angle)
-        extrinsics[:, view, 0, 2], extrinsics[:, view, 2, 0] = math.sin(angle), -math.sin(angle)
+        cosine, sine = math.cos(angle), math.sin(angle)
+        extrinsics[:, view, :3, :3] = torch.tensor([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
         extrinsics[:, view, 2, 3] = distance
     return Cameras(intrinsics.expand(batch, views, 3, 3), extrinsics, height, width)
 
@@ -35,7 +39,7 @@ def cameras(
 def cloud(
     count: int, seed: int = 0, size: float = 0.05, channels: int = 3, splits: tuple | None = None
 ) -> Gaussians:
-    """Random Gaussians around the origin, of all shapes, turned every way."""
+    """Random Gaussians around the origin, of all shapes and directions."""
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=0.5 * torch.randn(count, 3, generator=generator),
@@ -48,7 +52,7 @@ def cloud(
 
 
 def body(count: int, size: int, seed: int = 0) -> Gaussians:
-    """Splats of about a pixel on a closed surface that covers a fifth of a ``size`` x ``size`` frame."""
+    """Gaussians of about a pixel on an ellipsoid that covers a fifth of a ``size`` x ``size`` image."""
     generator = torch.Generator().manual_seed(seed)
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     pixel = 3.0 / (1.3 * size)
@@ -63,8 +67,8 @@ def body(count: int, size: int, seed: int = 0) -> Gaussians:
     )
 
 
-def one(**changes) -> Gaussians:
-    """One round Gaussian at the origin, changed as asked; a value with a leading dimension makes several."""
+def few(**fields) -> Gaussians:
+    """One round Gaussian at the origin; ``fields`` replaces values, and more rows make more Gaussians."""
     values = {
         "means": torch.zeros(1, 3),
         "quaternions": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
@@ -72,20 +76,23 @@ def one(**changes) -> Gaussians:
         "opacities": torch.full((1,), 0.8),
         "colors": torch.tensor([[0.9, 0.5, 0.2]]),
     }
-    values.update({name: torch.as_tensor(value, dtype=torch.float32) for name, value in changes.items()})
+    values.update({name: torch.as_tensor(value, dtype=torch.float32) for name, value in fields.items()})
     count = max(len(value) for value in values.values())
     values = {name: value.expand(count, *value.shape[1:]).clone() for name, value in values.items()}
     return Gaussians(**values, splits=(count,))
 
 
-def leaves(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
-    """The same Gaussians as leaves that require gradients."""
+def with_gradients(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> Gaussians:
+    """The same Gaussians as leaf tensors that require gradients."""
     fields = {name: getattr(gaussians, name).detach().to(dtype).requires_grad_() for name in FIELDS}
     return dataclasses.replace(gaussians, **fields)
 
 
 def ambiguous(gaussians: Gaussians, views: Cameras, settings: RasterSettings, **options) -> Tensor:
-    """Pixels [B, T, 1, h, w] of which float32 may decide a threshold otherwise than float64 does."""
+    """Pixels [B, T, 1, h, w] where float32 and float64 may decide a threshold differently.
+
+    They change when the thresholds move by a little more than float32 rounds.
+    """
     images = []
     for sign in (-1, 1):
         moved = dataclasses.replace(
@@ -102,7 +109,7 @@ def ambiguous(gaussians: Gaussians, views: Cameras, settings: RasterSettings, **
     return difference != 0
 
 
-def error(value: Tensor, truth: Tensor) -> float:
+def relative_error(value: Tensor, truth: Tensor) -> float:
     """Relative L2 error; absolute where the truth is zero."""
     value, truth = value.detach().double(), truth.detach().double()
     return float((value - truth).norm() / (truth.norm() if truth.norm() > 0 else 1.0))
@@ -111,15 +118,15 @@ def error(value: Tensor, truth: Tensor) -> float:
 def differentiate(
     gaussians: Gaussians, views: Cameras, backend: str, dtype, weights: list[Tensor], **options
 ):
-    """A rendering and the gradients of its product with ``weights`` (image, alpha, depth)."""
-    gaussians = leaves(gaussians, dtype)
+    """A rendering, and the gradients of the sum of (image, alpha, depth) times ``weights``."""
+    gaussians = with_gradients(gaussians, dtype)
     rendering = render(gaussians, views, backend, **options)
     outputs = (rendering.image, rendering.alpha, rendering.depth)
     torch.autograd.backward([(o.double() * w).sum() for o, w in zip(outputs, weights, strict=True)])
     return rendering, {name: getattr(gaussians, name).grad for name in FIELDS}
 
 
-def compare(
+def assert_cpu_matches_reference(
     gaussians: Gaussians,
     views: Cameras,
     settings: RasterSettings | None = None,
@@ -128,7 +135,16 @@ def compare(
     ambiguous_budget: float = 0.01,
     **options,
 ) -> Rendering:
-    """Assert that the CPU backend in float32 is the reference in float64, forward and backward."""
+    """Assert that the CPU backend in float32 equals the reference in float64, forward and backward.
+
+    Args:
+        gaussians, views, settings, options: what to render.
+        image_budget, gradient_budget: largest relative L2 errors.
+        ambiguous_budget: largest part of the pixels that may be left out because they are ambiguous.
+
+    Returns:
+        The CPU backend's rendering.
+    """
     settings = settings or RasterSettings()
     unsure = ambiguous(gaussians, views, settings, **options)
     assert unsure.double().mean() <= ambiguous_budget
@@ -148,8 +164,8 @@ def compare(
     for name in ("image", "alpha", "depth"):
         value, wanted = getattr(found, name), getattr(truth, name)
         assert torch.isfinite(value).all(), name
-        assert error(value * ~unsure, wanted * ~unsure) < image_budget, name
+        assert relative_error(value * ~unsure, wanted * ~unsure) < image_budget, name
     for name in FIELDS:
         assert torch.isfinite(gradients[name]).all(), name
-        assert error(gradients[name], true_gradients[name]) < gradient_budget, name
+        assert relative_error(gradients[name], true_gradients[name]) < gradient_budget, name
     return found

@@ -28,7 +28,7 @@ def _cameras(*shape: int, height: int, width: int) -> Cameras:
 
 
 def _example(seed: int = 0, body: bool = True, depths: bool = True):
-    """A batch of two people in two views with one target, a prediction and its rendering."""
+    """A prediction, its rendering and a batch: two people in two views with one target."""
     g = torch.Generator().manual_seed(seed)
     b, v, h, w = 2, 2, 16, 18
     cameras = _cameras(b, v, height=h, width=w)
@@ -72,6 +72,7 @@ def _reference_chamfer(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def test_nearest_neighbours_are_exact():
+    """The search for nearest neighbours gives SciPy's result."""
     g = torch.Generator().manual_seed(0)
     a, b = torch.rand(300, 3, generator=g), torch.rand(200, 3, generator=g)
     expected = torch.from_numpy(cdist(a.double(), b.double()).argmin(1))
@@ -79,6 +80,7 @@ def test_nearest_neighbours_are_exact():
 
 
 def test_chamfer_is_scipys():
+    """The Chamfer distance equals one computed with SciPy, in float32 for half-precision input."""
     g = torch.Generator().manual_seed(1)
     a, b = torch.rand(120, 3, generator=g), torch.rand(90, 3, generator=g)
     assert chamfer(a, b).item() == pytest.approx(_reference_chamfer(a, b), rel=1e-6)
@@ -87,6 +89,7 @@ def test_chamfer_is_scipys():
 
 @pytest.mark.parametrize("kind", ["squared", "huber", "truncated"])
 def test_chamfer_gradient_is_that_of_finite_differences(kind):
+    """The gradient of each penalty is that of its value."""
     g = torch.Generator().manual_seed(2)
     a = torch.rand(12, 3, generator=g, dtype=torch.float64, requires_grad=True)
     b = torch.rand(9, 3, generator=g, dtype=torch.float64, requires_grad=True)
@@ -94,6 +97,7 @@ def test_chamfer_gradient_is_that_of_finite_differences(kind):
 
 
 def test_one_outlier_owns_the_squared_gradient_only():
+    """Robust penalties keep one outlier from dominating the gradient."""
     g = torch.Generator().manual_seed(3)
     body = torch.rand(500, 3, generator=g)
     points = body + 0.01 * torch.randn(500, 3, generator=g)
@@ -111,12 +115,14 @@ def test_one_outlier_owns_the_squared_gradient_only():
 
 
 def test_penalties_agree_within_the_scale_and_meet_at_it():
+    """Robust penalties equal the squared one below their scale and are continuous there."""
     offsets = torch.tensor([[0.05, 0, 0], [0.1, 0, 0], [0.3, 0, 0]])
     assert torch.allclose(penalty(offsets, "huber", 0.1), torch.tensor([0.0025, 0.01, 0.05]))
     assert torch.allclose(penalty(offsets, "truncated", 0.1), torch.tensor([0.0025, 0.01, 0.01]))
 
 
 def test_chamfer_of_empty_and_of_broken_sets():
+    """Empty sets give 0, coincident points a zero gradient, and infinite points nan."""
     points = torch.zeros(0, 3, requires_grad=True)
     value = chamfer(points, torch.rand(5, 3))
     value.backward()
@@ -129,6 +135,7 @@ def test_chamfer_of_empty_and_of_broken_sets():
 
 
 def test_the_total_is_the_weighted_sum_of_reference_terms():
+    """Every term and the total equal independent computations."""
     kornia = pytest.importorskip("kornia")
     prediction, rendering, batch = _example()
     weights = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.5, "depth": 0.5}
@@ -150,6 +157,7 @@ def test_the_total_is_the_weighted_sum_of_reference_terms():
 
 
 def test_terms_of_weight_zero_are_not_computed():
+    """A term with weight 0 needs no data."""
     prediction, rendering, batch = _example(body=False, depths=False)
     total, values = Losses({"render_l1": 1.0, "chamfer": 0.0, "depth": 0.0})(prediction, rendering, batch)
     assert list(values) == ["render_l1"]
@@ -158,12 +166,14 @@ def test_terms_of_weight_zero_are_not_computed():
 
 @pytest.mark.parametrize("term", ["chamfer", "depth"])
 def test_a_term_that_the_data_cannot_feed_is_an_error(term):
+    """A term whose data is missing is an error that names its key."""
     prediction, rendering, batch = _example(body=False, depths=False)
     with pytest.raises(InputError, match=rf"loss\.weights\.{term}"):
         Losses({term: 1.0})(prediction, rendering, batch)
 
 
 def test_losses_without_any_subject_pixel_are_zero():
+    """A batch without subject pixels gives 0, not nan."""
     prediction, rendering, batch = _example()
     batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks))
     _, values = Losses({"chamfer": 1.0, "depth": 1.0})(prediction, rendering, batch)
@@ -172,6 +182,7 @@ def test_losses_without_any_subject_pixel_are_zero():
 
 
 def test_subsampled_chamfer_is_unbiased():
+    """Matching random subsets changes the loss by noise only."""
     prediction, rendering, batch = _example()
     _, full = Losses({"chamfer": 1.0})(prediction, rendering, batch)
     torch.manual_seed(0)
@@ -193,5 +204,6 @@ def test_subsampled_chamfer_is_unbiased():
     ],
 )
 def test_impossible_values_name_their_key(arguments, key):
+    """Impossible options are refused with their key."""
     with pytest.raises(InputError, match=key):
         Losses(**arguments)

@@ -29,6 +29,7 @@ def _images(n=3, h=30, w=41, seed=0):
 
 
 def test_authors_evaluation_numbers():
+    """The release protocol reproduces the numbers of the authors' evaluation."""
     data = load_file(FIXTURES / "losses.safetensors")
     first, second = data["in/img1"], data["in/img2"]
     assert torch.allclose(psnr(first, second)[:, None], data["out/psnr"], atol=1e-5)
@@ -36,16 +37,17 @@ def test_authors_evaluation_numbers():
     assert torch.allclose(
         ssim(first.double(), second.double(), "zeros"), data["out64/ssim_per_image"], atol=2e-7
     )
-    # As the release protocol reports them, over whole images.
+    # The release protocol, which measures whole images.
     release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")
     values = release(first, second, torch.zeros(2, 40, 48, dtype=torch.bool))
     assert torch.allclose(values["psnr"][:, None], data["out/psnr"], atol=1e-5)
     assert torch.allclose(values["ssim"], data["out/ssim_per_image"], atol=2e-6)
-    # Without padding it is another number: the fixture tells them apart.
+    # Without padding the result differs, so the fixture distinguishes the paddings.
     assert (ssim(first, second, "valid") - data["out/ssim_per_image"]).abs().min() > 1e-3
 
 
 def test_psnr_and_ssim_are_torchmetrics():
+    """PSNR and SSIM equal torchmetrics."""
     image, target = _images()
     for i in range(len(image)):
         a, b = image[i : i + 1], target[i : i + 1]
@@ -57,6 +59,7 @@ def test_psnr_and_ssim_are_torchmetrics():
 
 
 def test_psnr_and_ssim_are_scikit_images():
+    """PSNR and SSIM equal scikit-image, as a mean and as a map."""
     metrics = pytest.importorskip("skimage.metrics")
     image, target = _images()
     options = {
@@ -67,7 +70,7 @@ def test_psnr_and_ssim_are_scikit_images():
         a, b = image[i].double(), target[i].double()
         mean, full = metrics.structural_similarity(a.numpy(), b.numpy(), **options)
         assert ssim(a[None], b[None], "valid").item() == pytest.approx(mean, abs=1e-6)
-        # ... and its map, whose border scikit-image mirrors with the edge pixel doubled.
+        # The map inside the border, which scikit-image pads in another way.
         own = ssim_map(a[None], b[None], "reflect")[0]
         assert np.abs(own.numpy() - full)[:, 5:-5, 5:-5].max() < 1e-6
         expected = metrics.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1.0)
@@ -75,6 +78,7 @@ def test_psnr_and_ssim_are_scikit_images():
 
 
 def test_ssim_maps_are_kornias():
+    """SSIM maps equal kornia's."""
     image, target = _images(2)
     for padding, name in (("reflect", "same"), ("valid", "valid")):
         expected = kornia.metrics.ssim(image, target, 11, padding=name)
@@ -82,18 +86,21 @@ def test_ssim_maps_are_kornias():
 
 
 def test_ssim_without_padding_is_the_interior():
+    """Padding changes SSIM at the border only."""
     image, target = _images(1)
     inside = ssim_map(image, target, "reflect")[..., 5:-5, 5:-5].mean()
     assert ssim(image, target, "valid").item() == pytest.approx(inside.item(), abs=1e-6)
 
 
 def test_ssim_gradient_is_that_of_finite_differences():
+    """SSIM can be a loss: its gradient is that of its value."""
     image, target = (i[:, :1].double() for i in _images(1, 12, 13))
     image.requires_grad_()
     assert torch.autograd.gradcheck(lambda x: ssim(x, target, "valid"), (image,), fast_mode=True)
 
 
 def test_ssim_is_wide_under_autocast():
+    """SSIM's moments stay float32 under autocast."""
     image, target = _images()
     with torch.autocast("cpu", torch.bfloat16):
         low = ssim(image, target)
@@ -101,6 +108,7 @@ def test_ssim_is_wide_under_autocast():
 
 
 def test_psnr_of_known_errors_by_region():
+    """PSNR counts exactly the pixels of its region."""
     target = torch.zeros(1, 3, 10, 12)
     mask = torch.zeros(1, 10, 12, dtype=torch.bool)
     mask[0, 2, 3] = mask[0, 5, 8] = True
@@ -115,6 +123,7 @@ def test_psnr_of_known_errors_by_region():
 
 
 def test_equal_images_and_empty_regions_are_defined():
+    """Equal images give the cap, and empty regions are left out of means."""
     image, _ = _images()
     nobody = torch.zeros(3, 30, 41, dtype=torch.bool)
     assert torch.equal(psnr(image, image), torch.full((3,), PSNR_CAP))
@@ -130,6 +139,7 @@ def test_equal_images_and_empty_regions_are_defined():
 
 
 def test_ssim_of_a_region_is_the_mean_of_its_windows():
+    """A region's SSIM uses the windows centred in it; too small images are an error."""
     image, target = _images(1)
     region = torch.zeros(1, 30, 41, dtype=torch.bool)
     region[0, 12, 20] = True
@@ -140,7 +150,7 @@ def test_ssim_of_a_region_is_the_mean_of_its_windows():
 
 
 def test_flip_is_the_reference_implementation():
-    """``flip.npz``: maps made with the authors' flip-evaluator 1.7 at its default viewing distance."""
+    """FLIP equals maps by the authors' flip-evaluator 1.7 at its default viewing distance (``flip.npz``)."""
     data = np.load(FIXTURES / "flip.npz")
     reference, test = (
         torch.from_numpy(data[k].astype(np.float32) / 255).permute(0, 3, 1, 2) for k in ("reference", "test")
@@ -149,6 +159,7 @@ def test_flip_is_the_reference_implementation():
 
 
 def test_flip_of_black_and_white_is_nearly_one():
+    """FLIP is symmetric and close to 1 for the largest difference."""
     black, white = torch.zeros(1, 3, 20, 20), torch.ones(1, 3, 20, 20)
     value = flip_map(white, black)
     assert value.max() <= 1
@@ -157,6 +168,7 @@ def test_flip_of_black_and_white_is_nearly_one():
 
 
 def test_metric_classes_average_the_pure_functions():
+    """Metric classes give the mean over images, not over batches, and store nothing in checkpoints."""
     image, target = _images(4)
     mask = torch.rand(4, 30, 41, generator=torch.Generator().manual_seed(5)) > 0.9
     for metric, values in (
@@ -170,6 +182,7 @@ def test_metric_classes_average_the_pure_functions():
 
 
 def test_a_protocol_reports_its_metrics_by_name():
+    """Each protocol reports its own names, and clamps only if it says so."""
     image, target = _images(2)
     mask = torch.zeros(2, 30, 41, dtype=torch.bool)
     mask[:, 8:20, 10:30] = True
@@ -184,6 +197,7 @@ def test_a_protocol_reports_its_metrics_by_name():
 
 
 def test_lpips_is_left_out_with_its_reason_or_refused():
+    """Without torchvision LPIPS is left out with a reason, or refused where it is required."""
     try:
         import torchvision  # noqa: F401
     except ImportError:
@@ -198,13 +212,13 @@ def test_lpips_is_left_out_with_its_reason_or_refused():
 
 
 class RecordingNetwork:
-    """Stands in for torchmetrics' LPIPS: notes its options and what it is fed."""
+    """Replaces torchmetrics' LPIPS: records its options and inputs."""
 
     def __init__(self, net_type, normalize):
-        self.options, self.fed = (net_type, normalize), []
+        self.options, self.inputs = (net_type, normalize), []
 
     def __call__(self, image, target):
-        self.fed.append((image, target))
+        self.inputs.append((image, target))
         return (image - target).abs().mean()
 
 
@@ -220,12 +234,13 @@ def recorded(monkeypatch):
 
 @pytest.mark.usefixtures("recorded")
 def test_lpips_sees_what_its_protocol_says():
+    """LPIPS gets images one at a time, in the range of its protocol."""
     image, target = _images(3)
     mask = torch.ones(3, 30, 41, dtype=torch.bool)
     overshooting = image * 1.5
     for protocol, signed, expected in (
         (ImageMetrics(), True, overshooting.clamp(0, 1)),
-        # The authors' evaluation: [0, 1] as it is, neither clamped nor mapped.
+        # The authors' evaluation: neither clamped nor mapped to [-1, 1].
         (
             ImageMetrics("release", ["image"], "zeros", False, "require", lpips_signed=False),
             False,
@@ -235,13 +250,14 @@ def test_lpips_sees_what_its_protocol_says():
         values = protocol(overshooting, target, mask)["lpips"]
         network = protocol.metrics["lpips"].network
         assert network.options == ("vgg", signed)
-        # One image at a time: torchmetrics would give the mean of a batch.
-        assert torch.equal(torch.cat([a for a, _ in network.fed]), expected)
+        # One image at a time, since torchmetrics gives the mean of a batch.
+        assert torch.equal(torch.cat([a for a, _ in network.inputs]), expected)
         assert torch.allclose(values, (expected - target).abs().mean((1, 2, 3)))
 
 
 @pytest.mark.usefixtures("recorded")
 def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
+    """A failed download of the weights leaves LPIPS out, with a message of one line."""
     import torchmetrics.image.lpip
 
     def offline(**_):
@@ -252,10 +268,11 @@ def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
     )
     protocol = ImageMetrics()
     assert "lpips" not in protocol.metrics
-    assert protocol.left_out["lpips"] == "LPIPS: the weights of 'vgg' could not be had: no route"
+    assert protocol.left_out["lpips"] == "LPIPS: the weights of 'vgg' could not be loaded: no route"
 
 
 def test_the_box_can_be_wider():
+    """The margin widens the box on each side and stops at the image's border."""
     mask = torch.zeros(2, 20, 30, dtype=torch.bool)
     mask[0, 8, 10] = mask[0, 11, 19] = True  # 4 high, 10 wide
     wider = box_of(mask, 0.5)
@@ -263,7 +280,7 @@ def test_the_box_can_be_wider():
     assert wider[0].nonzero().amax(0).tolist() == [13, 24]
     assert wider[0].sum() == 8 * 20
     assert not wider[1].any()
-    # It ends where the image does.
+    # The box ends at the image's border.
     assert box_of(mask, 9.0)[0].all()
     image, target = _images(2, 20, 30)
     values = ImageMetrics(lpips="off", box_margin=0.5)(image, target, mask)
@@ -274,6 +291,7 @@ def test_the_box_can_be_wider():
 
 
 def test_a_protocol_says_what_its_numbers_mean():
+    """Definitions stored beside the numbers name padding, cap, box and clamp."""
     said = ImageMetrics(lpips="off", box_margin=0.1).definitions
     assert said["ssim"].endswith("padding reflect")
     assert "at most 100 dB" in said["psnr"]
@@ -286,6 +304,7 @@ def test_a_protocol_says_what_its_numbers_mean():
 
 
 def test_depth_error_is_in_millimetres_on_known_subject_pixels():
+    """Depth errors count only subject pixels with a known depth, in millimetres."""
     depth = torch.full((1, 2, 3), 2.0)
     truth = torch.tensor([[[2.01, 2.03, 0.0], [2.0, 5.0, 2.0]]])
     region = torch.tensor([[[True, True, True], [False, False, True]]])

@@ -1,4 +1,4 @@
-"""The kernels of a CPU for attention over neighbours against float64, and in the module."""
+"""The CPU kernels for attention over neighbours: against float64, and inside the module."""
 
 import pytest
 import torch
@@ -9,21 +9,21 @@ from tests.recalibration.test_recalibration import make, scene
 
 
 def neighborhood(n=37, c=64, k=9, seed=0, scale=1.0):
-    """Queries, keys and values as parts of one tensor; neighbours of which some are none."""
+    """Queries, keys and values (parts of one tensor), neighbours (some invalid), factors and biases."""
     g = torch.Generator().manual_seed(seed)
     qkv = torch.randn(n, 3 * c, generator=g) * scale
     index = torch.stack([torch.randperm(n, generator=g)[:k] for _ in range(n)])
     valid = torch.rand(n, k, generator=g) < 0.7
     valid[:, 0] = True
-    factor, term = torch.randn(n, k, generator=g), torch.randn(n, k, generator=g)
-    return *qkv.chunk(3, dim=-1), index, valid, factor, term
+    factor, bias = torch.randn(n, k, generator=g), torch.randn(n, k, generator=g)
+    return *qkv.chunk(3, dim=-1), index, valid, factor, bias
 
 
-def gathered(q, k, v, heads, index, valid, factor, term):
-    """Eq. 3 with everything gathered."""
+def gathered(q, k, v, heads, index, valid, factor, bias):
+    """Eq. 3 with gathered keys and values."""
     q, k, v = (x.unflatten(1, (heads, -1)) for x in (q, k, v))
     logits = torch.einsum("nad,nkad->nak", q, k[index]) / q.shape[-1] ** 0.5
-    logits = logits * factor[:, None] + term[:, None]
+    logits = logits * factor[:, None] + bias[:, None]
     weights = logits.masked_fill(~valid[:, None], float("-inf")).softmax(-1)
     return torch.einsum("nak,nkad->nad", weights, v[index]).flatten(1)
 
@@ -35,6 +35,7 @@ def double(arguments):
 @pytest.mark.parametrize(("c", "heads"), [(16, 1), (64, 4), (64, 1), (96, 2), (512, 8)])
 @pytest.mark.parametrize("k", [1, 7, 16, 33])
 def test_attention_over_neighbors(c, heads, k):
+    """The kernel equals gathering in float64 for all widths and numbers of neighbours."""
     q, key, v, *rest = neighborhood(c=c, k=k)
     arguments = q, key, v, heads, *rest
     expected = gathered(*double(arguments))
@@ -42,6 +43,7 @@ def test_attention_over_neighbors(c, heads, k):
 
 
 def test_large_logits():
+    """Logits of thousands do not overflow, and the kernel is as accurate as PyTorch."""
     q, key, v, *rest = neighborhood(k=33, scale=100)
     arguments = q, key, v, 2, *rest
     expected, own = gathered(*double(arguments)), gathered(*arguments)
@@ -49,27 +51,30 @@ def test_large_logits():
 
 
 def test_who_is_no_neighbor_has_no_say():
-    q, key, v, index, valid, factor, term = neighborhood()
-    expected = cpu.attend(q, key, v, 2, index, valid, factor, term)
+    """Invalid neighbours have no influence, even where their values are NaN."""
+    q, key, v, index, valid, factor, bias = neighborhood()
+    expected = cpu.attend(q, key, v, 2, index, valid, factor, bias)
     index = torch.where(valid, index, torch.full_like(index, 36))
     met = (index == 36) & valid
     key, v = key.clone(), v.clone()
     key[36] = v[36] = float("nan")
-    found = cpu.attend(q, key, v, 2, index, valid, factor, term)
+    found = cpu.attend(q, key, v, 2, index, valid, factor, bias)
     assert torch.equal(found.isnan().any(1), met.any(1))
     assert torch.equal(found[~met.any(1)], expected[~met.any(1)])
 
 
 def test_no_neighbor_at_all_is_undefined_as_in_a_softmax_of_nothing():
-    q, key, v, index, valid, factor, term = neighborhood()
+    """A token without a valid neighbour gives NaN, and only that token."""
+    q, key, v, index, valid, factor, bias = neighborhood()
     valid[5] = False
-    found = cpu.attend(q, key, v, 2, index, valid, factor, term)
+    found = cpu.attend(q, key, v, 2, index, valid, factor, bias)
     assert found[5].isnan().all()
     assert found.isfinite().all(1).sum() == 36
 
 
 @pytest.mark.parametrize("scale", [1e-15, 1.0, 1e15])
 def test_cosines(scale):
+    """Cosines are accurate for features of any length, and 0 for a zero feature."""
     g = torch.Generator().manual_seed(0)
     features = torch.randn(50, 48, generator=g) * scale
     index = torch.randint(50, (50, 5), generator=g)
@@ -82,6 +87,7 @@ def test_cosines(scale):
 
 
 def test_the_same_bits_with_any_number_of_threads():
+    """Results do not depend on the number of threads."""
     before = torch.get_num_threads()
     q, key, v, *rest = neighborhood(n=700, k=16)
     found = []
@@ -98,6 +104,7 @@ def test_the_same_bits_with_any_number_of_threads():
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 @pytest.mark.parametrize("neighbors", MODES)
 def test_the_module_without_a_gradient_is_the_same(monkeypatch, similarity, neighbors):
+    """Inference by the kernels equals the module with a gradient, for every option."""
     tokens, points, batch = scene(dim=128)
     tokens = type(tokens)(tokens.latent, torch.randn(96, 32), *list(vars(tokens).values())[2:])
     module = make(dim=128, similarity=similarity, neighbors=neighbors)
@@ -115,8 +122,9 @@ def test_the_module_without_a_gradient_is_the_same(monkeypatch, similarity, neig
 
 
 def test_what_the_kernels_are_asked_for():
+    """The kernels are used only where they are supported and faster."""
     x = torch.randn(1024, 128)
-    assert not cpu.is_supported(x, 8, 64)  # a gradient may be wanted
+    assert not cpu.is_supported(x, 8, 64)  # a gradient may be needed
     with torch.no_grad():
         assert cpu.is_supported(x, 8, 64)
         assert not cpu.is_supported(x, 16, 64)  # eight numbers a head

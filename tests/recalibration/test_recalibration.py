@@ -1,3 +1,5 @@
+"""The recalibration stage: neighbours, attention against the equations and the release, options."""
+
 import dataclasses
 
 import numpy as np
@@ -23,7 +25,7 @@ FIXTURES = ["sc3d_n200", "sc3d_b2_n150", "sc3d_small_variance"]
 
 
 def literal_neighbors(points, view, i, k, mode):
-    """Indices of the neighbours of point ``i``, from the definition, in float64."""
+    """Indices of the neighbours of point ``i``, computed from the definition in float64."""
     distance = np.linalg.norm(points.double().numpy() - points[i].double().numpy(), axis=1)
     order = sorted(range(len(points)), key=lambda j: (np.float32(distance[j]), j))
     own, other = ([j for j in order if (view[j] == view[i]) == same] for same in (True, False))
@@ -63,7 +65,7 @@ def literal_attention(block, x, points, semantic, view, k, mode):
 
 
 def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torch.float32):
-    """Tokens of which some are valid: ``counts[b][v]`` in view v of element b."""
+    """Tokens, points and batch; ``counts[b][v]`` tokens are valid in view v of element b."""
     generator = torch.Generator().manual_seed(seed)
     b, v = len(counts), len(counts[0])
     n = b * v * grid[0] * grid[1]
@@ -93,6 +95,7 @@ def make(dim=32, k=4, num_heads=2, **options):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", FIXTURES)
 def test_attention_matches_the_release(name, dtype):
+    """Neighbours, cosines and output reproduce the authors' numbers."""
     options = CASES[name]["constructor"]
     block = SemanticAttention(options["dim"], options["num_heads"], "product_clamped").to(dtype)
     block.load_state_dict(fixture(name, "state", dtype))
@@ -115,6 +118,7 @@ def test_attention_matches_the_release(name, dtype):
 @pytest.mark.parametrize("neighbors", MODES)
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_recalibration_is_the_literal_equations(similarity, neighbors):
+    """Every option equals Eqs. 3 to 5 written as loops."""
     tokens, points, batch = scene()
     module = make(similarity=similarity, neighbors=neighbors).double()
     tokens = dataclasses.replace(tokens, latent=tuple(t.double() for t in tokens.latent))
@@ -137,6 +141,7 @@ def test_recalibration_is_the_literal_equations(similarity, neighbors):
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0])
 def test_neighbors_match_a_kd_tree(offset):
+    """Neighbours equal SciPy's k-d tree, also far from the origin."""
     points = (torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 + offset).float()
     found = nearest_neighbors(points, torch.zeros(500, dtype=torch.int64), 16)
     distance, index = cKDTree(points.double().numpy()).query(points.double().numpy(), 17)
@@ -147,6 +152,7 @@ def test_neighbors_match_a_kd_tree(offset):
 
 
 def test_ties_go_to_the_lower_index():
+    """Equal distances give the same neighbours on every machine."""
     points = torch.zeros(700, 3)
     points[300:] = 1
     found = nearest_neighbors(points, torch.zeros(700, dtype=torch.int64), 5).index
@@ -155,6 +161,7 @@ def test_ties_go_to_the_lower_index():
 
 
 def test_blocks_do_not_change_the_neighbors(monkeypatch):
+    """Searching in blocks to save memory gives the same neighbours."""
     points = torch.rand(90, 3)
     view = torch.arange(90) % 3
     for mode in MODES:
@@ -167,6 +174,7 @@ def test_blocks_do_not_change_the_neighbors(monkeypatch):
 
 
 def test_fewer_points_than_k_and_none():
+    """Fewer points than ``k``, and elements without points, do not fail or give NaN."""
     found = nearest_neighbors(torch.rand(3, 3), torch.zeros(3, dtype=torch.int64), 64)
     assert found.index.shape == (3, 3)
     assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).index.shape[0] == 0
@@ -178,6 +186,7 @@ def test_fewer_points_than_k_and_none():
 
 
 def test_points_of_all_sizes_have_neighbors():
+    """Huge, tiny and broken points give valid indices, and broken points are never near."""
     points = torch.rand(40, 3) * torch.logspace(-20, 25, 40)[:, None]
     points[7], points[8] = float("nan"), float("inf")
     found = nearest_neighbors(points, torch.zeros(40, dtype=torch.int64), 8)
@@ -187,6 +196,7 @@ def test_points_of_all_sizes_have_neighbors():
 
 
 def test_other_tokens_pass_unchanged_and_all_takes_them_in():
+    """Tokens outside the subject change only with ``tokens=all``."""
     tokens, points, batch = scene()
     found = make()(tokens, points, batch)
     changed = (found.latent[2] != tokens.latent[2]).any(1)
@@ -196,6 +206,7 @@ def test_other_tokens_pass_unchanged_and_all_takes_them_in():
 
 
 def test_neighbors_are_searched_once_an_element(monkeypatch):
+    """Neighbours are not searched again for each layer."""
     calls = []
     search = stage.nearest_neighbors
     monkeypatch.setattr(stage, "nearest_neighbors", lambda *args: calls.append(1) or search(*args))
@@ -205,6 +216,7 @@ def test_neighbors_are_searched_once_an_element(monkeypatch):
 
 
 def test_elements_of_a_batch_do_not_mix():
+    """A result does not depend on other elements of the batch."""
     tokens, points, batch = scene()
     together = make()(tokens, points, batch)
     moved = dataclasses.replace(points, tokens=points.tokens + 100 * (tokens.image[:, None] < 3))
@@ -217,6 +229,7 @@ def test_elements_of_a_batch_do_not_mix():
 
 
 def test_order_of_the_views_does_not_matter():
+    """Permuting the views only permutes the tokens."""
     tokens, points, batch = scene(((5, 6, 4),))
     order = torch.tensor([2, 0, 1])
     index = (order[:, None] * 16 + torch.arange(16)).flatten()
@@ -231,6 +244,7 @@ def test_order_of_the_views_does_not_matter():
 
 
 def test_neighborhoods():
+    """Only ``xyz`` reads the points; token centres on the image plane are the same in all views."""
     tokens, points, batch = scene(((16, 16, 16),))
     outputs = {name: make(neighborhood=name)(tokens, points, batch) for name in stage.NEIGHBORHOODS}
     far = dataclasses.replace(points, tokens=points.tokens.flip(0))
@@ -238,7 +252,7 @@ def test_neighborhoods():
         after = make(neighborhood=name)(tokens, far, batch)
         assert torch.equal(after.latent[0], before.latent[0]) == (name != "xyz")
     assert not torch.equal(outputs["image_plane"].latent[0], outputs["feature"].latent[0])
-    position = make(neighborhood="image_plane")._positions(tokens, points)
+    position = make(neighborhood="image_plane").positions(tokens, points)
     assert torch.equal(position[:16], position[16:32])
     assert position.min() == 0.125
     assert position.max() == 0.875
@@ -246,6 +260,7 @@ def test_neighborhoods():
 
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_gradients_are_finite_where_points_coincide(similarity):
+    """Coincident points and zero features give finite gradients, and none reach the points."""
     tokens, points, batch = scene()
     points = dataclasses.replace(points, tokens=torch.zeros_like(points.tokens).requires_grad_())
     tokens = dataclasses.replace(
@@ -261,9 +276,13 @@ def test_gradients_are_finite_where_points_coincide(similarity):
 
 
 def test_dissimilar_neighbors_lose_their_weight_in_log_only():
+    """``log`` lowers the weight of a dissimilar neighbour; clamping leaves it at 1/2."""
     cosine = torch.tensor([[1.0, -1.0]])
     weights = {
-        name: make(similarity=name).block._weigh(torch.zeros(2, 1, 2), cosine).softmax(-1)[0, 0, 1].item()
+        name: make(similarity=name)
+        .block.apply_similarity(torch.zeros(2, 1, 2), cosine)
+        .softmax(-1)[0, 0, 1]
+        .item()
         for name in ("product_clamped", "log")
     }
     assert weights["product_clamped"] == 0.5
@@ -271,6 +290,7 @@ def test_dissimilar_neighbors_lose_their_weight_in_log_only():
 
 
 def test_blocks_of_queries_change_nothing(monkeypatch):
+    """Computing a part of the tokens at a time gives the same result."""
     tokens, points, batch = scene()
     module = make(neighbors="mixed")
     expected = module(tokens, points, batch)
@@ -281,6 +301,7 @@ def test_blocks_of_queries_change_nothing(monkeypatch):
 
 
 def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
+    """Autocast changes neither the neighbours nor the dtype of the tokens."""
     tokens, points, batch = scene()
     expected = make()(tokens, points, batch)
     with torch.autocast("cpu", torch.bfloat16):
@@ -302,5 +323,6 @@ def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
     ],
 )
 def test_impossible_options_are_refused(options, key):
+    """Impossible options are refused with their key."""
     with pytest.raises(InputError, match=key):
         make(**options)

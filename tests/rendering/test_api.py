@@ -1,23 +1,24 @@
-"""Options, refusals and configs of the renderer."""
-
-from pathlib import Path
+"""Options, errors and configs of the renderer."""
 
 import pytest
 import torch
-import yaml
+from hydra import compose, initialize_config_dir
 
+from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import Renderer, render
-from tests.helpers.splats import cameras, cloud
+from tests.helpers.splats import camera_ring, cloud
 
-CONFIGS = sorted((Path(__file__).parents[2] / "conf" / "renderer").glob("*.yaml"))
+NAMES = sorted(path.stem for path in (conf_dir() / "renderer").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_every_config_builds_a_renderer(path):
-    options = yaml.safe_load(path.read_text())
+@pytest.mark.parametrize("name", NAMES)
+def test_every_config_builds_a_renderer(name):
+    """Each file of the config group builds a renderer with the backend of its name."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        options = dict(compose(f"renderer/{name}").renderer)
     assert options.pop("_target_") == "ghgs_lit.rendering.Renderer"
-    assert Renderer(**options).backend == path.stem
+    assert Renderer(**options).backend == name
 
 
 @pytest.mark.parametrize(
@@ -37,18 +38,21 @@ def test_every_config_builds_a_renderer(path):
     ],
 )
 def test_impossible_options_are_refused_by_name(options, key):
+    """Impossible options are refused with their key."""
     with pytest.raises(InputError, match=key):
         Renderer(**options)
 
 
 def test_auto_is_the_cpu_backend_for_cpu_tensors():
-    gaussians, views = cloud(20), cameras(2, 20, 30)
+    """``auto`` renders CPU tensors by the CPU backend."""
+    gaussians, views = cloud(20), camera_ring(2, 20, 30)
     assert torch.equal(Renderer()(gaussians, views).image, render(gaussians, views, "cpu").image)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 def test_backgrounds(backend):
-    gaussians, views = cloud(20), cameras(2, 20, 30)
+    """Every form of background is blended by one minus alpha; a wrong number of channels is refused."""
+    gaussians, views = cloud(20), camera_ring(2, 20, 30)
     black = render(gaussians, views, backend)
     behind = 1 - black.alpha
     color = torch.tensor([0.1, 0.5, 0.9])
@@ -63,14 +67,16 @@ def test_backgrounds(backend):
 
 
 def test_the_background_is_differentiable():
+    """A learned background gets its gradient."""
     background = torch.zeros(3, requires_grad=True)
-    rendering = render(cloud(20), cameras(1, 20, 30), "cpu", background=background)
+    rendering = render(cloud(20), camera_ring(1, 20, 30), "cpu", background=background)
     rendering.image.sum().backward()
     torch.testing.assert_close(background.grad, (1 - rendering.alpha).sum().expand(3))
 
 
 def test_inputs_that_do_not_fit():
-    gaussians, views = cloud(20), cameras(2, 20, 30)
+    """Inputs that do not fit together are refused with the field's name."""
+    gaussians, views = cloud(20), camera_ring(2, 20, 30)
     with pytest.raises(InputError, match="cameras"):
         render(gaussians, views[0], "cpu")
     with pytest.raises(InputError, match="cameras"):
@@ -85,5 +91,6 @@ def test_inputs_that_do_not_fit():
 
 @pytest.mark.parametrize("region", [(0, 0, 21, 30), (-1, 0, 5, 5), (0, 0, 5), (0.0, 0.0, 5.0, 5.0)])
 def test_regions_that_do_not_fit(region):
+    """A region outside the image or of a wrong form is refused."""
     with pytest.raises(InputError, match="region"):
-        render(cloud(5), cameras(2, 20, 30), "cpu", region=region)
+        render(cloud(5), camera_ring(2, 20, 30), "cpu", region=region)

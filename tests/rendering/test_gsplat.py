@@ -1,4 +1,4 @@
-"""gsplat: its own projection in PyTorch as an outside check, how it is called, and on a GPU its image."""
+"""gsplat: its projection in PyTorch as an independent check, how it is called, and its image on a GPU."""
 
 import inspect
 
@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import BackendUnavailable, RasterSettings, gsplat_backend, reference, render
 from ghgs_lit.types import Cameras, Gaussians
-from tests.helpers.splats import FIELDS, cameras, cloud, differentiate, error, leaves
+from tests.helpers.splats import FIELDS, camera_ring, cloud, differentiate, relative_error, with_gradients
 
 
 def _functions():
@@ -18,7 +18,8 @@ def _functions():
 
 
 def test_covariances_are_those_of_gsplat():
-    gaussians = leaves(cloud(100), torch.float64)
+    """Rotation and scale make the same covariance as in gsplat."""
+    gaussians = with_gradients(cloud(100), torch.float64)
     wanted, _ = _functions()._quat_scale_to_covar_preci(
         gaussians.quaternions, gaussians.scales, compute_preci=False
     )
@@ -29,11 +30,8 @@ def test_covariances_are_those_of_gsplat():
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("distance", [3.0, 0.8])
 def test_projection_is_that_of_gsplat(distance, antialiased):
-    """Centres, inverse covariances, depths and opacities of every splat in view, and their gradients.
-
-    Near cameras see Gaussians beyond the frame, where the Jacobian is held.
-    """
-    gaussians, views = leaves(cloud(200), torch.float64), cameras(3, 40, 50, distance=distance)
+    """Centres, inverse covariances, depths, opacities and their gradients equal gsplat's projection."""
+    gaussians, views = with_gradients(cloud(200), torch.float64), camera_ring(3, 40, 50, distance=distance)
     views = Cameras(views.intrinsics.double(), views.extrinsics.double(), 40, 50)
     settings = RasterSettings(antialiased=antialiased)
     covariances, _ = _functions()._quat_scale_to_covar_preci(
@@ -47,16 +45,16 @@ def test_projection_is_that_of_gsplat(distance, antialiased):
     compared = 0
     for view in range(3):
         splats = reference.project(gaussians, views[0, view], settings)
-        xx, xy, yy = splats["covariances"].unbind(-1)
+        xx, xy, yy = splats.covariances.unbind(-1)
         found = [
-            splats["centers"],
-            torch.stack((yy, -xy, xx), dim=-1) / splats["determinants"][:, None],
-            splats["depths"][:, None],
-            splats["opacities"][:, None],
+            splats.centers,
+            torch.stack((yy, -xy, xx), dim=-1) / splats.determinants[:, None],
+            splats.depths[:, None],
+            splats.opacities[:, None],
         ]
         opacities = gaussians.opacities * compensations[view] if antialiased else gaussians.opacities
         wanted = [centers[view], conics[view], depths[view][:, None], opacities[:, None]]
-        front = splats["depths"].detach() > 0.05
+        front = splats.depths.detach() > 0.05
         compared += int(front.sum())
         slopes = []
         for values in (found, wanted):
@@ -68,26 +66,28 @@ def test_projection_is_that_of_gsplat(distance, antialiased):
         for ours, theirs in zip(found, wanted, strict=True):
             torch.testing.assert_close(ours[front], theirs[front], rtol=1e-6, atol=1e-9)
         for ours, theirs in zip(*slopes, strict=True):
-            assert error(ours, theirs) < 1e-6
+            assert relative_error(ours, theirs) < 1e-6
     assert compared > 400
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="tells what happens without CUDA")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="tests the error without CUDA")
 def test_gsplat_without_cuda_says_what_is_missing():
+    """Without CUDA the error names the backend and the reason."""
     with pytest.raises(BackendUnavailable, match=r"renderer\.backend=gsplat.*CUDA"):
-        render(cloud(5), cameras(1, 8, 8), "gsplat")
+        render(cloud(5), camera_ring(1, 8, 8), "gsplat")
 
 
 def test_gsplat_refuses_constants_it_does_not_know():
+    """Constants that are compiled into gsplat cannot be changed silently."""
     with pytest.raises(ValueError, match="renderer"):
-        render(cloud(5), cameras(1, 8, 8), "gsplat", settings=RasterSettings(stop=0.5))
+        render(cloud(5), camera_ring(1, 8, 8), "gsplat", settings=RasterSettings(stop=0.5))
 
 
-def _stand_in(
+def _documented_rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane, eps2d,
     render_mode, packed, rasterize_mode,
 ):  # fmt: skip
-    """gsplat's ``rasterization`` as its documentation has it, drawn by the reference."""
+    """A replacement for gsplat's ``rasterization``, as documented, that draws by the reference."""
     assert (render_mode, packed) == ("RGB+ED", False)
     assert all(torch.isfinite(t).all() for t in (means, quats, scales, opacities))
     torch.testing.assert_close(quats.norm(dim=-1), torch.ones(len(quats)))
@@ -101,13 +101,14 @@ def _stand_in(
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
-    monkeypatch.setattr(gsplat_backend, "load", lambda: _stand_in)
-    gaussians, views = cloud(40, splits=(15, 0, 25)), cameras(2, 20, 30, batch=3)
+    """gsplat gets finite, normalised input, and its output is read as documented."""
+    monkeypatch.setattr(gsplat_backend, "load", lambda: _documented_rasterization)
+    gaussians, views = cloud(40, splits=(15, 0, 25)), camera_ring(2, 20, 30, batch=3)
     gaussians.quaternions[3] = 0
     gaussians.quaternions[4] *= 1e-25
     gaussians.means[5, 0] = float("nan")
     settings = RasterSettings(low_pass=0.2, antialiased=antialiased)
-    gaussians = leaves(gaussians)
+    gaussians = with_gradients(gaussians)
     found = gsplat_backend.rasterize(gaussians, views, settings, 0.5, 20.0)
     wanted = render(gaussians, views, "cpu", settings=settings, near=0.5, far=20.0)
     for name in ("image", "alpha", "depth"):
@@ -117,9 +118,10 @@ def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
 
 
 def test_every_argument_is_one_of_gsplat():
+    """The arguments and defaults that are relied on exist in the installed gsplat."""
     gsplat = pytest.importorskip("gsplat", reason="needs the package gsplat (it needs no GPU for this test)")
     parameters = inspect.signature(gsplat.rasterization).parameters
-    assert set(inspect.signature(_stand_in).parameters) <= set(parameters)
+    assert set(inspect.signature(_documented_rasterization).parameters) <= set(parameters)
     defaults = {"radius_clip": 0.0, "sh_degree": None, "backgrounds": None, "camera_model": "pinhole"}
     assert {name: parameters[name].default for name in defaults} == defaults
 
@@ -127,8 +129,9 @@ def test_every_argument_is_one_of_gsplat():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gsplat_draws_the_same_image_with_the_same_gradients(antialiased):
+    """On a GPU, gsplat gives the CPU backend's image and gradients."""
     pytest.importorskip("gsplat")
-    gaussians, views = cloud(500, splits=(200, 0, 300)), cameras(2, 45, 70, batch=3)
+    gaussians, views = cloud(500, splits=(200, 0, 300)), camera_ring(2, 45, 70, batch=3)
     options = {"settings": RasterSettings(antialiased=antialiased), "background": (0.1, 0.5, 0.9)}
     generator = torch.Generator().manual_seed(7)
     weights = [torch.randn(3, 2, c, 45, 70, generator=generator, dtype=torch.float64) for c in (3, 1, 1)]
@@ -142,6 +145,6 @@ def test_gsplat_draws_the_same_image_with_the_same_gradients(antialiased):
         **options,
     )
     for name in ("image", "alpha", "depth"):
-        assert error(getattr(found, name).cpu(), getattr(wanted, name)) < 1e-3
+        assert relative_error(getattr(found, name).cpu(), getattr(wanted, name)) < 1e-3
     for name in FIELDS:
-        assert error(others[name].cpu(), slopes[name]) < 1e-2
+        assert relative_error(others[name].cpu(), slopes[name]) < 1e-2

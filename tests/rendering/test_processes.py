@@ -1,4 +1,4 @@
-"""The CPU backend among threads, processes, processors and cached machine code."""
+"""The CPU backend with several threads and processes, other processors, and cached machine code."""
 
 import dataclasses
 import importlib.util
@@ -18,28 +18,20 @@ import torch
 from ghgs_lit.kernels import compile, pool
 from ghgs_lit.rendering import render
 from ghgs_lit.rendering.cpu import backend
-from tests.helpers.splats import FIELDS, body, cameras, leaves
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+from tests.helpers.splats import FIELDS, body, camera_ring, with_gradients
 
 
 @pytest.mark.parametrize("splits", [(3000,), (1501, 0, 1, 1498)])
 def test_the_same_bits_with_any_number_of_threads(monkeypatch, splits):
-    """Small parts, so that several threads have work; many Gaussians of equal depth lie in several parts."""
-    monkeypatch.setattr(pool, "GRAIN", 64)
+    """Results do not depend on how Gaussians and tiles are divided among threads."""
+    monkeypatch.setattr(pool, "GRAIN", 64)  # small parts, so that several threads have work
     scene = body(3000, 64)
-    scene.means[::3, 2] = 0.1
+    scene.means[::3, 2] = 0.1  # Gaussians of equal depth in several parts
     scene = dataclasses.replace(scene, splits=splits)
 
     def run():
-        gaussians = leaves(scene)
-        rendering = render(gaussians, cameras(2, 64, 64, batch=len(splits)), "cpu")
+        gaussians = with_gradients(scene)
+        rendering = render(gaussians, camera_ring(2, 64, 64, batch=len(splits)), "cpu")
         (rendering.image.square().sum() + rendering.depth.sum()).backward()
         return [rendering.image.detach(), *(getattr(gaussians, name).grad for name in FIELDS)]
 
@@ -50,14 +42,15 @@ def test_the_same_bits_with_any_number_of_threads(monkeypatch, splits):
 
 
 def test_two_threads_of_the_caller_at_once():
+    """Two threads that render at once do not disturb each other."""
     torch.set_num_threads(2)
-    gaussians, views = body(2000, 48), cameras(2, 48, 48)
+    gaussians, views = body(2000, 48), camera_ring(2, 48, 48)
     wanted = render(gaussians, views, "cpu").image
     found = []
 
     def work():
         for _ in range(5):
-            leaf = leaves(gaussians)
+            leaf = with_gradients(gaussians)
             rendering = render(leaf, views, "cpu")
             rendering.image.sum().backward()
             found.append(rendering.image.detach())
@@ -71,13 +64,14 @@ def test_two_threads_of_the_caller_at_once():
 
 def _render_in_child(queue):
     torch.set_num_threads(2)
-    queue.put(float(render(body(500, 32), cameras(2, 32, 32), "cpu").image.sum()))
+    queue.put(float(render(body(500, 32), camera_ring(2, 32, 32), "cpu").image.sum()))
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
 def test_after_a_fork():
+    """A forked process does not hang on the parent's threads."""
     torch.set_num_threads(2)
-    wanted = float(render(body(500, 32), cameras(2, 32, 32), "cpu").image.sum())
+    wanted = float(render(body(500, 32), camera_ring(2, 32, 32), "cpu").image.sum())
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     children = [context.Process(target=_render_in_child, args=(queue,)) for _ in range(2)]
@@ -92,8 +86,8 @@ class _Renderings(torch.utils.data.Dataset):
         return 8
 
     def __getitem__(self, index):
-        gaussians = leaves(body(500, 32, seed=index))
-        image = render(gaussians, cameras(1, 32, 32), "cpu").image
+        gaussians = with_gradients(body(500, 32, seed=index))
+        image = render(gaussians, camera_ring(1, 32, 32), "cpu").image
         image.square().sum().backward()
         return image.detach(), gaussians.means.grad
 
@@ -101,6 +95,7 @@ class _Renderings(torch.utils.data.Dataset):
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
 def test_training_in_four_workers_of_a_data_loader():
+    """Rendering with gradients works in worker processes."""
     torch.set_num_threads(2)
     wanted = [_Renderings()[index] for index in range(8)]
     loader = torch.utils.data.DataLoader(
@@ -112,7 +107,7 @@ def test_training_in_four_workers_of_a_data_loader():
 
 
 def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
-    """A kernel cached under one digest is compiled anew under another, and found again under its own."""
+    """Machine code of older sources is never loaded; that of the same sources is."""
     source = tmp_path / "scaled.py"
     source.write_text(
         "from ghgs_lit.kernels import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
@@ -135,22 +130,23 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
 
 @pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])
 def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
+    """A slow processor is reported once, and a fast one never."""
     monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
     backend._warn_of_narrow_vectors.cache_clear()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(2):
-            render(body(10, 8), cameras(1, 8, 8), "cpu")
+            render(body(10, 8), camera_ring(1, 8, 8), "cpu")
     assert sum("256 bits" in str(warning.message) for warning in caught) == warned
 
 
 _SUM = """
 import torch
-from tests.helpers.splats import body, cameras, leaves
+from tests.helpers.splats import body, camera_ring, with_gradients
 from ghgs_lit.rendering import render
 from ghgs_lit.rendering.cpu import backend
-gaussians = leaves(body(300, 24))
-image = render(gaussians, cameras(1, 24, 24), "cpu").image
+gaussians = with_gradients(body(300, 24))
+image = render(gaussians, camera_ring(1, 24, 24), "cpu").image
 image.square().sum().backward()
 print(float(image.detach().sum()), float(gaussians.scales.grad.norm()))
 """
@@ -158,7 +154,7 @@ print(float(image.detach().sum()), float(gaussians.scales.grad.norm()))
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="takes x86 vectors away")
 def test_the_same_image_without_wide_vectors():
-    """Compiled for a processor that has vectors of 128 bits only (the first run takes a while)."""
+    """A processor with 128-bit vectors only gives the same image (the first run compiles for a while)."""
 
     def run(**variables):
         path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])

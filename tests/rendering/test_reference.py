@@ -7,17 +7,15 @@ import torch
 
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.types import Gaussians
-from tests.helpers.splats import FIELDS, cameras, cloud, one
-
-LOOSE = RasterSettings(alpha_min=1e-12, stop=0.0, extent=30.0)
+from tests.helpers.splats import FIELDS, camera_ring, cloud, few
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gradients_of_the_reference_are_those_of_its_values(antialiased):
-    """Thresholds out of the way, so that the image is smooth; opaque enough that order matters."""
+    """The reference's gradients are those of its values, where no threshold makes steps."""
     settings = RasterSettings(alpha_min=1e-12, stop=0.0, extent=30.0, antialiased=antialiased)
     gaussians = cloud(4, size=0.3, splits=(3, 1))
-    views = cameras(1, 3, 4, batch=2).to(torch.float64)
+    views = camera_ring(1, 3, 4, batch=2).to(torch.float64)
 
     def outputs(*fields):
         rendering = render(
@@ -34,11 +32,11 @@ def test_gradients_of_the_reference_are_those_of_its_values(antialiased):
 
 
 def test_one_round_gaussian_in_closed_form():
-    """Seen straight on: isotropic covariance (f s / z)^2 + low-pass, up to the slant of its axis."""
-    views = cameras(1, 17, 17)
+    """A round Gaussian on the axis has the variance (f s / z)^2 + low-pass."""
+    views = camera_ring(1, 17, 17)
     views.intrinsics[..., 0, 0], views.intrinsics[..., 1, 1] = 40.0, 40.0
     views.intrinsics[..., :2, 2] = 8.5
-    rendering = render(one(scales=[[0.1] * 3]).to(torch.float64), views, "reference", background=0.25)
+    rendering = render(few(scales=[[0.1] * 3]).to(torch.float64), views, "reference", background=0.25)
     variance = (40 * 0.1 / 3) ** 2 + 0.3
     distance = torch.arange(17, dtype=torch.float64) - 8
     squared = distance[:, None] ** 2 + distance**2
@@ -54,33 +52,33 @@ def test_one_round_gaussian_in_closed_form():
 
 
 def test_splats_are_composited_front_to_back_with_every_threshold():
-    """Against a scalar loop written from the definition, on many opaque overlapping splats."""
+    """The reference equals a loop over splats and pixels, written from the definition."""
     from ghgs_lit.rendering import reference
 
     settings = RasterSettings()
-    gaussians, views = cloud(120, size=0.4).to(torch.float64), cameras(1, 9, 11).to(torch.float64)
+    gaussians, views = cloud(120, size=0.4).to(torch.float64), camera_ring(1, 9, 11).to(torch.float64)
     rendering = render(gaussians, views, "reference", settings=settings)
     index = reference.visible(gaussians, views[0, 0], settings, 0.01, 1e10)
     splats = reference.project(gaussians.select(index, (len(index),)), views[0, 0], settings)
-    depths = splats["depths"].tolist()
+    depths = splats.depths.tolist()
     assert depths == sorted(depths)
     assert len(depths) > 50
     stopped = 0
     for row, column in ((0, 0), (4, 5), (8, 10), (3, 7)):
         transmittance, color, depth = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
         for k in range(len(depths)):
-            xx, xy, yy = splats["covariances"][k]
+            xx, xy, yy = splats.covariances[k]
             covariance = torch.stack((torch.stack((xx, xy)), torch.stack((xy, yy))))
-            offset = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64) - splats["centers"][k]
+            offset = torch.tensor([column + 0.5, row + 0.5], dtype=torch.float64) - splats.centers[k]
             sigma = float(0.5 * offset @ torch.linalg.solve(covariance, offset))
-            alpha = min(settings.alpha_max, float(splats["opacities"][k]) * math.exp(-sigma))
+            alpha = min(settings.alpha_max, float(splats.opacities[k]) * math.exp(-sigma))
             if alpha < settings.alpha_min:
                 continue
             if transmittance * (1 - alpha) <= settings.stop:
                 stopped += 1
                 break
             weight = transmittance * alpha
-            color, depth = color + weight * splats["colors"][k], depth + weight * depths[k]
+            color, depth = color + weight * splats.colors[k], depth + weight * depths[k]
             transmittance *= 1 - alpha
         torch.testing.assert_close(rendering.image[0, 0, :, row, column], color, rtol=1e-9, atol=1e-12)
         total = 1 - transmittance
@@ -92,12 +90,12 @@ def test_splats_are_composited_front_to_back_with_every_threshold():
 
 
 def test_projection_against_the_derivative_of_the_pinhole():
-    """The 2D covariance is J Sigma J^T with J from autograd, inside the frame where nothing is held."""
+    """Inside the frame, 2D covariances are J Sigma J^T with J from autograd."""
     from ghgs_lit.geometry.projection import project
     from ghgs_lit.geometry.rotations import quaternion_to_matrix
     from ghgs_lit.rendering import reference
 
-    gaussians, views = cloud(40).to(torch.float64), cameras(3, 40, 50).to(torch.float64)
+    gaussians, views = cloud(40).to(torch.float64), camera_ring(3, 40, 50).to(torch.float64)
     camera = views[0, 1]
     splats = reference.project(gaussians, camera, RasterSettings())
     root = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
@@ -110,13 +108,14 @@ def test_projection_against_the_derivative_of_the_pinhole():
         )
         covariance = jacobian @ root[n] @ root[n].T @ jacobian.T + 0.3 * torch.eye(2, dtype=torch.float64)
         wanted = covariance[[0, 0, 1], [0, 1, 1]]
-        torch.testing.assert_close(splats["covariances"][n], wanted)
-        torch.testing.assert_close(splats["determinants"][n], torch.linalg.det(covariance))
-        torch.testing.assert_close(splats["centers"][n], center)
+        torch.testing.assert_close(splats.covariances[n], wanted)
+        torch.testing.assert_close(splats.determinants[n], torch.linalg.det(covariance))
+        torch.testing.assert_close(splats.centers[n], center)
 
 
 def test_float32_reference_is_close_to_float64():
-    gaussians, views = cloud(60), cameras(1, 20, 30)
+    """The reference in float32 is accurate, and keeps the dtype of its input."""
+    gaussians, views = cloud(60), camera_ring(1, 20, 30)
     single = render(gaussians, views, "reference")
     double = render(gaussians.to(torch.float64), views, "reference")
     assert single.image.dtype == torch.float32

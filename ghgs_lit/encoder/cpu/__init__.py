@@ -1,4 +1,4 @@
-"""The project's own attention for CPUs with 512-bit vectors: one pass, no matrix of scores in memory."""
+"""Attention for CPUs with 512-bit vectors: one pass, without a matrix of all scores in memory."""
 
 from ghgs_lit.encoder.cpu.attention import attend, is_supported
 

@@ -1,4 +1,4 @@
-"""Attention of all heads, shared out to threads."""
+"""Attention of all heads, distributed over threads."""
 
 from functools import cache, partial
 from itertools import pairwise
@@ -10,14 +10,19 @@ from torch import Tensor
 from ghgs_lit.encoder.cpu.layout import PANEL, QUERIES
 from ghgs_lit.kernels import pool
 
-# Multiplications from which the kernel pays: below, PyTorch's own takes milliseconds.
+# Multiplications above which the kernel is worth it: smaller products take PyTorch only milliseconds.
 _LARGE = 1 << 27
-# What it needs of a processor: registers for its tiles, and their product in bfloat16.
+# Processor feature that the kernel needs: enough registers for its tiles, and bfloat16 products.
 _FEATURE = {torch.float32: "avx512f", torch.bfloat16: "avx512bf16"}
 
 
 def is_supported(q: Tensor, v: Tensor) -> bool:
-    """Whether :func:`attend` can and should take queries like ``q`` [n, a, t, d] and values like ``v``."""
+    """Whether :func:`attend` can compute this attention, and faster than PyTorch.
+
+    Args:
+        q: queries [n, a, t, d].
+        v: values [n, a, s, d].
+    """
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURE:
         return False
     n, a, t, d = q.shape
@@ -26,7 +31,7 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
 
 @cache
 def _has(feature: str) -> bool:
-    from ghgs_lit.kernels.compile import processor_features  # late, like the kernel: it loads a compiler
+    from ghgs_lit.kernels.compile import processor_features  # here, like the kernel: it loads a compiler
 
     return feature in processor_features()
 
@@ -34,9 +39,9 @@ def _has(feature: str) -> bool:
 def attend(
     q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a s d"], v: Float[Tensor, "n a s d"]
 ) -> Float[Tensor, "n t a d"]:
-    """``softmax(q k^T / sqrt(d)) v`` of every head, in the type of ``v``, for what :func:`is_supported`.
+    """``softmax(q k^T / sqrt(d)) v`` of every head, in the dtype of ``v``; see :func:`is_supported`.
 
-    Scores and softmax are float32. The same bits with any number of threads.
+    Scores and softmax are float32. The result has the same bits with any number of threads.
     """
     from ghgs_lit.encoder.cpu.kernel import attend_head
 
@@ -44,7 +49,7 @@ def attend(
     words = [_words(x.to(v.dtype)) for x in (q, k, v, out.transpose(1, 2))]
     n, a, t, d = q.shape
     heads = [(i, j) for i in range(n) for j in range(a)]
-    # Every task packs keys and values of its own: parts of a head only where there are too few heads.
+    # Every task packs its own keys and values, so a head is split only where there are few heads.
     parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
     edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]
     compiled = attend_head(words[0].dtype.type)
@@ -58,7 +63,7 @@ def attend(
 
 
 def _words(x: Tensor):
-    """As a NumPy array of the same numbers, bfloat16 in pairs as int32."""
+    """The numbers as a NumPy array of 32-bit words: float32, or int32 that hold two bfloat16 each."""
     x = x.detach()
     if x.stride(-1) != 1 or (x.dtype == torch.bfloat16 and any(s % 2 for s in x.stride()[:-1])):
         x = x.contiguous()

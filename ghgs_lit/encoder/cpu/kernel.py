@@ -1,6 +1,7 @@
 """Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al., FlashAttention, 2022).
 
 Scores, exponentials and sums are float32; queries, keys, values and weights are float32 or bfloat16.
+Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``.
 """
 
 import math
@@ -10,22 +11,22 @@ import numpy as np
 from numba.core import types
 from numba.np.numpy_support import from_dtype
 
+from ghgs_lit.encoder.cpu.bfloat16 import aligned_words, pack_line, per_word, store_numbers
 from ghgs_lit.encoder.cpu.layout import KEYS, PANEL, QUERIES, ROWS
 from ghgs_lit.encoder.cpu.products import add_values, score
-from ghgs_lit.encoder.cpu.words import aligned_words, pack_line, per_word, store_numbers
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.compile import helper, kernel
+from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.simd import EXP2_LIMIT
 
 LANES = simd.LANES
 LOWEST = np.float32(-np.inf)
-# The least weight beside the largest is 2^-126, the smallest normal float32.
-DEEPEST = np.float32(126)
 
 
 def _attend_head(q, k, v, out, first, last):
-    """``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` into ``out``.
+    """Write ``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` to ``out``.
 
-    Each is [tokens, words], float32 [t, d] or int32 [t, d / 2] of bfloat16 pairs; d is a multiple of 32.
+    Every matrix is [tokens, words]: float32 [t, d], or int32 [t, d / 2] of two bfloat16 each. ``d`` is a
+    multiple of 32.
     """
     tokens, steps = k.shape
     width = steps * per_word(k)
@@ -57,12 +58,9 @@ def _attend_head(q, k, v, out, first, last):
 
 @cache
 def attend_head(word: type):
-    """The kernel for words of a type, ``np.float32`` or ``np.int32``, and matrices of any strides."""
-    compiled = kernel(_attend_head)
+    """The kernel for words of type ``np.float32`` or ``np.int32`` and matrices with any strides."""
     matrix = types.Array(from_dtype(np.dtype(word)), 2, "A")
-    compiled.compile((matrix, matrix, matrix, matrix, types.int64, types.int64))
-    compiled.disable_compile()  # for contiguous matrices once more, to no gain
-    return compiled
+    return kernel_for(_attend_head, matrix, matrix, matrix, matrix, types.int64, types.int64)
 
 
 @helper
@@ -72,7 +70,7 @@ def _padded(count):
 
 @helper
 def _packed_keys(k):
-    """Panels of ``PANEL`` keys, each [words, PANEL]; zeros for keys that are not there."""
+    """Panels of ``PANEL`` keys, each [words, PANEL]; missing keys of the last panel are zero."""
     tokens, steps = k.shape
     packed = aligned_words(k, _padded(tokens) * steps)
     for panel in range(0, tokens, PANEL):
@@ -88,7 +86,7 @@ def _packed_keys(k):
 
 @helper
 def _packed_values(v):
-    """Panels of ``PANEL`` channels, each [words of tokens, PANEL]; zeros for tokens that are not there."""
+    """Panels of ``PANEL`` channels, each [words of tokens, PANEL]; missing tokens are zero."""
     tokens, steps = v.shape
     lines, width = _padded(tokens) // per_word(v), steps * per_word(v)
     packed = aligned_words(v, lines * width)
@@ -100,7 +98,7 @@ def _packed_values(v):
 
 @helper
 def _pack_queries(q, start, count, packed):
-    """Tiles of ``ROWS`` queries, each [words, ROWS]; behind the last one, it is repeated."""
+    """Tiles of ``ROWS`` queries, each [words, ROWS]; the last query fills the last tile."""
     steps = q.shape[1]
     for row in range(0, count, ROWS):
         for r in range(ROWS):
@@ -111,7 +109,7 @@ def _pack_queries(q, start, count, packed):
 
 @helper
 def _score(queries, row, keys, key, seen, steps, scores):
-    """Products of ``ROWS`` queries and ``seen`` keys [ROWS, KEYS]; those behind are never the highest."""
+    """Products of ``ROWS`` queries and ``seen`` keys [ROWS, KEYS]; the padding after them is -inf."""
     for panel in range(0, seen, PANEL):
         score(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
     for r in range(ROWS):
@@ -121,17 +119,17 @@ def _score(queries, row, keys, key, seen, steps, scores):
 
 @helper
 def _highest(scores, r, seen):
-    """The highest score of a row; NaN is passed over, and will be met again in the weights."""
+    """The highest score of a row; NaN is ignored here and reaches the result through the weights."""
     found = simd.full(LOWEST)
     for i in range(0, seen, LANES):
         found = simd.maximum(memory.load(scores, r * KEYS + i), found)
-    return simd.highest_lane(found)
+    return simd.lane_max(found)
 
 
 @helper
 def _scale_down(exponent, sums, totals, r, width):
-    """Multiply what a query has gathered by ``2^exponent``."""
-    factor = simd.exp2_minus(simd.full(min(-exponent, DEEPEST)))
+    """Multiply the weighted values and the sum of weights of query ``r`` by ``2^exponent``."""
+    factor = simd.exp2_minus(simd.full(min(-exponent, EXP2_LIMIT)))
     memory.store(sums, r * LANES, memory.load(sums, r * LANES) * factor)
     for i in range(r * width, (r + 1) * width, LANES):
         memory.store(totals, i, memory.load(totals, i) * factor)
@@ -139,12 +137,12 @@ def _scale_down(exponent, sums, totals, r, width):
 
 @helper
 def _weigh(scores, r, seen, scale, top, weights, sums, query):
-    """Weights ``2^(scale s - top)`` of a row of scores, and their sum by lanes."""
-    total, minus, deepest = memory.load(sums, query * LANES), simd.full(-scale), simd.full(DEEPEST)
+    """Weights ``2^(scale s - top)`` of a row of scores, and their sum in each lane."""
+    total, minus, limit = memory.load(sums, query * LANES), simd.full(-scale), simd.full(EXP2_LIMIT)
     for i in range(0, _padded(seen), LANES):
         depth = simd.fma(memory.load(scores, r * KEYS + i), minus, top)
-        # The second where the first is NaN: it stays.
-        weight = simd.exp2_minus(simd.minimum(deepest, depth))
+        # ``minimum`` gives the second argument where either is NaN, so NaN stays.
+        weight = simd.exp2_minus(simd.minimum(limit, depth))
         total = total + weight
         store_numbers(weights, (r * KEYS + i) // per_word(weights), weight)
     memory.store(sums, query * LANES, total)
@@ -161,7 +159,7 @@ def _add_values(weights, values, key, seen, totals, row, width):
 
 @helper
 def _finish(out, sums, totals, r, width):
-    """One query's values, over the sum of its weights, into its line of the result."""
+    """Write the weighted values of query ``r``, divided by the sum of its weights, to ``out``."""
     share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
     for i in range(0, width, LANES):
         store_numbers(out, i // per_word(out), memory.load(totals, r * width + i) * simd.full(share))

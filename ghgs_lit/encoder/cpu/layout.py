@@ -1,8 +1,8 @@
-"""Sizes of what the kernel holds at once: multiples of a vector's 16 lanes but for ``ROWS``."""
+"""Sizes of the kernel's blocks; all but ``ROWS`` are multiples of a vector's 16 lanes."""
 
-#: A tile of a product: rows of its left factor, columns of its right one; 24 of the 32 registers of AVX-512.
+#: Rows and columns of a tile of a product; it fills 24 of the 32 registers of AVX-512.
 ROWS, PANEL = 12, 32
 #: Keys whose scores and weights are held at once, for ``ROWS`` queries.
 KEYS = 256
-#: Queries that share a look at those keys.
+#: Queries that are compared with those keys before the next keys are read.
 QUERIES = 8 * ROWS

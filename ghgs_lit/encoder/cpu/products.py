@@ -1,7 +1,7 @@
 """Products of small matrices that stay in registers, in float32 or in pairs of bfloat16.
 
-Both come as words (see ``words``); where they are pairs, these are neighbours of the dimension that is summed
-over, as AVX-512's bfloat16 product wants them, which sums in float32. A tile of the result is ``ROWS`` x
+Both factors are 32-bit words (see ``bfloat16``). A pair holds neighbours along the dimension that is summed,
+which is what AVX-512's bfloat16 product needs; it sums in float32. A tile of the result is ``ROWS`` x
 ``PANEL``; its right factor is a panel, ``PANEL`` words for every step of the sum.
 """
 
@@ -9,8 +9,8 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from ghgs_lit.encoder.cpu.bfloat16 import PAIRS, holds_pairs
 from ghgs_lit.encoder.cpu.layout import KEYS, PANEL, ROWS
-from ghgs_lit.encoder.cpu.words import PAIRS, halves
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I32, I64, LANES, call, constant, floats, indices
 
@@ -18,7 +18,7 @@ _WORDS = ir.VectorType(I32, LANES)
 
 
 def _multiply_add(builder, half: bool, x, y, total):
-    """``total + x * y`` of every lane, or of both halves of it."""
+    """``total + x * y`` in every lane; with ``half``, the products of both bfloat16 of a lane are added."""
     if not half:
         return call(builder, "fmuladd", floats, x, y, total)
     kind = ir.FunctionType(floats.llvm, [floats.llvm, PAIRS, PAIRS])
@@ -27,7 +27,7 @@ def _multiply_add(builder, half: bool, x, y, total):
 
 
 def _steps(builder, half: bool, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:
-    """Sum over ``steps`` words of each row times those of the panel into ``totals``."""
+    """Add the products of each row and the panel, over ``steps`` words, to ``totals``."""
     kind = _WORDS if half else floats.llvm
     undefined = ir.Constant(kind, ir.Undefined)
     with cgutils.for_range(builder, steps, intp=I64) as loop:
@@ -46,14 +46,17 @@ def _steps(builder, half: bool, rows, row_stride: int, step_stride: int, panel, 
 
 
 def _make_product(strides, adds: bool):
-    """A product of ``ROWS`` rows whose words lie ``strides(half)`` apart, from row to row and step to step.
+    """A product of ``ROWS`` rows and one panel.
 
-    Strides that the compiler knows keep every register for the tile.
+    Args:
+        strides: maps ``half`` to the distances in words from row to row and from step to step; the compiler
+            knows them, which keeps all registers free for the tile.
+        adds: add the product to ``out`` instead of overwriting it.
     """
 
     @intrinsic
     def product(typing_context, x, x_at, panels, panel_at, steps, out, out_at, out_stride):
-        half = halves(x)
+        half = holds_pairs(x)
         row_stride, step_stride = strides(half)
 
         def emit(context, builder, sig, args):
@@ -62,7 +65,7 @@ def _make_product(strides, adds: bool):
 
             word = I32 if half else ir.FloatType()
             count = PANEL // LANES
-            # Registers: their addresses never leave this function.
+            # These become registers, since their addresses never leave this function.
             totals = [[cgutils.alloca_once(builder, floats.llvm) for _ in range(count)] for _ in range(ROWS)]
             for row in totals:
                 for total in row:
@@ -86,7 +89,7 @@ def _make_product(strides, adds: bool):
     return product
 
 
-#: ``out = x y`` where a step's words of all rows are neighbours.
+#: ``out = x y`` where the words of all rows for one step are neighbours.
 score = _make_product(lambda half: (1, ROWS), adds=False)
-#: ``out += x y`` where a row's words are neighbours: ``KEYS`` numbers.
+#: ``out += x y`` where the words of one row are neighbours: ``KEYS`` numbers.
 add_values = _make_product(lambda half: (KEYS // 2 if half else KEYS, 1), adds=True)

@@ -1,4 +1,4 @@
-"""The project's own attention over given neighbours for CPUs: nothing is computed for other tokens."""
+"""Attention over given neighbours for CPUs: nothing is computed for other tokens."""
 
 from ghgs_lit.recalibration.cpu.attention import attend, cosines, is_supported
 

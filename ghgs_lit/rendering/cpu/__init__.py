@@ -1,4 +1,4 @@
-"""The project's own rasterizer for CPUs: kernels on explicit vectors; ``layout`` tells of their data."""
+"""A rasterizer for CPUs in kernels on explicit vectors; ``layout`` describes their data."""
 
 from ghgs_lit.rendering.cpu.backend import rasterize
 

@@ -17,12 +17,13 @@ from ghgs_lit.rendering.cpu import binning, layout, projection
 from ghgs_lit.rendering.cpu.backward import backward
 from ghgs_lit.rendering.cpu.forward import forward
 from ghgs_lit.rendering.cpu.gradients import collect
+from ghgs_lit.rendering.cpu.plan import Plan
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
-# Tiles are handed to threads in runs of about this many per thread, so that none waits long for the last.
+# Runs of tiles for each thread: with several short runs, no thread waits long for the last one.
 _RUNS = 8
-# The kernels are compiled for this number of channels, and once more for all others.
+# The kernels are compiled once for this number of channels and once for all others.
 _COLORS = 3
 
 
@@ -36,21 +37,20 @@ def rasterize(
 ) -> Rendering:
     """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
 
-    Outside of ``regions`` (top, left, height, width) nothing is drawn, nor computed.
-
-    Differentiable in the Gaussians, not in the cameras. The same bits with any number of threads.
+    Differentiable in the Gaussians, not in the cameras. The result has the same bits with any number of
+    threads. Nothing is drawn or computed outside ``regions`` (top, left, height, width).
     """
     _warn_of_narrow_vectors()
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-    plan = _Plan.of(gaussians, cameras, settings, near, far, regions)
+    plan = Plan.of(gaussians, cameras, settings, near, far, regions)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
 
 
 @cache
 def _warn_of_narrow_vectors() -> None:
-    """Warn, once in a process, where vectors are narrower than 256 bits.
+    """Warn, once in a process, on a processor whose vectors are narrower than 256 bits.
 
-    The kernels fall back to what the machine has: LLVM splits their vectors, and the image is the same.
+    The image is the same there: LLVM splits the kernels' vectors into those of the machine.
     """
     if not processor_features() & {"avx2", "sve"}:
         warnings.warn(
@@ -61,94 +61,9 @@ def _warn_of_narrow_vectors() -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What to render, without the Gaussians' values. View ``v`` shows batch element ``v // T``."""
-
-    views: np.ndarray
-    edges: np.ndarray
-    shifts: np.ndarray
-    splats: int
-    shape: tuple[int, int]
-    height: int
-    width: int
-    settings: RasterSettings
-    near: float
-    far: float
-
-    @classmethod
-    def of(cls, gaussians, cameras, settings, near, far, regions) -> "_Plan":
-        counts, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
-        firsts = np.cumsum(counts) - counts
-        # Whole vectors of splats for each view, so that threads never write to the same one.
-        sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
-        return cls(
-            views=_view_rows(cameras, settings, regions),
-            edges=_part_edges(firsts, counts),
-            shifts=np.cumsum(sizes) - sizes - np.repeat(firsts, views_each),
-            splats=int(sizes.sum()),
-            shape=tuple(cameras.shape),
-            height=cameras.height,
-            width=cameras.width,
-            settings=settings,
-            near=near,
-            far=far,
-        )
-
-    @property
-    def tiles(self) -> tuple[int, int]:
-        """Tiles across and down one view."""
-        return -(-self.width // layout.TILE), -(-self.height // layout.TILE)
-
-    @property
-    def constants(self) -> tuple[np.float32, np.float32]:
-        return np.float32(self.settings.alpha_max), np.float32(self.settings.stop)
-
-    @property
-    def parts(self) -> list[tuple[int, int, int, int, slice]]:
-        """Batch element, part of it, first and last Gaussian of the part, and the element's views."""
-        views = self.shape[1]
-        return [
-            (b, p, int(edges[p]), int(edges[p + 1]), slice(b * views, (b + 1) * views))
-            for b, edges in enumerate(self.edges)
-            for p in range(len(edges) - 1)
-            if edges[p] < edges[p + 1]
-        ]
-
-
-def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Where the parts of each element begin and end [B, P + 1]: whole vectors but for the last."""
-    threads, total = torch.get_num_threads(), int(counts.sum())
-    parts = 1 if threads == 1 else max(1, min(-(-2 * threads // max(1, len(counts))), total // pool.GRAIN))
-    steps = -(-counts // (parts * simd.DOUBLES)) * simd.DOUBLES
-    edges = np.minimum(steps[:, None] * np.arange(parts + 1), counts[:, None])
-    return edges + firsts[:, None]
-
-
-def _view_rows(cameras: Cameras, settings: RasterSettings, regions: Tensor | None) -> np.ndarray:
-    """The cameras as rows of ``layout.VIEW`` doubles."""
-    intrinsics = cameras.intrinsics.detach().double().flatten(0, -3).numpy()
-    extrinsics = cameras.extrinsics.detach().double().flatten(0, -3).numpy()
-    rows = np.zeros((len(intrinsics), layout.VIEW))
-    sides = ((0, cameras.width, layout.X_LOW), (1, cameras.height, layout.Y_LOW))
-    for axis, size, low in sides:
-        focal, center = intrinsics[:, axis, axis], intrinsics[:, axis, 2]
-        margin = settings.frustum_margin * 0.5 * size / focal
-        rows[:, layout.FX + axis], rows[:, layout.CX + axis] = focal, center
-        rows[:, low], rows[:, low + 1] = -center / focal - margin, (size - center) / focal + margin
-    rows[:, layout.RIGHT], rows[:, layout.BOTTOM] = cameras.width - 1, cameras.height - 1
-    if regions is not None:
-        top, left, height, width = regions.cpu().double().flatten(0, -2).numpy().T
-        rows[:, layout.LEFT], rows[:, layout.RIGHT] = left, left + width - 1
-        rows[:, layout.TOP], rows[:, layout.BOTTOM] = top, top + height - 1
-    rows[:, layout.ROTATION : layout.ROTATION + 9] = extrinsics[:, :3, :3].reshape(-1, 9)
-    rows[:, layout.TRANSLATION : layout.TRANSLATION + 3] = extrinsics[:, :3, 3]
-    return rows
-
-
 @dataclass
 class _Splats:
-    """Splats of all views, and the entries of all tiles; see ``layout``."""
+    """Splats of all views and entries of all tiles; see ``layout``."""
 
     records: np.ndarray
     boxes: np.ndarray
@@ -159,11 +74,11 @@ class _Splats:
     reached: np.ndarray
 
 
-def _prepare(plan: _Plan, means, quaternions, scales, opacities, colors) -> _Splats:
-    """Project all Gaussians into their views and list them by tile."""
+def _prepare(plan: Plan, means, quaternions, scales, opacities, colors) -> _Splats:
+    """Project all Gaussians into their views and list the splats of each tile."""
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
-    records = _aligned(total * layout.RECORD).reshape(total, layout.RECORD)
+    records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
     depths, boxes = np.empty((total, 1), np.float32), np.empty((total, 4), np.int32)
     counts = np.zeros((elements, plan.edges.shape[1] - 1, views, tiles_x * tiles_y), np.int64)
     found = np.zeros(counts.shape[:2], np.int64)
@@ -195,7 +110,7 @@ def _prepare(plan: _Plan, means, quaternions, scales, opacities, colors) -> _Spl
 
 
 def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
-    """Tiles that have entries, in runs of about equal work."""
+    """Tiles that have entries, divided into runs of about equal work."""
     counts = np.diff(tile_starts)
     tiles = np.flatnonzero(counts)
     threads = torch.get_num_threads()
@@ -208,7 +123,7 @@ def _tile_runs(tile_starts: np.ndarray) -> list[np.ndarray]:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, colors, plan: _Plan):
+    def forward(ctx, means, quaternions, scales, opacities, colors, plan: Plan):
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
         found = _prepare(plan, *arrays)
         channels, size = colors.shape[1], (plan.height, plan.width)
@@ -257,39 +172,32 @@ class _Rasterize(torch.autograd.Function):
         return *results, None
 
 
-def _aligned(count: int) -> np.ndarray:
-    """``count`` floats whose memory starts on a cache line."""
-    buffer = np.empty(count + simd.LANES, np.float32)
-    skip = -(buffer.ctypes.data // 4) % simd.LANES
-    return buffer[skip : skip + count]
-
-
 _kept = threading.local()
-# Floats of scratch memory that a thread keeps: fresh memory costs more than what is written to it.
+# Floats of scratch memory that a thread may keep: allocating it again takes longer than filling it.
 _KEEP = 1 << 24
 
 
 def _scratch(count: int) -> np.ndarray:
-    """``_aligned`` memory that is the caller's until this thread asks for scratch again."""
+    """Aligned floats that the caller may use until this thread calls this function again."""
     buffer = getattr(_kept, "buffer", None)
     if buffer is None or len(buffer) < count:
-        buffer = _aligned(count + count // 4)
+        buffer = simd.aligned_floats(count + count // 4)
         _kept.buffer = buffer if len(buffer) <= _KEEP else None
     return buffer[:count]
 
 
 def _zeros(*shape: int) -> Tensor:
-    """Zeros by NumPy: the operating system's own, where PyTorch would wake its threads to write them."""
+    """Zeros by NumPy, which takes memory zeroed by the system; PyTorch would start threads to write them."""
     return torch.from_numpy(np.zeros(shape, np.float32))
 
 
 def _flat(tensor: Tensor | None) -> np.ndarray:
-    """All numbers of an image in one row; none for an image that is absent."""
-    return (
-        np.empty(0, np.float32) if tensor is None else tensor.detach().float().contiguous().flatten().numpy()
-    )
+    """All values of an image as a flat array; an empty array where there is no image."""
+    if tensor is None:
+        return np.empty(0, np.float32)
+    return tensor.detach().float().contiguous().flatten().numpy()
 
 
 def _channels(count: int):
-    """What tells a kernel the number of channels: a tuple of that length compiles it for them."""
+    """The number of channels for a kernel; as a tuple of that length, the kernel is compiled for it."""
     return (0,) * count if count == _COLORS else count

@@ -1,8 +1,9 @@
-"""Gradients of pixels to those of splats, one tile at a time.
+"""From gradients of pixels to gradients of splats, one tile at a time.
 
-The backward pass replays the forward pass front to back: with ``v_i`` the gradient's product with splat
-``i``'s colour, depth and one, and ``S`` the sum of ``w_j v_j`` over the splats behind, ``dL/d alpha_i =
-T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the pixel's own total and shrinks: one number a pixel.
+The backward pass repeats the forward pass front to back. Let ``v_i`` be the product of the pixel's gradient
+with splat ``i``'s colour, depth and 1, and ``S`` the sum of ``w_j v_j`` over the splats behind it. Then
+``dL/d alpha_i = T_i v_i - S / (1 - alpha_i)``. ``S`` starts as the sum over all splats of the pixel and
+shrinks: one number per pixel.
 """
 
 import numpy as np
@@ -12,13 +13,13 @@ from ghgs_lit.kernels.compile import helper, kernel
 from ghgs_lit.rendering.cpu import layout, tables, tiles
 from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ONE, ZERO
 
-# Entries between asking for a splat and reading it.
+# Entries between prefetching a splat and reading it.
 _AHEAD = 8
 
 
 @helper
 def _read(image, first, width, rows, columns, block):
-    """One block of a tile whose first pixel is ``image[first]``; zero beyond ``rows`` x ``columns``."""
+    """One block of a tile whose first pixel is ``image[first]``; zero outside ``rows`` x ``columns``."""
     y, x = block // 4 * 4, block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
         return tables.load_block(image, first + y * width + x, width)
@@ -36,8 +37,8 @@ def _read_gradients(
 ):  # fmt: skip
     """Fill ``upstream`` with the gradients of a tile's planes and ``suffix`` with ``S`` of all splats.
 
-    Gradients of alpha and depth may be absent (of size 0). With depth = D / A, ``dL/dD = g / A`` and
-    ``dL/dA = -g depth / A``; so D's and A's shares of ``S`` cancel.
+    Gradients of alpha and depth may be missing (size 0). With depth = D / A, ``dL/dD = g / A`` and
+    ``dL/dA = -g depth / A``, so the parts of D and A in ``S`` cancel.
     """
     channels, start = simd.length(count), view * height * width + first
     for block in range(BLOCKS):
@@ -70,7 +71,7 @@ def _differentiate_splat(
 ):
     """Sum one splat's gradients over a tile into the rows of ``sums``."""
     channels, zero = simd.length(count), simd.full(ZERO)
-    numbers, depth = tiles.splat(records[s], np.float32(x0), np.float32(y0)), records[s, layout.DEPTH]
+    numbers, depth = tiles.read_splat(records[s], np.float32(x0), np.float32(y0)), records[s, layout.DEPTH]
     h, h_p, h_q, h_pp, h_pq, h_qq, d_depth = zero, zero, zero, zero, zero, zero, zero
     for c in range(channels):
         memory.store(sums, (layout.COLOR + c) * LANES, zero)
@@ -115,15 +116,14 @@ def backward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, image, alpha, depth, d_image, d_alpha, d_depth, gradients,
 ):  # fmt: skip
-    """Gradients of the drawn entries of the given tiles into ``gradients`` [slots x gradient_width].
+    """Write gradients of the drawn entries of the given tiles to ``gradients`` [slots x gradient_width].
 
-    ``gradients`` is flat and starts on a cache line; images and their gradients are flat as in
-    ``forward``.
+    ``gradients`` is flat and starts on a cache line; images and their gradients are flat as in ``forward``.
     """
     channels = simd.length(count)
     transmittance, suffix = simd.aligned(layout.PIXELS), simd.aligned(layout.PIXELS)
     upstream = simd.aligned((channels + 2) * layout.PIXELS)
-    stride = (layout.COLOR + channels + LANES - 1) // LANES * LANES
+    stride = layout.kernel_gradient_width(channels)
     sums, pixels = simd.aligned(stride * LANES), tiles.grid()
     sums[:] = ZERO
     for tile in some_tiles:

@@ -1,8 +1,8 @@
-"""Which splats lie in which tile, and in which order.
+"""The list of splats of each tile, in the order in which they are drawn.
 
-Every part of the Gaussians scatters its splats into the tiles' lists in the order of their index; then
-each tile sorts its own list by depth with a stable sort. So neither the number of parts nor that of
-threads changes the order, and no sort is larger than a tile.
+Each part of the Gaussians writes its splats to the lists of the tiles in the order of their index; then
+each tile sorts its own list by depth with a stable sort. So the order does not depend on the number of parts
+or threads, and no sort is larger than a tile.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from ghgs_lit.rendering.cpu import layout
 
 _DIGIT = 8
 _BUCKETS = 1 << _DIGIT
-# Up to this many numbers insertion beats counting.
+# For this many keys or fewer, insertion sort is faster than radix sort.
 _FEW = 24
 
 
@@ -20,8 +20,8 @@ _FEW = 24
 def scatter(first, last, shifts, depths, boxes, tiles_x, slot, entry_starts, next_free, entries):
     """List the splats of Gaussians ``first`` to ``last`` in every tile that they touch.
 
-    ``next_free`` [T, tiles] is where this part's next entry of a tile goes; the part's slots begin with
-    ``slot``, and ``entry_starts`` receives the first slot of every splat that is seen.
+    ``next_free`` [T, tiles] is the place of this part's next entry in each tile; the slots of the part begin
+    at ``slot``, and ``entry_starts`` receives the first slot of every visible splat.
     """
     keys = depths.view(np.int32)
     for t in range(len(shifts)):
@@ -49,7 +49,7 @@ def _insertion_sort(keys, count):
 
 @helper
 def _radix_pass(keys, new_keys, count, shift, places):
-    """Sort stably by one digit of the keys into ``new_keys``."""
+    """Sort by one digit of the keys, stably, to ``new_keys``."""
     places[:] = 0
     for i in range(count):
         places[(keys[i] >> shift) & (_BUCKETS - 1)] += 1
@@ -66,9 +66,10 @@ def _radix_pass(keys, new_keys, count, shift, places):
 
 @helper
 def depth_order(entries, start, end, keys, spare, places):
-    """The entries of one tile by depth, ties as they stand: their rows are the lower halves of the result.
+    """The entries of one tile sorted by depth, ties in their present order.
 
-    The bits of positive floats order as integers do; above ``start``'s smallest few of them differ.
+    Returns keys whose lower halves are rows of ``entries``. The bits of positive floats sort like integers;
+    relative to the smallest of a tile, only a few low digits differ.
     """
     count, least, most = end - start, entries[start, layout.KEY], entries[start, layout.KEY]
     for i in range(start, end):

@@ -1,4 +1,4 @@
-"""Splats to pixels, one tile at a time, front to back."""
+"""From splats to pixels, one tile at a time, front to back."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from ghgs_lit.kernels.compile import helper, kernel
 from ghgs_lit.rendering.cpu import binning, layout, tables, tiles
 from ghgs_lit.rendering.cpu.tiles import BLOCKS, LANES, LEAST_ALPHA, ZERO
 
-# Entries that are drawn block after block before the next are looked at: as many as an integer has bits.
+# Entries that are drawn into all blocks before the next entries are read: the bits of an integer.
 _CHUNK = 64
-# Where depth and colours lie in a gathered row, after the numbers of ``tiles.splat``.
+# Places of depth and colours in a gathered row, after the values of ``tiles.read_splat``.
 _DEPTH, _COLOR = 7, 8
 
 
@@ -17,9 +17,9 @@ _DEPTH, _COLOR = 7, 8
 def _touches(numbers, slope_x, slope_y, block):
     """Which of 16 splats have an ellipse that meets a block, as bits.
 
-    A convex function that is least at the centre is least over a box either where the box's column
-    nearest to the centre crosses the valley along it, or the same for rows. Compared with a hair more
-    than the cutoff, since it only saves work.
+    The smallest p^2 + q^2 over a box lies on the column or on the row of the box that is nearest to the
+    splat's centre, at the minimum along that column or row. The comparison is slightly more generous than
+    the cutoff, since it only saves work.
     """
     side = np.float32(layout.BLOCK - 1)
     left, top = numbers[0] + np.float32(block % 4 * 4), numbers[1] + np.float32(block // 4 * 4)
@@ -36,7 +36,7 @@ def _touches(numbers, slope_x, slope_y, block):
 
 @helper
 def _fetch(order, i, entries, shift, records, colors, splats):
-    """The splats of a chunk, the last repeated to whole vectors; asks for the records of the next chunk."""
+    """The splats of a chunk, the last one repeated to whole vectors; prefetches the next chunk's records."""
     for k in range(_CHUNK):
         splats[k] = entries[order[min(i + k, len(order) - 1)] & 0xFFFFFFFF, layout.SPLAT]
         if i + k + _CHUNK < len(order):
@@ -46,14 +46,14 @@ def _fetch(order, i, entries, shift, records, colors, splats):
 
 @helper
 def _list_chunk(splats, count, shift, records, colors, x0, y0, live, rows, todo):
-    """Gather the numbers of ``count`` splats into ``rows``; list for each block those that touch it, as bits.
+    """Gather ``count`` splats to ``rows``; ``todo`` gets the splats that touch each block, as bits.
 
-    ``rows`` holds a run of ``_CHUNK`` for each number of ``tiles.splat``, the depth, and each channel.
+    ``rows`` holds ``_CHUNK`` numbers for each value of ``tiles.read_splat``, the depth, and each channel.
     """
     todo[:] = 0
     for i in range(0, count, LANES):
         record = tables.gather_lines(records, splats, i)
-        numbers = tiles.splat(record, np.float32(x0), np.float32(y0))
+        numbers = tiles.read_splat(record, np.float32(x0), np.float32(y0))
         memory.store(rows, i, numbers[0])
         memory.store(rows, _CHUNK + i, numbers[1])
         memory.store(rows, 2 * _CHUNK + i, numbers[2])
@@ -84,7 +84,7 @@ def _add(planes, position, value):
 
 @helper
 def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
-    """Blend the splats ``todo`` (as bits) into one block, front to back; returns whether it stays open."""
+    """Blend the splats ``todo`` (bits) into one block, front to back; returns whether light still passes."""
     at, bit = block * LANES, np.int32(1) << block
     x, y, before = (
         memory.load(pixels, at),
@@ -104,7 +104,7 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
             hits[i] |= bit
         weight = simd.select(seen, before * alpha, ZERO)
         for c in range(simd.length(count)):
-            # Where the splat is not seen, a colour that is not finite must not be multiplied by zero.
+            # Selected after the product: zero times a colour that is not finite would be NaN.
             color = simd.select(seen, weight * rows[(_COLOR + c) * _CHUNK + i], ZERO)
             _add(planes, c * layout.PIXELS + at, color)
         _add(planes, simd.length(count) * layout.PIXELS + at, weight * rows[_DEPTH * _CHUNK + i])
@@ -118,7 +118,7 @@ def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_m
 
 @helper
 def _write(image, first, width, rows, columns, block, value):
-    """Write one block of a tile whose first pixel is ``image[first]``, cut at ``rows`` x ``columns``."""
+    """Write the ``rows`` x ``columns`` part of one block of a tile whose first pixel is ``image[first]``."""
     y, x = block // 4 * 4, block % 4 * 4
     if y + 4 <= rows and x + 4 <= columns:
         tables.store_block(image, first + y * width + x, width, value)
@@ -132,6 +132,7 @@ def _write(image, first, width, rows, columns, block, value):
 
 @helper
 def _write_planes(planes, view, first, height, width, rows, columns, channels, image, alpha, depth):
+    """Write a tile's colours, alpha and expected depth."""
     for block in range(BLOCKS):
         at = block * LANES
         for c in range(channels):
@@ -149,11 +150,11 @@ def forward(
     some_tiles, tiles_x, tiles_y, height, width, views, tile_starts, entries, shifts, records, colors, count,
     alpha_max, stop, drawn, reached, image, alpha, depth,
 ):  # fmt: skip
-    """Draw the given tiles into flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
+    """Draw the given tiles to flat ``image`` [V C h w], ``alpha`` and (expected) ``depth`` [V h w].
 
-    Leaves in ``entries`` what the backward pass needs, see ``layout``: ``drawn`` [tiles] of each tile's
-    entries, whose slots are marked in ``reached``. ``count`` is the number of channels, or a tuple of
-    that length, for which the kernel is then compiled.
+    For the backward pass (see ``layout``) it writes the drawn entries to ``entries``, their number in each
+    tile to ``drawn``, and marks their slots in ``reached``. ``count`` is the number of channels, or a tuple
+    of that length, for which the kernel is then compiled.
     """
     channels, longest = simd.length(count), 1
     for tile in some_tiles:

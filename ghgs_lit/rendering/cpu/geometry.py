@@ -1,7 +1,7 @@
-"""The geometry of eight splats at once, which projection and its gradient share; in doubles.
+"""Geometry of eight splats at once in doubles, used by the projection and its gradient.
 
-Points and vectors are tuples of vectors of eight doubles; matrices are such tuples row by row. Doubles
-cost little (once a splat, not once a pixel) and leave no finite float32 input that overflows.
+Points and vectors are tuples of vectors of eight doubles; matrices are such tuples, row by row. Doubles
+cost little (they are used once per splat, not per pixel), and with them no finite float32 input overflows.
 """
 
 import math
@@ -10,16 +10,16 @@ from ghgs_lit.kernels import simd
 from ghgs_lit.kernels.compile import helper
 from ghgs_lit.rendering.cpu import layout
 
-# p^2 + q^2 = sigma / ln 2, where sigma is the exponent of the Gaussian.
+# p^2 + q^2 = sigma / ln 2, where exp(-sigma) is the Gaussian.
 TO_LOG2 = 1.0 / math.log(2.0)
 K_SCALE = math.sqrt(0.5 * TO_LOG2)
 
 
 @helper
 def unit(quaternions):
-    """Unit quaternions and 1 / norm; identity and 0 for the zero quaternion."""
+    """Unit quaternions and 1 / norm; for the zero quaternion the identity and 0."""
     w, x, y, z = quaternions
-    norm = simd.root(w * w + x * x + (y * y + z * z))
+    norm = simd.sqrt(w * w + x * x + (y * y + z * z))
     is_zero = norm == 0.0
     inverse = 1.0 / simd.select(is_zero, 1.0, norm)
     w = simd.select(is_zero, 1.0, w * inverse)
@@ -47,7 +47,7 @@ def rotation(w, x, y, z):
 
 @helper
 def scaled(r, s):
-    """``R S``, whose columns are the axes of Gaussians at their lengths."""
+    """``R S``: the columns of R times the scales."""
     return (
         r[0] * s[0], r[1] * s[1], r[2] * s[2], r[3] * s[0], r[4] * s[1], r[5] * s[2],
         r[6] * s[0], r[7] * s[1], r[8] * s[2],
@@ -56,12 +56,13 @@ def scaled(r, s):
 
 @helper
 def dot(a, b, c, x, y, z):
+    """``a x + b y + c z``."""
     return simd.fma(a, x, simd.fma(b, y, c * z))
 
 
 @helper
 def camera_points(view, mean):
-    """World points in camera axes: x / z, y / z, z and 1 / z."""
+    """x / z, y / z, z and 1 / z of world points in camera axes."""
     r, t = layout.ROTATION, layout.TRANSLATION
     z = dot(view[r + 6], view[r + 7], view[r + 8], mean[0], mean[1], mean[2]) + view[t + 2]
     inverse = 1.0 / z
@@ -71,8 +72,8 @@ def camera_points(view, mean):
 
 
 @helper
-def held(view, x, y):
-    """x / z and y / z held near the frame, as the Jacobian takes them."""
+def clamped(view, x, y):
+    """x / z and y / z clamped to the frame and its margin, where the Jacobian is evaluated."""
     x = simd.minimum(simd.maximum(x, view[layout.X_LOW]), view[layout.X_HIGH])
     y = simd.minimum(simd.maximum(y, view[layout.Y_LOW]), view[layout.Y_HIGH])
     return x, y
@@ -80,7 +81,7 @@ def held(view, x, y):
 
 @helper
 def affine(view, x, y, inverse):
-    """``J W``, 2 x 3: the local affine map of the projection, for held ``x`` and ``y``."""
+    """``J W``, 2 x 3: the local affine map of the projection, for clamped ``x`` and ``y``."""
     fx, fy, r = view[layout.FX] * inverse, view[layout.FY] * inverse, layout.ROTATION
     a, b, c = view[r + 6], view[r + 7], view[r + 8]
     return (
@@ -91,7 +92,7 @@ def affine(view, x, y, inverse):
 
 @helper
 def footprint(t, r):
-    """``M = J W R(q) S``, 2 x 3, whose ``M M^T`` is the covariance before the low-pass filter."""
+    """``M = J W R(q) S``, 2 x 3; ``M M^T`` is the covariance before the low-pass filter."""
     return (
         dot(t[0], t[1], t[2], r[0], r[3], r[6]),
         dot(t[0], t[1], t[2], r[1], r[4], r[7]),
@@ -104,7 +105,7 @@ def footprint(t, r):
 
 @helper
 def normal(m):
-    """``m_0 x m_1`` of the rows of M; its square is ``det(M M^T)`` without cancellation."""
+    """Cross product of the rows of M; its squared length is ``det(M M^T)`` without cancellation."""
     return m[1] * m[5] - m[2] * m[4], m[2] * m[3] - m[0] * m[5], m[0] * m[4] - m[1] * m[3]
 
 

@@ -1,6 +1,6 @@
-"""From the gradients of entries to those of Gaussians: the projection's derivative, eight at a time.
+"""From gradients of entries to gradients of Gaussians: the derivative of the projection, eight at a time.
 
-Sums run in a fixed order (entries of a splat, then views), so results do not depend on threads.
+Sums are added in a fixed order (entries of a splat, then views), so results do not depend on threads.
 """
 
 import numpy as np
@@ -14,13 +14,13 @@ _WIDE = simd.DOUBLES
 _MEAN, _ROOT, _OPACITY = 0, 3, 12
 _SUMS = 13
 
-# The K and with them the whitened moments carry a factor K_SCALE each.
+# Each K, and so each whitened coordinate in a moment, contains a factor K_SCALE.
 _FIRST_MOMENT, _SECOND_MOMENT = geometry.K_SCALE**-2, geometry.K_SCALE**-4
 
 
 @helper
 def _gather_splats(m, boxes, entry_starts, reached, gradients, width, lines):
-    """Sum the entries of splats ``m`` to ``m + 8`` into rows of ``lines``; returns those drawn, as bits."""
+    """Sum the entries of splats ``m`` to ``m + 8`` to rows of ``lines``; returns the drawn ones, as bits."""
     drawn = 0
     for lane in range(_WIDE):
         s = m + lane
@@ -44,7 +44,7 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
     """``dL/dM`` (2 x 3) and ``dL/d opacity``.
 
     The covariance's gradient is ``G = L^-T H L^-1 / 2`` with the whitened second moments H, and
-    ``dL/dM = 2 G M``. Under anti-aliasing opacity carries ``(det before / det after)^(1/2)`` too.
+    ``dL/dM = 2 G M``. With anti-aliasing, opacity also contains ``(det before / det after)^(1/2)``.
     """
     k_xx, k_yx, k_yy = record[layout.K_XX], record[layout.K_YX], record[layout.K_YY]
     pp, pq = _SECOND_MOMENT * moments[layout.H_PP], _SECOND_MOMENT * moments[layout.H_PQ]
@@ -60,8 +60,8 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
     if antialiased:
         n = geometry.normal(m)
         bare, determinant, _, _ = geometry.determinants(m, n, low_pass)
-        d_opacity = d_opacity * simd.root(bare / determinant)
-        # d ln(compensation) = (d ln bare - d ln determinant) / 2, of sums of squares in n and in m.
+        d_opacity = d_opacity * simd.sqrt(bare / determinant)
+        # d ln(compensation) = (d ln bare - d ln determinant) / 2, both sums of squares of n and m.
         d_n, d_m = h * (1.0 / bare - 1.0 / determinant), 0.0 - h * low_pass / determinant
         out = (
             out[0] + d_n * (m[4] * n[2] - m[5] * n[1]) + d_m * m[0],
@@ -75,33 +75,36 @@ def _footprint_gradient(moments, record, m, low_pass, antialiased):
 
 
 @helper
-def _point_gradient(view, x, y, held_x, held_y, inverse, d_u, d_v, d_z, d_t):
-    """``dL/d point`` in camera axes from the centre, the depth and ``J W`` (2 x 3), for x / z and y / z."""
+def _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_t):
+    """``dL/d point`` in camera axes, from the gradients of the centre, the depth and ``J W`` (2 x 3).
+
+    ``x`` and ``y`` are x / z and y / z of the point.
+    """
     r, fx, fy = layout.ROTATION, view[layout.FX] * inverse, view[layout.FY] * inverse
-    # J_xx = fx and J_xz = -fx held_x; dL/dJ = dL/d(J W) W^T.
+    # J_xx = fx and J_xz = -fx clamped_x; dL/dJ = dL/d(J W) W^T.
     d_xz = geometry.dot(view[r + 6], view[r + 7], view[r + 8], d_t[0], d_t[1], d_t[2])
     d_yz = geometry.dot(view[r + 6], view[r + 7], view[r + 8], d_t[3], d_t[4], d_t[5])
     d_xx = geometry.dot(view[r], view[r + 1], view[r + 2], d_t[0], d_t[1], d_t[2])
     d_yy = geometry.dot(view[r + 3], view[r + 4], view[r + 5], d_t[3], d_t[4], d_t[5])
-    d_x = fx * (d_u - inverse * simd.select(held_x == x, d_xz, 0.0))
-    d_y = fy * (d_v - inverse * simd.select(held_y == y, d_yz, 0.0))
-    slope = fx * (d_xx - held_x * d_xz) + fy * (d_yy - held_y * d_yz)
+    d_x = fx * (d_u - inverse * simd.select(clamped_x == x, d_xz, 0.0))
+    d_y = fy * (d_v - inverse * simd.select(clamped_y == y, d_yz, 0.0))
+    slope = fx * (d_xx - clamped_x * d_xz) + fy * (d_yy - clamped_y * d_yz)
     return d_x, d_y, d_z - x * d_x - y * d_y - inverse * slope
 
 
 @helper
 def _add(sums, k, drawn, value):
-    """Add to a row in the lanes that are drawn; what is not finite in others stays there."""
+    """Add to a row in the drawn lanes only; other lanes may hold values that are not finite."""
     old = memory.load(sums, k * _WIDE)
     memory.store(sums, k * _WIDE, simd.select(drawn, old + value, old))
 
 
 @helper
 def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antialiased, sums):
-    """Add eight splats' gradients to those of their Gaussians."""
+    """Add the gradients of eight splats to those of their Gaussians."""
     x, y, _, inverse = geometry.camera_points(view, mean)
-    held_x, held_y = geometry.held(view, x, y)
-    t = geometry.affine(view, held_x, held_y, inverse)
+    clamped_x, clamped_y = geometry.clamped(view, x, y)
+    t = geometry.affine(view, clamped_x, clamped_y, inverse)
     d_m, d_opacity = _footprint_gradient(moments, record, geometry.footprint(t, root), low_pass, antialiased)
     _add(sums, _OPACITY, drawn, d_opacity)
     for k in range(3):
@@ -121,7 +124,7 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
     d_u = record[layout.K_XX] * h_p + record[layout.K_YX] * h_q
     d_v = record[layout.K_YY] * h_q
     d_z = moments[layout.D_DEPTH]
-    point = _point_gradient(view, x, y, held_x, held_y, inverse, d_u, d_v, d_z, d_t)
+    point = _point_gradient(view, x, y, clamped_x, clamped_y, inverse, d_u, d_v, d_z, d_t)
     for k in range(3):
         r = layout.ROTATION + k
         _add(
@@ -132,7 +135,7 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
 
 @helper
 def _root_rows(sums):
-    """The gradient of ``R S`` among the sums."""
+    """The gradient of ``R S``, from the sums."""
     at = _ROOT * _WIDE
     return (
         memory.load(sums, at), memory.load(sums, at + 8), memory.load(sums, at + 16),
@@ -143,7 +146,7 @@ def _root_rows(sums):
 
 @helper
 def _quaternion_gradient(w, x, y, z, inverse, d):
-    """From the rotation matrix's gradient; along the quaternion itself there is none."""
+    """Gradient of quaternions from that of their rotation matrices; it is orthogonal to the quaternion."""
     d_w = 2.0 * (x * (d[7] - d[5]) + y * (d[2] - d[6]) + z * (d[3] - d[1]))
     d_x = 2.0 * (y * (d[1] + d[3]) + z * (d[2] + d[6]) + w * (d[7] - d[5]) - 2.0 * x * (d[4] + d[8]))
     d_y = 2.0 * (x * (d[1] + d[3]) + z * (d[5] + d[7]) + w * (d[2] - d[6]) - 2.0 * y * (d[0] + d[8]))
@@ -160,9 +163,9 @@ def collect(
     means, quaternions, scales, first, last, views, shifts, low_pass, antialiased, records, boxes,
     entry_starts, reached, gradients, d_means, d_quaternions, d_scales, d_opacities, d_colors,
 ):  # fmt: skip
-    """Gradients of Gaussians ``first`` to ``last``, summed over ``views``; all of them are written."""
+    """Write the gradients of Gaussians ``first`` to ``last``, summed over ``views``."""
     channels = d_colors.shape[1]
-    width = (layout.COLOR + channels + simd.LANES - 1) // simd.LANES * simd.LANES
+    width = layout.kernel_gradient_width(channels)
     lines, sums = simd.aligned(_WIDE * width), np.empty(_SUMS * _WIDE)
     lines[:] = np.float32(0)
     for n in range(first, last, _WIDE):

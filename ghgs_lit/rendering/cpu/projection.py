@@ -7,16 +7,16 @@ from ghgs_lit.kernels.compile import helper, kernel
 from ghgs_lit.rendering.cpu import geometry, layout, tables
 
 _WIDE = simd.DOUBLES
-# Pixels beyond which no splat can matter, and up to which float32 counts without overflow.
+# Splats farther away, in pixels, are not seen; up to here float32 does not overflow.
 _FAR = 1e30
 
 
 @helper
 def _extents(view, u, v, a, c, cutoff):
-    """First and last wanted pixels, across and down, whose centres lie in the boxes around splats."""
+    """First and last pixels of the region, across and down, whose centres lie in the boxes around splats."""
     reach = (2.0 / geometry.TO_LOG2) * cutoff
-    half_width = simd.minimum(simd.root(reach * a), _FAR)
-    half_height = simd.minimum(simd.root(reach * c), _FAR)
+    half_width = simd.minimum(simd.sqrt(reach * a), _FAR)
+    half_height = simd.minimum(simd.sqrt(reach * c), _FAR)
     left = simd.maximum(0.0 - simd.floor(0.5 - (u - half_width)), view[layout.LEFT])
     right = simd.minimum(simd.floor(u + half_width - 0.5), view[layout.RIGHT])
     top = simd.maximum(0.0 - simd.floor(0.5 - (v - half_height)), view[layout.TOP])
@@ -29,20 +29,20 @@ def _project_vector(
     view, mean, root, opacity, near, far, low_pass, extent, alpha_min, antialiased, m, records,
     depths, boxes,
 ):  # fmt: skip
-    """Project eight Gaussians to splats ``m`` to ``m + 8``; returns those seen, as bits."""
+    """Project eight Gaussians to splats ``m`` to ``m + 8``; returns the visible ones, as bits."""
     x, y, z, inverse = geometry.camera_points(view, mean)
-    held_x, held_y = geometry.held(view, x, y)
-    footprint = geometry.footprint(geometry.affine(view, held_x, held_y, inverse), root)
+    clamped_x, clamped_y = geometry.clamped(view, x, y)
+    footprint = geometry.footprint(geometry.affine(view, clamped_x, clamped_y, inverse), root)
     bare, determinant, xx, yy = geometry.determinants(footprint, geometry.normal(footprint), low_pass)
     a, c = xx + low_pass, yy + low_pass
     b = geometry.dot(footprint[0], footprint[1], footprint[2], footprint[3], footprint[4], footprint[5])
     u, v = simd.fma(x, view[layout.FX], view[layout.CX]), simd.fma(y, view[layout.FY], view[layout.CY])
     if antialiased:
-        opacity = opacity * simd.root(simd.minimum(simd.maximum(bare / determinant, 0.0), 1.0))
+        opacity = opacity * simd.sqrt(simd.minimum(simd.maximum(bare / determinant, 0.0), 1.0))
     visible = (z >= near) & (z <= far) & (opacity >= alpha_min)
     visible = visible & (determinant > 0.0) & (determinant < np.inf)
     visible = visible & (u > -_FAR) & (u < _FAR) & (v > -_FAR) & (v < _FAR)
-    # As bits of alpha: where p^2 + q^2 is larger, alpha falls below alpha_min.
+    # The largest p^2 + q^2 (a power of 2) at which alpha is at least alpha_min.
     cutoff = simd.maximum(simd.log2(opacity / alpha_min), 0.0)
     cutoff = simd.minimum(cutoff, 0.5 * extent * extent * geometry.TO_LOG2)
     left, right, top, bottom = _extents(view, u, v, a, c, cutoff)
@@ -58,11 +58,11 @@ def _project_vector(
     if seen == 0:
         return seen
     column, row, inverse_a = simd.floor(u), simd.floor(v), 1.0 / a
-    k_yy = geometry.K_SCALE * simd.root(a / determinant)
+    k_yy = geometry.K_SCALE * simd.sqrt(a / determinant)
     tables.store_columns1(depths, m, m + _WIDE, (z,))
     tables.store_lines(records, m, (
         column, row, 0.5 - (u - column), 0.5 - (v - row),
-        geometry.K_SCALE * simd.root(inverse_a), 0.0 - k_yy * b * inverse_a, k_yy,
+        geometry.K_SCALE * simd.sqrt(inverse_a), 0.0 - k_yy * b * inverse_a, k_yy,
         opacity, cutoff, z, b / c, b * inverse_a,
     ))  # fmt: skip
     return seen
@@ -73,7 +73,7 @@ def project(
     means, quaternions, scales, opacities, colors, first, last, views, shifts, near, far, low_pass, extent,
     alpha_min, antialiased, tiles_x, records, depths, boxes, tile_counts,
 ):  # fmt: skip
-    """Splats of Gaussians ``first`` to ``last`` in all of ``views`` [T]; returns how many entries they are.
+    """Project Gaussians ``first`` to ``last`` into all ``views`` [T]; returns the number of their entries.
 
     Gaussian ``n`` is splat ``n + shifts[t]`` of view ``t``. Fills ``records``, ``depths`` and ``boxes``;
     adds to ``tile_counts`` [T, tiles].

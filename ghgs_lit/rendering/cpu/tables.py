@@ -1,4 +1,4 @@
-"""Vectors from memory and to it: by 4 x 4 blocks of an image, by columns of a table, transposed."""
+"""Loading and storing vectors: 4 x 4 blocks of an image, columns of a table, transposed rows."""
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -34,7 +34,7 @@ def _block_rows(context, builder, array_type, array, index, stride, index_type):
 
 @intrinsic
 def load_block(typing_context, array, index, stride):
-    """The 4 x 4 pixels of a flat image that start at ``index``; its rows are ``stride`` floats apart."""
+    """The 4 x 4 pixels of a flat image from ``index`` on; rows of the image are ``stride`` floats apart."""
 
     def emit(context, builder, sig, args):
         rows = _block_rows(context, builder, array, *args, index)
@@ -59,7 +59,7 @@ def store_block(typing_context, array, index, stride, value):
 
 
 def _fold(builder, first, second, width):
-    """Add the two halves of every group of ``width`` lanes of two vectors into one vector."""
+    """One vector with the sums of the two halves of every group of ``width`` lanes of two vectors."""
     low = [i for i in range(2 * LANES) if i % width < width // 2]
     high = [i + width // 2 for i in low]
     return builder.fadd(
@@ -70,9 +70,9 @@ def _fold(builder, first, second, width):
 
 @intrinsic
 def row_sums(typing_context, array, index, count):
-    """Sums of the 16 rows of 16 floats from ``index`` on: row ``k``'s in lane ``k``, by a fixed tree.
+    """Sums of the 16 rows of 16 floats from ``index`` on, row ``k`` in lane ``k``, in a fixed order.
 
-    Where ``count`` is a tuple, rows from ``COLOR + len(count)`` on are taken for zero.
+    Where ``count`` is a tuple, rows from ``COLOR + len(count)`` on count as zero.
     """
     used = layout.COLOR + len(count) if isinstance(count, types.BaseTuple) else LANES
 
@@ -101,7 +101,7 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
 
 
 def _masked(builder, name: str, kind, rows, count: int, *args):
-    """Read or write a vector of up to eight rows of ``count`` floats, the first ``rows`` of them only."""
+    """Load or store a vector of eight rows of ``count`` floats, but only the first ``rows`` of them."""
     wide, lanes = ir.VectorType(I64, kind.count), range(kind.count)
     one = builder.insert_element(ir.Constant(wide, ir.Undefined), rows, ir.Constant(I32, 0))
     limit = builder.shuffle_vector(one, one, indices([0 for _ in lanes]))
@@ -122,7 +122,7 @@ def _make_columns(count: int):
 
     @intrinsic
     def columns(typing_context, array, row, last):
-        """Rows ``row`` to ``row + 8`` of a float32 table as doubles: one vector for each of its columns.
+        """Rows ``row`` to ``row + 8`` of a float32 table as doubles: one vector for each column.
 
         Lanes from row ``last`` on are zero.
         """
@@ -142,7 +142,7 @@ def _make_columns(count: int):
     def store_columns(typing_context, array, row, last, values):
         """Write one vector of doubles for each column to rows ``row`` to ``row + 8`` of a float32 table.
 
-        Rows from ``last`` on are left alone.
+        Rows from ``last`` on are not written.
         """
 
         def emit(context, builder, sig, args):
@@ -163,10 +163,10 @@ def _make_columns(count: int):
 
 
 def _interleave(builder, columns: list):
-    """One long vector of the first lanes of all (eight-lane) columns, then of their second lanes, ..."""
+    """One long vector: the first lanes of all (eight-lane) columns, then their second lanes, and so on."""
     lines = columns[0]
     for column in columns[1:]:
-        # A shuffle takes two vectors of one length.
+        # A shuffle needs two vectors of the same length.
         lanes = range(lines.type.count)
         padding = [DOUBLES] * (lines.type.count - DOUBLES)
         column = builder.shuffle_vector(column, column, indices([*range(DOUBLES), *padding]))
@@ -192,7 +192,7 @@ def store_boxes(typing_context, array, row, values):
 
 
 def _transpose(builder, vectors: list):
-    """Transpose 16 vectors; of eight, transpose the two 8 x 8 matrices that their halves make."""
+    """Transpose 16 vectors; with eight vectors, transpose the two 8 x 8 matrices of their halves."""
     distance = len(vectors) // 2
     while distance > 0:
         low = [i if not i & distance else LANES + i - distance for i in range(LANES)]
@@ -208,7 +208,7 @@ def _transpose(builder, vectors: list):
 
 @intrinsic
 def gather_lines(typing_context, array, rows, index):
-    """The rows of 16 floats that ``rows[index]`` and the 15 numbers after it name: a vector a column."""
+    """The 16 rows of 16 floats given by ``rows[index]`` and the next 15 indices, one vector per column."""
 
     def emit(context, builder, sig, args):
         lines = []

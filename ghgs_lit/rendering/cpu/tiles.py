@@ -1,7 +1,7 @@
-"""What drawing a tile and differentiating it share: its pixels, and one splat over a block of them.
+"""Parts of drawing a tile that the forward and the backward pass share.
 
-A tile is 16 x 16 pixels in 16 blocks of 4 x 4, one block a vector. Small splats are the rule (a splat
-for each input pixel), and a 4 x 4 block holds one better than a row of 16.
+A tile is 16 x 16 pixels in 16 blocks of 4 x 4; a block is one vector. Most splats are small (there is one for
+each input pixel), and a small splat fits into a 4 x 4 block better than into a row of 16.
 
 The planes of a tile are its colour channels, then the sum of ``w z``, then the sum of ``w``.
 """
@@ -15,7 +15,7 @@ from ghgs_lit.rendering.cpu import layout
 LANES = simd.LANES
 BLOCKS = layout.PIXELS // LANES
 ZERO, ONE = np.float32(0), np.float32(1)
-# Gradients of the expected depth end where alpha does: its denominator is held at this.
+# Smallest denominator of the expected depth; for smaller alphas depth has no gradient in alpha.
 LEAST_ALPHA = np.float32(1e-10)
 
 
@@ -32,7 +32,7 @@ def grid():
 
 @helper
 def place(tile, tiles_x, tiles_y, height, width):
-    """View of a tile, its first column and row, the image's rows and columns in it, its first pixel."""
+    """View of a tile, its first column and row, its rows and columns inside the image, its first pixel."""
     view, inner = tile // (tiles_x * tiles_y), tile % (tiles_x * tiles_y)
     y0, x0 = inner // tiles_x * layout.TILE, inner % tiles_x * layout.TILE
     rows, columns = min(layout.TILE, height - y0), min(layout.TILE, width - x0)
@@ -41,16 +41,12 @@ def place(tile, tiles_x, tiles_y, height, width):
 
 @helper
 def open_pixels(view, x0, y0, pixels, transmittance):
-    """Set T to 1 in the pixels of a tile that are wanted, else 0; returns their blocks."""
+    """Set the transmittance to 1 in the pixels of a tile that are drawn, else to 0; returns their blocks."""
     live = 0
-    left, right = (
-        simd.full(np.float32(view[layout.LEFT] - x0)),
-        simd.full(np.float32(view[layout.RIGHT] - x0)),
-    )
-    top, bottom = (
-        simd.full(np.float32(view[layout.TOP] - y0)),
-        simd.full(np.float32(view[layout.BOTTOM] - y0)),
-    )
+    left = simd.full(np.float32(view[layout.LEFT] - x0))
+    right = simd.full(np.float32(view[layout.RIGHT] - x0))
+    top = simd.full(np.float32(view[layout.TOP] - y0))
+    bottom = simd.full(np.float32(view[layout.BOTTOM] - y0))
     for block in range(BLOCKS):
         at = block * LANES
         x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
@@ -62,8 +58,8 @@ def open_pixels(view, x0, y0, pixels, transmittance):
 
 
 @helper
-def splat(record, x0, y0):
-    """The way from a splat's centre to the tile's first pixel, then ``K``, opacity and cutoff."""
+def read_splat(record, x0, y0):
+    """Vector from a splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff."""
     return (
         x0 - record[layout.COLUMN] + record[layout.REST_X],
         y0 - record[layout.ROW] + record[layout.REST_Y],
@@ -85,7 +81,7 @@ def color(records, s, colors, n, c, count):
 
 @helper
 def prefetch(records, s, colors, n):
-    """Ask for what drawing splat ``s``, Gaussian ``n``, needs: a tile's splats may lie anywhere in memory."""
+    """Prefetch splat ``s``, which is Gaussian ``n``: the splats of a tile may lie anywhere in memory."""
     memory.prefetch(records, s * layout.RECORD)
     if colors.shape[1] > layout.ROOM:
         memory.prefetch(colors, n * colors.shape[1])
@@ -93,22 +89,22 @@ def prefetch(records, s, colors, n):
 
 @helper
 def whiten(numbers, dx, dy):
-    """Whitened distances ``p``, ``q``."""
+    """Whitened coordinates ``p`` and ``q`` of the vector (dx, dy) from a splat's centre."""
     return numbers[2] * dx, simd.fma(numbers[3], dx, numbers[4] * dy)
 
 
 @helper
 def blend(numbers, p, q, before, alpha_max, stop):
-    """One splat over one block of pixels.
+    """One splat over one block of pixels with transmittance ``before``.
 
-    Returns the unclamped and the clamped alpha, the lanes that the splat reaches, those where it is
-    seen, those that stay open, and T behind it. Where T would fall to ``stop`` the splat is left out
-    and T becomes 0, which stops all that follow. Lanes are masked by zeros and stored whole: what was
-    written under a mask cannot be forwarded to the next splat's load.
+    Returns the unclamped and the clamped alpha; the lanes that the splat reaches, those where it is seen and
+    those that stay open; and the transmittance behind it. Where that would fall to ``stop``, the splat is
+    left out and the transmittance becomes 0, which also excludes all splats behind. Vectors are stored
+    whole, with zeros in masked lanes: a masked store could not be forwarded to the next splat's load.
     """
     squared = simd.fma(p, p, q * q)
     reached = squared <= numbers[6]
-    # Lanes out of reach are held at the cutoff: denormals there would be slow.
+    # Lanes out of reach are clamped to the cutoff, since denormal numbers there would be slow.
     raw = numbers[5] * simd.exp2_minus(simd.minimum(squared, numbers[6]))
     alpha = simd.select(reached, simd.minimum(raw, alpha_max), ZERO)
     behind = before - before * alpha

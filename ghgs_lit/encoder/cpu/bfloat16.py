@@ -1,4 +1,7 @@
-"""Numbers as 32-bit words: one float32, or two neighbouring bfloat16, the first in the lower half."""
+"""Numbers as 32-bit words: one float32, or two neighbouring bfloat16 with the first in the lower half.
+
+Numba has no bfloat16, so arrays of bfloat16 are int32 arrays here.
+"""
 
 import numpy as np
 from llvmlite import ir
@@ -11,7 +14,7 @@ from ghgs_lit.kernels.simd import I32, LANES, aligned, floats
 
 
 class _BFloat(ir.Type):
-    """LLVM's ``bfloat``, which llvmlite does not name."""
+    """LLVM's type ``bfloat``, which llvmlite does not define."""
 
     def __str__(self) -> str:
         return "bfloat"
@@ -26,25 +29,25 @@ class _BFloat(ir.Type):
 PAIRS = ir.VectorType(_BFloat(), LANES * 2)
 
 
-def halves(array) -> bool:
-    """Whether an array's type holds pairs of bfloat16."""
+def holds_pairs(array) -> bool:
+    """Whether an array of this Numba type holds pairs of bfloat16."""
     return array.dtype == types.int32
 
 
 def per_word(array):
-    """Numbers in one word of an array: 1 or 2, known to the compiler."""
+    """Numbers in one word of an array: 1 or 2, a constant for the compiler."""
 
 
 @overload(per_word)
 def _per_word(array):
-    count = 2 if halves(array) else 1
+    count = 2 if holds_pairs(array) else 1
     return lambda array: count
 
 
 @intrinsic
 def store_numbers(typing_context, array, index, value):
-    """Write 16 floats to the words from ``index`` on: as they are, or rounded to bfloat16 in eight words."""
-    half = halves(array)
+    """Write 16 floats from word ``index`` on: as 16 words, or rounded to bfloat16 as eight words."""
+    half = holds_pairs(array)
 
     def emit(context, builder, sig, args):
         vector = args[2]
@@ -77,20 +80,23 @@ def _pair_rows(rows, line, column, packed, at):
 
 
 def aligned_words(array, count):
-    """``count`` words of the array's kind whose memory starts on a cache line."""
+    """``count`` words of the array's type whose memory starts on a cache line."""
 
 
 @overload(aligned_words)
 def _aligned_words(array, count):
-    if halves(array):
+    if holds_pairs(array):
         return lambda array, count: aligned(count).view(np.int32)
     return lambda array, count: aligned(count)
 
 
 def pack_line(rows, line, column, packed, at):
-    """``PANEL`` columns of one row, or of two rows paired, to ``packed[at:]``; zeros behind the last row."""
+    """Copy ``PANEL`` columns of one row (bfloat16: of two rows, paired) to ``packed[at:]``.
+
+    Rows after the last are zero.
+    """
 
 
 @overload(pack_line)
 def _pack_line(rows, line, column, packed, at):
-    return _pair_rows if halves(rows) else _copy_row
+    return _pair_rows if holds_pairs(rows) else _copy_row
