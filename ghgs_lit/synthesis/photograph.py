@@ -13,11 +13,13 @@ them a pixel, on a regular grid. Conventions: see :mod:`ghgs_lit.types`.
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
+from ghgs_lit.synthesis.people.meshing import vertex_normals
 from ghgs_lit.types import Cameras
 
 # Rays traced at once: what fits the processor's cache is three times as fast as a whole photograph.
@@ -95,24 +97,9 @@ class Photographs:
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit vertex normals [n, 3]: area-weighted over the faces that touch the same position.
-
-    Vertices that a UV seam splits share one normal. Zero where the faces around cancel.
-    """
-    _, weld = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
-    weld = weld.reshape(-1)
-    corners = vertices[faces].astype(np.float64)
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    index = weld[faces].T.reshape(-1)
-    total = np.stack(
-        [np.bincount(index, np.tile(areas[:, k], 3), minlength=weld.max() + 1) for k in range(3)], -1
-    )
-    return _unit(total)[weld].astype(np.float32)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1), 0)
+    """Unit vertex normals [n, 3] float32; vertices at one position (where a UV seam splits them) share one."""
+    first, merged = trimesh.grouping.unique_rows(vertices, digits=6)
+    return vertex_normals(vertices[first].astype(np.float64), merged[faces])[merged].astype(np.float32)
 
 
 def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
@@ -176,8 +163,7 @@ class Studio:
             [0.0 if p.alpha_cutoff is None else p.alpha_cutoff for p in parts], np.float32
         )
         corners = self._vertices[self._faces].astype(np.float64)
-        sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._face_normals = _unit(sides).astype(np.float32)
+        self._face_normals = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
         self._scene = EmbreeScene(robust=True)
         TriangleMesh(self._scene, self._vertices, self._faces)
 
@@ -292,9 +278,10 @@ class Studio:
             index = np.flatnonzero(part == k)
             colors[index] = self._textured(k, face[index], weights[index])[:, :3]
         flat = self._face_normals[face]
-        normals = _unit(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
+        smooth = trimesh.unitize(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
+        cancelled = np.square(smooth).sum(-1, keepdims=True) < 0.5
+        normals = np.where(cancelled, flat, smooth)
         # Both are turned to the camera by the side of the face that is seen.
-        normals = np.where((normals != 0).any(-1, keepdims=True), normals, flat)
         behind = np.einsum("nc,nc->n", flat, directions) > 0
         normals = np.where(behind[:, None], -normals, normals)
         return colors * self.lights.shade(normals)[:, None]

@@ -1,6 +1,7 @@
 """Operations on triangle and quad meshes: normals, subdivision, smoothing, clipping, rasterising UV."""
 
 import numpy as np
+import trimesh
 from scipy import sparse
 from scipy.ndimage import distance_transform_edt
 
@@ -11,14 +12,9 @@ def triangles(quads: np.ndarray) -> np.ndarray:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals [n, 3], faces weighted by area; vertices of no face get (0, 1, 0)."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    total = np.empty_like(vertices)
-    for axis in range(3):
-        total[:, axis] = np.bincount(faces.ravel(), np.repeat(normals[:, axis], 3), minlength=len(vertices))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
+    """Unit normals [n, 3], the mean of the faces around each vertex weighted by area; 0 where they cancel."""
+    double_areas = trimesh.triangles.cross(vertices[faces])  # their length is what weights them
+    return trimesh.geometry.mean_vertex_normals(len(vertices), faces, double_areas)
 
 
 def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
