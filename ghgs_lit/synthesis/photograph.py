@@ -97,7 +97,7 @@ class Photographs:
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit vertex normals [n, 3] float32; vertices at one position (where a UV seam splits them) share one."""
+    """Unit vertex normals [n, 3] float32; vertices that a UV seam splits at one position share one."""
     first, merged = trimesh.grouping.unique_rows(vertices, digits=6)
     return vertex_normals(vertices[first].astype(np.float64), merged[faces])[merged].astype(np.float32)
 

@@ -70,11 +70,11 @@ def pose_figure(body: BodyModel, coefficients: np.ndarray, rng: np.random.Genera
     rest, joints = body.rest(coefficients)
     faces = triangles(body.surfaces["body"].quads)
     for attempt in range(TRIES):
-        pose = sample_pose(body, joints, rng, widen=attempt / (TRIES - 1))
-        posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], pose.transforms)
+        transforms = sample_pose(body, joints, rng, widen=attempt / (TRIES - 1))
+        posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], transforms)
         if arm_depth(posed, faces) < 0.012:
             break
-    return Figure(rest, joints, faces, pose.transforms, posed)
+    return Figure(rest, joints, faces, transforms, posed)
 
 
 def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
