@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.people import Person, TexturedMesh, generate
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, bone_transforms, load_body, skin
+from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.generate import arm_depth, pose_figure
 from ghgs_lit.synthesis.people.meshing import (
     clip,
@@ -19,7 +20,7 @@ from ghgs_lit.synthesis.people.meshing import (
     vertex_normals,
 )
 from ghgs_lit.synthesis.people.noise import Noise
-from ghgs_lit.synthesis.people.surface import CROTCH, chart
+from ghgs_lit.synthesis.people.place import CROTCH
 
 MEGABYTE = 2**20
 

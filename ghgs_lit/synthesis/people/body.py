@@ -16,10 +16,14 @@ BODY_VERTICES = 13380  # the skin comes first; then eyes and the helper surfaces
 
 @dataclass(frozen=True)
 class Surface:
-    """A quad mesh of the base mesh: vertex numbers [m, 4], its own UV numbers [m, 4]."""
+    """Quads of the base mesh: indices of vertices [m, 4] and of points in the UV layout [m, 4]."""
 
     quads: np.ndarray
     uv_quads: np.ndarray
+
+    def __getitem__(self, chosen: np.ndarray) -> "Surface":
+        """The quads where the mask `chosen` [m] is true."""
+        return Surface(self.quads[chosen], self.uv_quads[chosen])
 
 
 @dataclass(frozen=True)

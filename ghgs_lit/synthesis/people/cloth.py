@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.fabric import Fabric, paint, print_emblem
 from ghgs_lit.synthesis.people.garments import ANKLE, neckline
 from ghgs_lit.synthesis.people.noise import Noise, smoothstep
 from ghgs_lit.synthesis.people.outfit import Bottom, Shoes, Top
-from ghgs_lit.synthesis.people.surface import Place, chart
+from ghgs_lit.synthesis.people.place import Place
 
 
 def _line(distance: np.ndarray, width: float) -> np.ndarray:

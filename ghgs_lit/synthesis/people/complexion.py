@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ghgs_lit.synthesis.people.body import load_body
+from ghgs_lit.synthesis.people.charts import Chart, chart
 from ghgs_lit.synthesis.people.noise import Noise, smoothstep
 from ghgs_lit.synthesis.people.outfit import Shoes
-from ghgs_lit.synthesis.people.surface import EYE, Chart, chart, face_frame, hairline
+from ghgs_lit.synthesis.people.place import EYE, face_frame, hairline
 
 SKINS = (
     (0.92, 0.75, 0.65), (0.88, 0.69, 0.57), (0.83, 0.64, 0.50), (0.72, 0.52, 0.38), (0.56, 0.38, 0.27),

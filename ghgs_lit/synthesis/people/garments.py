@@ -7,10 +7,11 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body, skin
+from ghgs_lit.synthesis.people.charts import Chart, chart
 from ghgs_lit.synthesis.people.meshing import vertex_normals
 from ghgs_lit.synthesis.people.noise import Noise, smoothstep
 from ghgs_lit.synthesis.people.outfit import Bottom, Shoes, Top
-from ghgs_lit.synthesis.people.surface import CROTCH, Chart, Place, chart
+from ghgs_lit.synthesis.people.place import CROTCH, Place
 
 ANKLE = 0.120  # where the surface that trousers are cut from is still whole, metres
 SOLE = 0.013  # thickness of a sole, metres
@@ -91,7 +92,7 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     """Posed points of the upper chart for a top."""
     piece = chart("upper")
     place = piece.place
-    points = piece.operator @ figure.rest
+    points = piece.interpolation @ figure.rest
     sleeve_end = smoothstep(top.sleeve - 0.20, top.sleeve, place.sleeve) * (top.kind != "tank")
     flare = {"tee": 0.012, "shirt": 0.007, "jacket": 0.006}.get(top.kind, 0.0) if top.sleeve < 0.4 else -0.004
     ease = top.ease + flare * sleeve_end * place.arm
@@ -102,7 +103,7 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     else:  # over what is worn below
         low = max(1.02, top.hem + 0.03)
         ease = np.maximum(ease, 0.0145 * (1 - smoothstep(low, low + 0.06, place.y)))
-    points = points + (ease + folds)[:, None] * vertex_normals(points, piece.vertex_faces)
+    points = points + (ease + folds)[:, None] * vertex_normals(points, piece.point_faces)
     points = _hang(points, place, top.hang * smoothstep(0.985, 1.03, place.y) if top.tucked else top.hang)
     return _pose(figure, piece, points, np.minimum(0.4 * ease + 0.002, ease + 0.001))
 
@@ -112,7 +113,7 @@ def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
     piece = chart("upper")
     below = neckline(piece.place, top.neck)
     lift = 0.004 + 0.006 * smoothstep(0.0, 0.03, below)
-    points = posed + lift[:, None] * vertex_normals(posed, piece.vertex_faces)
+    points = posed + lift[:, None] * vertex_normals(posed, piece.point_faces)
     depth = 0.036 + 0.022 * np.exp(-(((np.abs(piece.place.x) - 0.045) / 0.022) ** 2)) * (piece.place.z > 0.07)
     field = np.minimum(below, depth - below)
     return points, np.minimum(field, piece.place.y - 1.33)
@@ -174,7 +175,7 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     """Posed points of the lower chart for trousers or shorts."""
     piece = chart("lower")
     place = piece.place
-    points = piece.operator @ figure.rest
+    points = piece.interpolation @ figure.rest
     tight = bottom.kind == "leggings"
     waist = smoothstep(bottom.waist - 0.10, bottom.waist, place.y)
     ease = 0.003 if tight else 0.0085 - 0.003 * waist
@@ -183,7 +184,7 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     creases = 0.0015 + 0.005 * _bump(place.y, 0.50, 0.09) + 0.005 * _bump(place.y, 0.19, 0.05)
     crotch = 0.004 * _bump(place.y, 0.80, 0.08)
     folds = (0.25 if tight else 1.0) * (creases * bends * (place.y < 0.95) + crotch * slant)
-    points = points + (ease + folds)[:, None] * vertex_normals(points, piece.vertex_faces)
+    points = points + (ease + folds)[:, None] * vertex_normals(points, piece.point_faces)
     if not tight:
         points = _widen_legs(figure, points, place, bottom, folds)
     drop = max(ANKLE - bottom.hem, 0.0)  # the helper surface ends at the ankle; the hem falls on the shoe
@@ -222,7 +223,7 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
     """Posed points of the skirt chart: flared towards the hem, in folds."""
     piece = chart("skirt")
     place = piece.place
-    points = piece.operator @ figure.rest
+    points = piece.interpolation @ figure.rest
     down = np.clip(0.93 - place.y, 0.0, 0.8)
     axis = points[:, [0, 2]].mean(0)
     offset = points[:, [0, 2]] - axis
@@ -233,7 +234,7 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
     slim = 1 - 0.35 * (1 - bottom.width / 0.55) * smoothstep(0.0, 0.5, down)
     grown = 1 + bottom.width * down + folds
     points[:, [0, 2]] = axis + offset * (slim * grown)[:, None]
-    points = points + 0.010 * vertex_normals(points, piece.vertex_faces)
+    points = points + 0.010 * vertex_normals(points, piece.point_faces)
     return _pose(figure, piece, points, np.full(len(points), 0.006))
 
 
@@ -241,8 +242,8 @@ def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
     """Posed points of the shoe chart: rounded toes, a flat sole below the foot."""
     piece = chart("shoes")
     place = piece.place
-    points = piece.operator @ figure.rest
-    normals = vertex_normals(points, piece.vertex_faces)
+    points = piece.interpolation @ figure.rest
+    normals = vertex_normals(points, piece.point_faces)
     normals[:, 1] *= 0.6
     points = points + 0.008 * normals
     toe = smoothstep(0.16, 0.26, place.z) * smoothstep(0.02, 0.06, place.y + 0.02)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis.people import garments
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, load_body, skin
+from ghgs_lit.synthesis.people.charts import Chart, chart
 from ghgs_lit.synthesis.people.cloth import bottom_texture, shoe_texture, top_texture
 from ghgs_lit.synthesis.people.complexion import (
     Complexion,
@@ -23,9 +24,9 @@ from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 from ghgs_lit.synthesis.people.meshing import triangles, vertex_normals
 from ghgs_lit.synthesis.people.noise import Noise
 from ghgs_lit.synthesis.people.outfit import Outfit, sample_outfit
+from ghgs_lit.synthesis.people.place import Place
 from ghgs_lit.synthesis.people.pose import sample_pose
 from ghgs_lit.synthesis.people.shading import shade, spheres
-from ghgs_lit.synthesis.people.surface import Chart, Place, chart
 
 Spheres = tuple[np.ndarray, np.ndarray]
 HIDDEN = 0.03  # skin and inner layers this far inside an outer garment are left out, metres
@@ -148,14 +149,14 @@ def naked_part(
     parts = []
     for name, texture in textures.items():
         piece = chart(name)
-        points = skin(piece.operator @ figure.rest, piece.weights, figure.transforms)
+        points = skin(piece.interpolation @ figure.rest, piece.weights, figure.transforms)
         field = np.ones(len(points))
         if name != "eyes":
             texture = piece.shaded(texture, shade(piece, points, balls))
         if name == "skin":
             field = bare_field(piece.place, outfit)
             under = np.clip(HIDDEN - field, 0.0, HIDDEN)  # what clothes cover keeps clear of them
-            points = points - 0.12 * under[:, None] * vertex_normals(points, piece.vertex_faces)
+            points = points - 0.12 * under[:, None] * vertex_normals(points, piece.point_faces)
         parts.append(piece.mesh(points, field, texture))
     return join(parts)
 

@@ -7,13 +7,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body, skin
+from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.complexion import Complexion
 from ghgs_lit.synthesis.people.fabric import Fabric, paint
 from ghgs_lit.synthesis.people.garments import Figure, push_out
 from ghgs_lit.synthesis.people.mesh import TexturedMesh
 from ghgs_lit.synthesis.people.meshing import triangles, vertex_normals
 from ghgs_lit.synthesis.people.noise import smoothstep
-from ghgs_lit.synthesis.people.surface import chart, face_frame, hairline
+from ghgs_lit.synthesis.people.place import face_frame, hairline
 
 STYLES = ("bald", "crop", "short", "quiff", "afro", "bob", "long", "tail", "bun")
 SHARES = {  # by sex (True: female), in the order of the styles
@@ -71,8 +72,8 @@ def _shell(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
     piece = chart("scalp")
     point = piece.place.point
     above = hairline(point)
-    points = piece.operator @ figure.rest
-    normals = vertex_normals(points, piece.vertex_faces)
+    points = piece.interpolation @ figure.rest
+    normals = vertex_normals(points, piece.point_faces)
     for _ in range(6):
         normals = piece.smooth @ normals
     centred = point - [0.0, 1.585, 0.105]
@@ -180,7 +181,7 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
     """Centre [3] of the cranium, its size against the average one, its radius along directions [..., 3]."""
     piece = chart("head")
     upper = piece.place.y > 1.50
-    head, mean = (piece.operator @ figure.rest)[upper], piece.place.point[upper]
+    head, mean = (piece.interpolation @ figure.rest)[upper], piece.place.point[upper]
     scale = np.ptp(head[:, 1]) / np.ptp(mean[:, 1])
     centre = head.mean(0) + (np.array([0.0, 1.575, 0.100]) - mean.mean(0)) * scale
     radii = np.linalg.norm(head - centre, axis=1)
@@ -202,13 +203,13 @@ def _face(height: np.ndarray) -> np.ndarray:
 def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
     """A knitted cap down to the ears, its brim turned up."""
     piece = chart("scalp")
-    points = piece.operator @ figure.rest
+    points = piece.interpolation @ figure.rest
     for _ in range(12):
         points = piece.smooth @ points
     at = face_frame(piece.place.point)
     above = at[:, 1] - 1.610 - 0.30 * (at[:, 2] - 0.2)
     height = 0.019 + 0.006 * (1 - smoothstep(0.040, 0.046, above)) + 0.010 * smoothstep(0.03, 0.1, above)
-    points = points + height[:, None] * vertex_normals(points, piece.vertex_faces)
+    points = points + height[:, None] * vertex_normals(points, piece.point_faces)
     texel = face_frame(piece.texel_place.point)
     azimuth = np.arctan2(texel[:, 0], texel[:, 2] - 0.105)
     rise = texel[:, 1] - 1.610 - 0.30 * (texel[:, 2] - 0.2)

@@ -45,9 +45,9 @@ class _Skeleton:
     joints: np.ndarray
     rotations: np.ndarray
 
-    def rest(self, *bones: str) -> list[np.ndarray]:
-        """Joints [3] of the named bones at rest."""
-        return [self.joints[self.body.bone(bone)] for bone in bones]
+    def rest(self, *bones: str, end: str = "") -> np.ndarray:
+        """Joints [k, 3] of k named bones at rest; `end` is added to every name."""
+        return self.joints[[self.body.bone(bone + end) for bone in bones]]
 
     def rotate(self, bone: str, rotation: np.ndarray) -> None:
         """Set the rotation [3, 3] of a bone."""
@@ -102,13 +102,10 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
         twist *= 0.5
     pelvis = Rotation.from_euler("zxy", [tilt, 0.35 * lean, 0.25 * twist], degrees=True).as_matrix()
     local[body.bone("root")] = pelvis
-    for name in SPINE:
-        share = [side / 5, 0.65 * lean / 5, 0.75 * twist / 5]
-        local[body.bone(name)] = Rotation.from_euler("zxy", share, degrees=True).as_matrix()
     nod, turn, roll = rng.uniform(-9, 9) - 0.6 * lean, rng.uniform(-30, 30) - 0.5 * twist, rng.uniform(-6, 6)
-    for name in NECK:
-        share = [roll / 4, nod / 4, turn / 4]
-        local[body.bone(name)] = Rotation.from_euler("zxy", share, degrees=True).as_matrix()
+    for names, angles in ((SPINE, (side, 0.65 * lean, 0.75 * twist)), (NECK, (roll, nod, turn))):
+        share = Rotation.from_euler("zxy", np.array(angles) / len(names), degrees=True).as_matrix()
+        local[[body.bone(name) for name in names]] = share
     return pelvis
 
 
@@ -162,7 +159,7 @@ def _pose_arm(
     for name, weight in (("clavicle", 0.6), ("shoulder01", 1.0)):
         skeleton.rotate(name + end, chest @ _fraction(chest.T @ girdle, weight))
 
-    shoulder, elbow_at, wrist = skeleton.rest("upperarm01" + end, "lowerarm01" + end, "wrist" + end)
+    shoulder, elbow_at, wrist = skeleton.rest("upperarm01", "lowerarm01", "wrist", end=end)
     hinge_rest = np.cross(elbow_at - shoulder, wrist - elbow_at)
     hinge = np.cross(upper, lower)
     full = _frame(upper, hinge) @ _frame(elbow_at - shoulder, hinge_rest).T
@@ -180,18 +177,18 @@ def _pose_hand(
     skeleton: _Skeleton, end: str, hand: np.ndarray, curl: float, rng: np.random.Generator
 ) -> None:
     """Bend the wrist a little and curl the fingers by `curl` radians."""
-    index, little = skeleton.rest("finger2-1" + end, "finger5-1" + end)
+    index, little = skeleton.rest("finger2-1", "finger5-1", end=end)
     across = (index - little) / np.linalg.norm(index - little)
     rest_curl = 0.0
     for finger in FINGERS:
-        one, two, three = skeleton.rest(*(f"{finger}-{i}{end}" for i in (1, 2, 3)))
+        one, two, three = skeleton.rest(*(f"{finger}-{i}" for i in (1, 2, 3)), end=end)
         rest_curl += np.cross(across, two - one) @ (three - two)
     across *= np.sign(rest_curl)
     hand = hand @ Rotation.from_rotvec(across * rng.uniform(-0.2, 0.2)).as_matrix()
     skeleton.rotations[_descendants(skeleton.body, "wrist" + end)] = hand
     along = {}
     for finger in (*FINGERS, "finger1"):
-        one, two = skeleton.rest(f"{finger}-1{end}", f"{finger}-2{end}")
+        one, two = skeleton.rest(f"{finger}-1", f"{finger}-2", end=end)
         along[finger] = (two - one) / np.linalg.norm(two - one)
     middle = np.mean([along[finger] for finger in FINGERS], 0)
     close = rng.uniform(0.2, 0.9)  # the hand at rest is spread
@@ -214,9 +211,7 @@ def _pose_legs(
     feet = _feet(skeleton, stance, stride, rng)
     ankles, hips, lengths = [], [], []
     for end, (across, forward, yaw, heel) in zip((".L", ".R"), feet, strict=True):
-        hip, knee, ankle, toes = skeleton.rest(
-            *(name + end for name in ("upperleg01", "lowerleg01", "foot", "toe2-1"))
-        )
+        hip, knee, ankle, toes = skeleton.rest("upperleg01", "lowerleg01", "foot", "toe2-1", end=end)
         turn = Rotation.from_euler("y", yaw, degrees=True).as_matrix()
         lifted = turn @ Rotation.from_euler("x", heel, degrees=True).as_matrix()
         ball = np.array([across, toes[1], forward]) + turn @ [0, 0, toes[2] - ankle[2]]
@@ -279,7 +274,7 @@ def _solve_leg(
     out = toward - (toward @ line) * line
     knee = hip + thigh * (np.cos(angle) * line + np.sin(angle) * out / np.linalg.norm(out))
     hinge = np.cross(toward, line)
-    rest = skeleton.rest("upperleg01" + end, "lowerleg01" + end, "foot" + end)
+    rest = skeleton.rest("upperleg01", "lowerleg01", "foot", end=end)
     axis = np.array([1.0, 0, 0])  # of the knees at rest
     upper = _frame(knee - hip, hinge) @ _frame(rest[1] - rest[0], axis).T
     lower = _frame(ankle - knee, hinge) @ _frame(rest[2] - rest[1], axis).T

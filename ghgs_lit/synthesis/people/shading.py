@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
+from ghgs_lit.synthesis.people.charts import Chart
 from ghgs_lit.synthesis.people.garments import Figure
 from ghgs_lit.synthesis.people.meshing import vertex_normals
-from ghgs_lit.synthesis.people.surface import Chart
 
 CHAINS = (  # from joint, to joint, spheres
     ("upperleg01", "lowerleg01", 6), ("lowerleg01", "foot", 6), ("foot", "toe2-1", 2),
@@ -64,7 +64,7 @@ def surroundings(
 
 def shade(piece: Chart, points: np.ndarray, balls: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Factor [g] on the colours of a chart whose posed points [g, 3] are among the spheres `balls`."""
-    normals = vertex_normals(points, piece.vertex_faces)
+    normals = vertex_normals(points, piece.point_faces)
     smooth = points
     for _ in range(5):
         smooth = piece.smooth @ smooth
