@@ -55,7 +55,7 @@ class Chart:
     texel_shares: np.ndarray
 
     def image(self, colours: np.ndarray) -> np.ndarray:
-        """Texture [h, w, 3] uint8 of colours [k, 3] in [0, 1] of the covered texels; others copy the nearest."""
+        """Texture [h, w, 3] uint8 of colours [k, 3] (0 to 1) of covered texels; others copy the nearest."""
         return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)[self.nearest].reshape(*self.shape, 3)
 
     def shaded(self, texture: np.ndarray, factor: np.ndarray) -> np.ndarray:

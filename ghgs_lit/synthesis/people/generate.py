@@ -63,7 +63,11 @@ def generate(seed: int, index: int) -> Person:
         parts.append(make_beanie(figure, outfit.beanie))
     parts = [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
     turn = Rotation.from_euler("y", pose_rng.uniform(-YAW, YAW), degrees=True).as_matrix()
-    return _on_the_ground(f"person_{seed}_{index:04d}", parts, figure.posed, turn)
+    ground = min(float(part.vertices[:, 1].min()) for part in parts)
+    middle = 0.5 * (figure.posed.min(0) + figure.posed.max(0))
+    origin = np.array([middle[0], ground, middle[2]])
+    person = Person(f"person_{seed}_{index:04d}", tuple(parts), figure.posed)
+    return person.mapped(lambda vertices: (vertices - origin) @ turn.T)
 
 
 def pose_figure(body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator) -> Figure:
@@ -185,19 +189,3 @@ def bare_field(place: Place, outfit: Outfit) -> np.ndarray:
         bottom = np.minimum(bottom, place.y - outfit.bottom.hem - 0.12)
     covered = np.maximum(covered, bottom)
     return HIDDEN - covered
-
-
-def _on_the_ground(name: str, parts: list[TexturedMesh], naked: np.ndarray, turn: np.ndarray) -> Person:
-    """Turn about y, centre in x and z, put the lowest point on y = 0."""
-    low = min(float(part.vertices[:, 1].min()) for part in parts)
-    middle = 0.5 * (naked.min(0) + naked.max(0))
-    shift = np.array([-middle[0], -low, -middle[2]])
-
-    def place(points: np.ndarray) -> np.ndarray:
-        return ((points.astype(np.float64) + shift) @ turn.T).astype(np.float32)
-
-    moved = tuple(
-        TexturedMesh(place(part.vertices), part.faces, part.uv, part.texture, part.alpha_cutoff)
-        for part in parts
-    )
-    return Person(name, moved, place(naked))

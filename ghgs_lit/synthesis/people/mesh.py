@@ -1,9 +1,10 @@
-"""Meshes with a texture, and people made of them: what the photographer takes pictures of.
+"""Textured meshes and people made of them: what is photographed.
 
 Metres, y up, feet on y = 0, facing +z up to a yaw about y. Built-in people and scans use the same two types.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,18 +52,28 @@ class Person:
     """A dressed, posed person.
 
     Attributes:
-        name: names the person in files and tables.
-        parts: body, hair, clothes: drawn together.
-        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts, or None: unknown.
+        name: in files and tables.
+        parts: body, hair, clothes.
+        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts; None: unknown.
     """
 
     name: str
     parts: tuple[TexturedMesh, ...]
     body_vertices: np.ndarray | None
 
+    def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Person":
+        """The person with ``function`` applied to all vertices [n, 3], in float64, of parts and body."""
+
+        def move(vertices: np.ndarray) -> np.ndarray:
+            return function(vertices.astype(np.float64)).astype(np.float32)
+
+        parts = tuple(replace(part, vertices=move(part.vertices)) for part in self.parts)
+        body = None if self.body_vertices is None else move(self.body_vertices)
+        return replace(self, parts=parts, body_vertices=body)
+
 
 def _expect(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
-    """Raise unless `array` has `shape`, None standing for any length."""
+    """Raise unless `array` has `shape`, in which None means any length."""
     if array.ndim != len(shape) or any(s not in (None, a) for s, a in zip(shape, array.shape, strict=True)):
         wanted = ", ".join("n" if s is None else str(s) for s in shape)
         raise InputError(f"{name}: expected [{wanted}], found {list(array.shape)}")
