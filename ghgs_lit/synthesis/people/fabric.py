@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ghgs_lit.synthesis.people.noise import Noise, smoothstep
+from ghgs_lit.synthesis.people.blending import mix, smoothstep
+from ghgs_lit.synthesis.people.noise import Noise
 
 PATTERNS = {
     "plain": 5.0, "melange": 2.0, "knit": 1.5, "stripes": 2.5, "pinstripes": 1.0, "checks": 2.0,
@@ -72,9 +73,8 @@ def paint(fabric: Fabric, across: np.ndarray, along: np.ndarray) -> np.ndarray:
     soft = 0.0012 / fabric.scale
     coarse = fabric.noise(across / 0.9, along / 0.9)
     fine = fabric.fine(across / 0.16, along / 0.16)
-    mix, third = _pattern(fabric.pattern, u, v, along, soft, coarse, fabric)
-    colour = one + (two - one) * mix[:, None]
-    colour = colour + (three - colour) * third[:, None]
+    second, third = _pattern(fabric.pattern, u, v, along, soft, coarse, fabric)
+    colour = mix(mix(one, second, two), third, three)
     shade = 1 + fabric.grain * fine + 0.025 * coarse
     if fabric.pattern == "knit":
         ribs = np.sin(2 * np.pi * across / 0.016) * (0.75 + 0.25 * np.sin(2 * np.pi * along / 0.013))
@@ -151,7 +151,7 @@ def print_emblem(
         mask = (1 - _edge(radius, 1, soft)) * _edge(_wave(radius * rng.uniform(1.6, 3.2)), 0.45, 4 * soft)
     else:
         mask = _glyphs(u, v, 2 if kind == "number" else int(rng.integers(3, 6)), soft, rng)
-    return colour + (ink - colour) * (0.94 * mask)[:, None]
+    return mix(colour, 0.94 * mask, ink)
 
 
 def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.random.Generator) -> np.ndarray:

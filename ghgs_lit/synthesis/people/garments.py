@@ -6,10 +6,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from ghgs_lit.synthesis.people.blending import bump, smoothstep
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body, skin
 from ghgs_lit.synthesis.people.charts import Chart, chart
 from ghgs_lit.synthesis.people.meshing import vertex_normals
-from ghgs_lit.synthesis.people.noise import Noise, smoothstep
+from ghgs_lit.synthesis.people.noise import Noise
 from ghgs_lit.synthesis.people.outfit import Bottom, Shoes, Top
 from ghgs_lit.synthesis.people.place import CROTCH, Place
 
@@ -99,7 +100,7 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     folds = _wrinkles(place, noise, top)
     if top.tucked:  # flat under the waistband, slack above it
         out = smoothstep(0.985, 1.03, place.y)
-        ease, folds = out * (ease + 0.008 * _bump(place.y, 1.05, 0.03)) + 0.001 * (1 - out), out * folds
+        ease, folds = out * (ease + 0.008 * bump(place.y, 1.05, 0.03)) + 0.001 * (1 - out), out * folds
     else:  # over what is worn below
         low = max(1.02, top.hem + 0.03)
         ease = np.maximum(ease, 0.0145 * (1 - smoothstep(low, low + 0.06, place.y)))
@@ -114,7 +115,7 @@ def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
     below = neckline(piece.place, top.neck)
     lift = 0.004 + 0.006 * smoothstep(0.0, 0.03, below)
     points = posed + lift[:, None] * vertex_normals(posed, piece.point_faces)
-    depth = 0.036 + 0.022 * np.exp(-(((np.abs(piece.place.x) - 0.045) / 0.022) ** 2)) * (piece.place.z > 0.07)
+    depth = 0.036 + 0.022 * bump(np.abs(piece.place.x), 0.045, 0.022) * (piece.place.z > 0.07)
     field = np.minimum(below, depth - below)
     return points, np.minimum(field, piece.place.y - 1.33)
 
@@ -126,17 +127,10 @@ def _wrinkles(place: Place, noise: Noise, top: Top) -> np.ndarray:
     bends = noise(around / 0.9 + 0.31, np.where(place.arm > 0.5, place.sleeve, place.y) / 0.42)
     slant = noise(place.x / 0.8 + place.y / 0.7, (place.y - 0.6 * np.abs(place.x)) / 0.55)
     elbow = place.arm * (
-        0.0022 + 0.0042 * _bump(place.sleeve, 0.25, 0.10) + 0.004 * _bump(place.sleeve, 0.44, 0.06)
+        0.0022 + 0.0042 * bump(place.sleeve, 0.25, 0.10) + 0.004 * bump(place.sleeve, 0.44, 0.06)
     )
-    waist = (1 - place.arm) * (
-        0.0016 + 0.0045 * _bump(place.y, 1.0, 0.10) + 0.002 * _bump(place.y, 1.25, 0.08)
-    )
+    waist = (1 - place.arm) * (0.0016 + 0.0045 * bump(place.y, 1.0, 0.10) + 0.002 * bump(place.y, 1.25, 0.08))
     return loose * (elbow * bends + waist * slant)
-
-
-def _bump(x: np.ndarray, centre: float, width: float) -> np.ndarray:
-    """1 at `centre`, 0 beyond two widths."""
-    return np.exp(-(((x - centre) / width) ** 2))
 
 
 def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.ndarray:
@@ -181,8 +175,8 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
     ease = 0.003 if tight else 0.0085 - 0.003 * waist
     bends = noise(place.leg_angle * 0.07 / 0.9, place.y / 0.45)
     slant = noise(place.x / 0.7, (place.y + 0.7 * np.abs(place.x)) / 0.5)
-    creases = 0.0015 + 0.005 * _bump(place.y, 0.50, 0.09) + 0.005 * _bump(place.y, 0.19, 0.05)
-    crotch = 0.004 * _bump(place.y, 0.80, 0.08)
+    creases = 0.0015 + 0.005 * bump(place.y, 0.50, 0.09) + 0.005 * bump(place.y, 0.19, 0.05)
+    crotch = 0.004 * bump(place.y, 0.80, 0.08)
     folds = (0.25 if tight else 1.0) * (creases * bends * (place.y < 0.95) + crotch * slant)
     points = points + (ease + folds)[:, None] * vertex_normals(points, piece.point_faces)
     if not tight:

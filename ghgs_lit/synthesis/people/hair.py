@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ghgs_lit.synthesis.people.blending import bump, smoothstep
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body, skin
 from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.complexion import Complexion
@@ -13,7 +14,6 @@ from ghgs_lit.synthesis.people.fabric import Fabric, paint
 from ghgs_lit.synthesis.people.garments import Figure, push_out
 from ghgs_lit.synthesis.people.mesh import TexturedMesh
 from ghgs_lit.synthesis.people.meshing import triangles, vertex_normals
-from ghgs_lit.synthesis.people.noise import smoothstep
 from ghgs_lit.synthesis.people.place import face_frame, hairline
 
 STYLES = ("bald", "crop", "short", "quiff", "afro", "bob", "long", "tail", "bun")
@@ -213,9 +213,7 @@ def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
     texel = face_frame(piece.texel_place.point)
     azimuth = np.arctan2(texel[:, 0], texel[:, 2] - 0.105)
     rise = texel[:, 1] - 1.610 - 0.30 * (texel[:, 2] - 0.2)
-    colour = (
-        paint(fabric, azimuth * 0.09, rise) * (1 - 0.35 * np.exp(-(((rise - 0.043) / 0.004) ** 2)))[:, None]
-    )
+    colour = paint(fabric, azimuth * 0.09, rise) * (1 - 0.35 * bump(rise, 0.043, 0.004))[:, None]
     return piece.mesh(skin(points, piece.weights, figure.transforms), above, piece.image(colour))
 
 

@@ -30,9 +30,3 @@ class Noise:
         upper = a + (field[row + k] - a) * fx
         lower = b + (field[below + k] - b) * fx
         return upper + (lower - upper) * fy
-
-
-def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 below `low`, 1 above `high`, smooth between."""
-    t = np.clip((x - low) / (high - low), 0.0, 1.0)
-    return t * t * (3 - 2 * t)

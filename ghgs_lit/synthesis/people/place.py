@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ghgs_lit.synthesis.people.blending import smoothstep
 from ghgs_lit.synthesis.people.body import load_body
-from ghgs_lit.synthesis.people.noise import smoothstep
 
 CROTCH = 0.766  # height of the average body's crotch, metres
 EYE = np.array([0.0288, 1.5661, 0.1909])  # centre of the left eye in the frame that faces are described in
