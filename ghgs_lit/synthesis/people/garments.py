@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, map_coordinates
 from scipy.spatial import cKDTree
 
 from ghgs_lit.synthesis.people.blending import bump, smoothstep
@@ -152,12 +152,8 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
     for below in range(1, rows):
         grid[below] = np.maximum(grid[below], grid[below - 1] - fall)
     grid = gaussian_filter1d(gaussian_filter1d(grid, 1.2, axis=1, mode="wrap"), 1.0, axis=0, mode="nearest")
-    i, j = np.minimum(row.astype(int), rows - 2), column.astype(int) % columns
-    fi, fj = row - i, column - np.floor(column)
-    k = (j + 1) % columns
-    hung = (grid[i, j] * (1 - fj) + grid[i, k] * fj) * (1 - fi) + (
-        grid[i + 1, j] * (1 - fj) + grid[i + 1, k] * fj
-    ) * fi
+    grid = np.concatenate([grid, grid[:, :1]], 1)  # the last column is the first
+    hung = map_coordinates(grid, [row, column], order=1, mode="nearest")
     gain = np.clip(hung - radius, 0.0, 0.06) * share * (1 - smoothstep(0.05, 0.4, place.arm))
     gain *= smoothstep(0.0, 3.0, row)
     moved = points.copy()

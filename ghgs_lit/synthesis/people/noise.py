@@ -18,7 +18,7 @@ class Noise:
         self.field = (field / field.std()).astype(np.float32)
 
     def __call__(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear values (float32) at `u`, `v` in periods, any shape."""
+        """Bilinear values at `u`, `v` in periods, any shape; by hand in float32, faster than SciPy."""
         x = np.asarray(u, np.float32) * np.float32(self.size)
         y = np.asarray(v, np.float32) * np.float32(self.size)
         left, top = np.floor(x), np.floor(y)
