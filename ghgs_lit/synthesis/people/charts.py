@@ -15,7 +15,7 @@ from ghgs_lit.synthesis.people.mesh import TexturedMesh
 from ghgs_lit.synthesis.people.meshing import clip, neighbour_mean, rasterise, subdivide, triangles
 from ghgs_lit.synthesis.people.place import Place, hairline, locate
 
-FEET_UV = 0.9068  # in the UV layout of the helper garment the feet lie below
+FEET_UV = 0.9068  # v coordinate below which the helper garment's UV layout shows the feet
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Chart:
         return np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)[self.nearest].reshape(*self.shape, 3)
 
     def shaded(self, texture: np.ndarray, factor: np.ndarray) -> np.ndarray:
-        """A texture [h, w, 3] times a factor [g] of the points."""
+        """A texture [h, w, 3] times a factor [g] given at the points."""
         factor = factor.astype(np.float32)[self.texel_points]
         spread = np.einsum("kc,kc->k", factor, self.texel_shares)[self.nearest].reshape(*self.shape, 1)
         return np.rint(np.minimum(texture * spread, 255)).astype(np.uint8)
@@ -156,7 +156,7 @@ def _select(body: BodyModel, name: str) -> tuple[Surface, Sequence[float]]:
     if name in ("head", "skin"):
         uv = _cropped(body.uv, body.head_uv)
         inside = ((uv > 0) & (uv < 1)).all(1)[surface.uv_quads].all(1)
-        inside &= body.mean[surface.quads][..., 1].min(1) > 1.38  # in the UV layout fingers lie close by
+        inside &= body.mean[surface.quads][..., 1].min(1) > 1.38  # the box also holds fingers
         return (surface[inside], body.head_uv) if name == "head" else (surface[~inside], (0, 0, 1, 1))
     if name == "scalp":
         above = hairline(body.mean[: body.vertex_count])[surface.quads]

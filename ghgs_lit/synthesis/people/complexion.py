@@ -1,4 +1,4 @@
-"""Paint skin, face and eyes."""
+"""Colours of a person, and textures of head, skin and eyes."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,15 @@ IRISES = ((0.28, 0.17, 0.08), (0.20, 0.12, 0.06), (0.35, 0.45, 0.55), (0.33, 0.4
 
 @dataclass(frozen=True)
 class Complexion:
-    """Colours [3] of skin, lips, hair, irises; strength of beard, brows, make-up, freckles (about 0 to 1)."""
+    """The colours of a person.
+
+    Attributes:
+        skin, lips, hair, iris: [3] in [0, 1].
+        beard, brows, makeup, freckles: strengths, about 0 to 1.
+        beard_style: none, stubble, full, goatee or moustache.
+        noise: coarse noise.
+        fine: fine noise.
+    """
 
     skin: np.ndarray
     lips: np.ndarray
@@ -36,7 +44,7 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Complexion:
-    """Draw the colours of a person; dark skin goes with dark hair and eyes, age with grey."""
+    """Draw the colours of a person: with dark skin hair and eyes are dark, with age hair turns grey."""
     tone = rng.uniform(0, len(SKINS) - 1)
     skin = np.array([np.interp(tone, range(len(SKINS)), [s[i] for s in SKINS]) for i in range(3)])
     skin = np.clip(skin * (1 + rng.normal(0, 0.025, 3)), 0.08, 0.97)
@@ -87,13 +95,13 @@ def _blob(
 
 
 def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
-    """Mottled skin as a factor [k]."""
+    """Irregular tone of the skin as a factor [k]."""
     u, v = point[:, 0] + 0.5 * point[:, 2], point[:, 1] + 0.3 * point[:, 2]
     return 1 + 0.030 * look.noise(u / 0.45, v / 0.45) + 0.018 * look.fine(u / 0.12, v / 0.12)
 
 
 def head_texture(look: Complexion, scalp: float) -> np.ndarray:
-    """Texture [h, w, 3] of the head; `scalp` (0 to 1) is how much hair shows on the scalp."""
+    """Texture [h, w, 3] of the head; `scalp` (0 to 1) is how strongly hair covers the scalp."""
     piece = chart("head")
     point = face_frame(piece.texel_place.point)
     above = hairline(piece.texel_place.point)

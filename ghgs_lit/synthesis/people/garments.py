@@ -1,4 +1,4 @@
-"""Cut and drape clothes: where they end (fields on the average body), how far they stand off the body."""
+"""Shapes of garments: where they end (fields on the average body) and how they drape over a posed body."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,21 @@ from ghgs_lit.synthesis.people.noise import Noise
 from ghgs_lit.synthesis.people.outfit import Bottom, Shoes, Top
 from ghgs_lit.synthesis.people.place import CROTCH, Place
 
-ANKLE = 0.120  # where the surface that trousers are cut from is still whole, metres
+ANKLE = 0.120  # height above which the surface that trousers are cut from is complete, metres
 SOLE = 0.013  # thickness of a sole, metres
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A naked person: rest vertices [n, 3], joints [b, 3], faces of the skin, bone transforms, posed skin."""
+    """A naked person in a pose.
+
+    Attributes:
+        rest: [n, 3] vertices of the base mesh at rest, metres.
+        joints: [b, 3] at rest.
+        faces: [m, 3] triangles of the skin.
+        transforms: [b, 3, 4] of the bones from rest to pose.
+        posed: [BODY_VERTICES, 3] vertices of the skin in the pose.
+    """
 
     rest: np.ndarray
     joints: np.ndarray
@@ -29,11 +37,11 @@ class Figure:
     posed: np.ndarray
 
 
-# ---- where garments end: metres inside (positive) or outside (negative)
+# ---- where garments end: signed distance to the edge in metres, positive where there is cloth
 
 
 def neckline(place: Place, kind: str) -> np.ndarray:
-    """Positive below the neckline."""
+    """Field that is positive below the neckline."""
     back, slope, radius, rise = {
         "crew": (1.422, 0.50, 0.072, 0.03),
         "scoop": (1.410, 0.82, 0.088, 0.05),
@@ -51,7 +59,7 @@ def neckline(place: Place, kind: str) -> np.ndarray:
 
 
 def top_field(place: Place, top: Top) -> np.ndarray:
-    """Positive where the garment is."""
+    """Field that is positive where the garment is."""
     hem = place.y - top.hem + 2.0 * place.arm
     sleeve = top.sleeve - place.sleeve
     if top.kind == "tank":  # armholes run from the shoulder strap to under the arm
@@ -65,24 +73,31 @@ def top_field(place: Place, top: Top) -> np.ndarray:
 
 
 def bottom_field(place: Place, bottom: Bottom) -> np.ndarray:
-    """Positive where trousers or a skirt are."""
+    """Field that is positive where trousers or a skirt are."""
     hem = bottom.hem if bottom.kind == "skirt" else max(bottom.hem, ANKLE)
     return np.minimum(np.minimum(bottom.waist - place.y, place.y - hem), 0.5 - place.arm)
 
 
 def shoe_field(place: Place, shoes: Shoes) -> np.ndarray:
-    """Positive where shoes are: low in front of the ankle, higher at the heel."""
+    """Field that is positive where shoes are: low in front of the ankle, higher at the heel."""
     instep = smoothstep(0.06, 0.13, place.z)
     return shoes.top - place.y + 0.02 * instep + 0.008 * np.cos(place.leg_angle)
 
 
-# ---- how they stand off the body
+# ---- how they drape
 
 
 def push_out(
     points: np.ndarray, vertices: np.ndarray, normals: np.ndarray, clearance: np.ndarray
 ) -> np.ndarray:
-    """Move points [g, 3] along the nearest vertex's normal until `clearance` [g] outside the body."""
+    """Move points outwards until they keep a distance from the body.
+
+    Args:
+        points: [g, 3].
+        vertices: [n, 3] of the body.
+        normals: [n, 3] of the body, unit.
+        clearance: [g] distance to keep along the normal of the nearest vertex, metres.
+    """
     _, index = cKDTree(vertices).query(points)
     height = np.einsum("gi,gi->g", points - vertices[index], normals[index])
     lack = np.clip(clearance - height, 0.0, 0.04)
@@ -90,7 +105,7 @@ def push_out(
 
 
 def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
-    """Posed points of the upper chart for a top."""
+    """Posed points [g, 3] of the upper chart for a top."""
     piece = chart("upper")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -98,10 +113,10 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
     flare = {"tee": 0.012, "shirt": 0.007, "jacket": 0.006}.get(top.kind, 0.0) if top.sleeve < 0.4 else -0.004
     ease = top.ease + flare * sleeve_end * place.arm
     folds = _wrinkles(place, noise, top)
-    if top.tucked:  # flat under the waistband, slack above it
+    if top.tucked:  # flat below the waistband, loose above it
         out = smoothstep(0.985, 1.03, place.y)
         ease, folds = out * (ease + 0.008 * bump(place.y, 1.05, 0.03)) + 0.001 * (1 - out), out * folds
-    else:  # over what is worn below
+    else:  # over the waistband of trousers or skirt
         low = max(1.02, top.hem + 0.03)
         ease = np.maximum(ease, 0.0145 * (1 - smoothstep(low, low + 0.06, place.y)))
     points = points + (ease + folds)[:, None] * vertex_normals(points, piece.point_faces)
@@ -110,7 +125,7 @@ def drape_top(figure: Figure, top: Top, noise: Noise) -> np.ndarray:
 
 
 def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
-    """A collar turned down over its shirt: posed points of the upper chart, and where it ends."""
+    """A collar folded down over its shirt: posed points [g, 3] of the upper chart, and its field [g]."""
     piece = chart("upper")
     below = neckline(piece.place, top.neck)
     lift = 0.004 + 0.006 * smoothstep(0.0, 0.03, below)
@@ -121,7 +136,7 @@ def fold_collar(posed: np.ndarray, top: Top) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _wrinkles(place: Place, noise: Noise, top: Top) -> np.ndarray:
-    """Folds of a top: across the sleeve at the elbow, slanting at waist and armpit."""
+    """Height [g] of the folds of a top in metres: across the sleeve at the elbow, slanted at the waist."""
     loose = 0.5 + 30.0 * top.ease
     around = np.where(place.arm > 0.5, place.arm_angle * 0.05, place.trunk_angle * 0.15)
     bends = noise(around / 0.9 + 0.31, np.where(place.arm > 0.5, place.sleeve, place.y) / 0.42)
@@ -134,7 +149,7 @@ def _wrinkles(place: Place, noise: Noise, top: Top) -> np.ndarray:
 
 
 def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.ndarray:
-    """Let cloth fall from chest, shoulder blades and belly instead of following every hollow below them."""
+    """Let a share (0 to 1) of the cloth hang from chest, shoulder blades and belly over the hollows below."""
     trunk = place.arm < 0.3
     axis = np.array([0.0, np.median(points[trunk, 2])])
     offset = points[:, [0, 2]] - axis
@@ -148,7 +163,7 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
     grid = np.zeros(rows * columns)
     np.maximum.at(grid, cell[chosen], radius[chosen])
     grid = grid.reshape(rows, columns)
-    fall = (top - bottom) / rows * 0.10  # it draws in by 10 cm a metre
+    fall = (top - bottom) / rows * 0.10  # it narrows by 10 cm per metre
     for below in range(1, rows):
         grid[below] = np.maximum(grid[below], grid[below - 1] - fall)
     grid = gaussian_filter1d(gaussian_filter1d(grid, 1.2, axis=1, mode="wrap"), 1.0, axis=0, mode="nearest")
@@ -162,7 +177,7 @@ def _hang(points: np.ndarray, place: Place, share: np.ndarray | float) -> np.nda
 
 
 def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
-    """Posed points of the lower chart for trousers or shorts."""
+    """Posed points [g, 3] of the lower chart for trousers or shorts."""
     piece = chart("lower")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -179,14 +194,14 @@ def drape_trousers(figure: Figure, bottom: Bottom, noise: Noise) -> np.ndarray:
         points = _widen_legs(figure, points, place, bottom, folds)
     drop = max(ANKLE - bottom.hem, 0.0)  # the helper surface ends at the ankle; the hem falls on the shoe
     points[:, 1] -= drop * (1 - smoothstep(ANKLE, 0.24, place.y))
-    clearance = np.where(place.y < 0.15, -1.0, 0.002)  # the hem need not keep off the foot
+    clearance = np.where(place.y < 0.15, -1.0, 0.002)  # the hem may touch the foot
     return _pose(figure, piece, points, clearance)
 
 
 def _widen_legs(
     figure: Figure, points: np.ndarray, place: Place, bottom: Bottom, folds: np.ndarray
 ) -> np.ndarray:
-    """Give each leg the radius of the cut, where wider than the body: a straight tube from the thigh."""
+    """Widen each leg to the radius of its cut: a straight tube from the thigh to the hem."""
     joints = [figure.joints[i] for i in _leg_bones()]
     moved = points.copy()
     for side in (1.0, -1.0):
@@ -210,7 +225,7 @@ def _leg_bones() -> list[int]:
 
 
 def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Posed points of the skirt chart: flared towards the hem, in folds."""
+    """Posed points [g, 3] of the skirt chart: flared towards the hem, with folds."""
     piece = chart("skirt")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -229,7 +244,7 @@ def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Gen
 
 
 def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
-    """Posed points of the shoe chart: rounded toes, a flat sole below the foot."""
+    """Posed points [g, 3] of the shoe chart: rounded toes, a flat sole below the foot."""
     piece = chart("shoes")
     place = piece.place
     points = piece.interpolation @ figure.rest
@@ -246,9 +261,9 @@ def shape_shoes(figure: Figure, shoes: Shoes) -> np.ndarray:
 
 
 def _pose(figure: Figure, piece: Chart, points: np.ndarray, clearance: np.ndarray) -> np.ndarray:
-    """Skin a garment and move it out of the body, at rest and in the pose."""
-    naked = figure.rest[:BODY_VERTICES]
-    points = push_out(points, naked, vertex_normals(naked, figure.faces), clearance)
+    """Pose a garment by its skinning weights; move it out of the body before and after."""
+    bare = figure.rest[:BODY_VERTICES]
+    points = push_out(points, bare, vertex_normals(bare, figure.faces), clearance)
     posed = skin(points, piece.weights, figure.transforms)
     posed = push_out(posed, figure.posed, vertex_normals(figure.posed, figure.faces), clearance)
     return piece.smooth @ posed

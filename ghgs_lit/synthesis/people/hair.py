@@ -1,4 +1,4 @@
-"""Hair: a shell over the scalp, a curtain that falls from it, a tail or a bun."""
+"""Hair (a shell over the scalp, a curtain that falls from it, a ponytail, a bun) and knitted caps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,14 @@ ROWS, COLUMNS = 56, 80
 
 @dataclass(frozen=True)
 class Haircut:
-    """`thickness` of the shell (metres), height where a curtain ends on the average body, `wave` (0 to 1)."""
+    """A haircut.
+
+    Attributes:
+        style: one of `STYLES`.
+        thickness: of the shell in metres.
+        end: height on the average body where a curtain ends, metres.
+        wave: how wavy the strands are, 0 to 1.
+    """
 
     style: str
     thickness: float
@@ -46,7 +53,7 @@ def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:
 
 
 def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Parts of the hair in the pose; none for a bald head."""
+    """Meshes of the hair in the pose; none for a bald head."""
     if cut.style == "bald":
         return []
     if cut.style in ("bob", "long"):
@@ -130,7 +137,7 @@ def _grid_mesh(
 
 
 def _hanging_weights(heights: np.ndarray, neck: float) -> np.ndarray:
-    """Skinning weights [n, b] of hair at rest heights [n]: the head's above the neck, then the chest's."""
+    """Skinning weights [n, b] of hair at rest heights [n]: above the neck the head's, below the chest's."""
     body = load_body()
     weights = np.zeros((len(heights), len(body.bone_names)))
     chest = smoothstep(neck, neck - 0.16, heights)
@@ -149,7 +156,7 @@ def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
 
 
 def _curtain(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
-    """Hair that leaves the crown in all directions, frames the face and falls behind and beside the neck."""
+    """Hair that grows from the crown in all directions and falls behind and beside the neck."""
     centre, scale, radius_at = _skull(figure)
     columns = np.linspace(-1, 1, COLUMNS)
     half = ROWS // 2
@@ -196,7 +203,7 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
 
 
 def _face(height: np.ndarray) -> np.ndarray:
-    """Half of the angle, in degrees, that hair leaves to the face at heights of the average head."""
+    """Half of the angle in degrees around the face without hair, at heights of the average head."""
     return np.interp(height, [1.44, 1.552, 1.572, 1.600, 1.622, 1.634, 1.64], [98, 84, 74, 60, 42, 12, 0.5])
 
 
@@ -218,13 +225,13 @@ def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
 
 
 def under_hat(cut: Haircut) -> Haircut:
-    """The haircut as a hat leaves it: flat on the scalp."""
+    """The haircut below a hat: flat on the scalp."""
     style = cut.style if cut.style in ("bald", "bob", "long") else "crop"
     return Haircut(style, min(cut.thickness, 0.007), cut.end, cut.wave)
 
 
 def _tail(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:
-    """A pony tail or a bun: a tube of rings behind the crown."""
+    """A ponytail or a bun: a tube of rings behind the crown."""
     body = load_body()
     skull = body.mean[:BODY_VERTICES]
     anchor = int(np.argmin(np.linalg.norm(skull - [0.0, rng.uniform(1.57, 1.64), 0.0], axis=1)))

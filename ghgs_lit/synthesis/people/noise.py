@@ -1,12 +1,16 @@
-"""Smooth random textures that repeat without a seam."""
+"""Smooth random fields that repeat without a seam."""
 
 import numpy as np
 
 
 class Noise:
-    """A periodic field [size, size] with zero mean, unit variance and a power spectrum of 1 / f^(2 slope).
+    """A periodic field with zero mean, unit variance and a power spectrum of 1 / f^(2 slope).
 
-    `fineness` is the lowest number of waves per period.
+    Args:
+        rng: random numbers.
+        slope: the larger, the smoother.
+        fineness: lowest number of waves per period.
+        size: side of the square grid.
     """
 
     def __init__(self, rng: np.random.Generator, slope: float = 1.2, fineness: float = 2.0, size: int = 256):

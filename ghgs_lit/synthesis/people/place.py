@@ -16,14 +16,16 @@ EYE = np.array([0.0288, 1.5661, 0.1909])  # centre of the left eye in the frame 
 
 @dataclass(frozen=True)
 class Place:
-    """Points on the average body at rest, n of them, float32.
+    """Coordinates of n points on the average body at rest, float32.
 
     Attributes:
         point: [n, 3] metres.
-        arm: [n] 0 on the trunk, 1 on an arm.
+        arm: [n] 0 on the trunk, 1 on an arm, smooth between.
         sleeve: [n] metres from the shoulder joint along the arm; at most 0 on the trunk.
         side: [n] +1 left, -1 right.
-        trunk_angle, arm_angle, leg_angle: [n] around the axis, 0 in front, positive outwards (trunk: left).
+        trunk_angle: [n] radians around the trunk, 0 in front, positive to the left.
+        arm_angle: [n] radians around the arm, 0 in front, positive outwards.
+        leg_angle: [n] radians around the leg, 0 in front, positive outwards.
     """
 
     point: np.ndarray
@@ -48,7 +50,7 @@ class Place:
 
 
 def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
-    """Place of points [n, 3] of the average body, given the skinning weight [n] of the arm bones."""
+    """Places of points [n, 3] of the average body, given their skinning weights [n] of the arm bones."""
     body = load_body()
     joints = body.mean[body.vertex_count :]
     side = np.where(point[:, 0] >= 0, 1.0, -1.0)
@@ -63,7 +65,7 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
     centre = np.stack(
         [np.interp(-folded[:, 1], [-j[1] for j in legs], [j[i] for j in legs]) for i in (0, 2)], 1
     )
-    # Above the legs each panel of a garment turns about its own half of the trunk.
+    # Above the legs the angle is taken around the middle of each half of the trunk.
     centre[:, 0] += smoothstep(CROTCH - 0.1, 0.95, folded[:, 1]) * (0.09 - centre[:, 0])
     leg_angle = np.arctan2(folded[:, 0] - centre[:, 0], folded[:, 2] - centre[:, 1])
     trunk_angle = np.arctan2(point[:, 0] / 1.45, point[:, 2] - 0.09)
@@ -72,7 +74,7 @@ def locate(point: np.ndarray, arm_weight: np.ndarray) -> Place:
 
 
 def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Length along a line of joints, and offset from it, of points [n, 3]; its ends go on straight."""
+    """Length [n] along a polyline of joints and offset [n, 3] from it; its ends are extended straight."""
     starts, steps = np.array(line[:-1]), np.diff(line, axis=0)  # [s, 3]
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / lengths[:, None]
@@ -87,7 +89,7 @@ def _along(points: np.ndarray, line: list[np.ndarray]) -> tuple[np.ndarray, np.n
 
 
 def face_frame(point: np.ndarray) -> np.ndarray:
-    """Points [n, 3] of the average head, moved up or down and to and fro so that the left eye is at `EYE`."""
+    """Points [n, 3] of the average head, moved in y and z so that the left eye is at `EYE`."""
     body = load_body()
     eyes = body.mean[np.unique(body.surfaces["eyes"].quads)]
     return point + (EYE - eyes[eyes[:, 0] > 0].mean(0)) * [0, 1, 1]

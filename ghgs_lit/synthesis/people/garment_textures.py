@@ -1,4 +1,4 @@
-"""Paint clothes: patterns on charts, seams, hems, pockets, buttons, belts, soles and laces."""
+"""Textures of garments: patterns, seams, hems, pockets, buttons, belts, soles and laces."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def _line(distance: np.ndarray, width: float) -> np.ndarray:
 
 
 def _folds(across: np.ndarray, along: np.ndarray, noise: Noise, strength: np.ndarray) -> np.ndarray:
-    """Light and dark of folds as a factor [k]: the hollows are darker."""
+    """Shading of folds as a factor [k]: hollows are darker."""
     height = noise(across / 0.95 + 0.13, along / 0.45)
     return 1 + strength * np.clip(0.8 * height, -1.2, 0.5)
 
@@ -55,7 +55,7 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
 
 
 def _trim(colour: np.ndarray, edge: np.ndarray, top: Top, rng: np.random.Generator) -> np.ndarray:
-    """Ribs or a stitched hem along every edge (metres from it)."""
+    """Ribs or a stitched hem along all edges; `edge` [k] is the distance to the nearest in metres."""
     if top.kind in ("tee", "tank"):
         if rng.random() < 0.25:
             colour = mix(colour, 1 - smoothstep(0.013, 0.015, edge), top.fabric.colours[1])
@@ -118,7 +118,7 @@ def _belt(colour: np.ndarray, band: np.ndarray, bottom: Bottom, place: Place) ->
 
 
 def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np.ndarray:
-    """Twill, worn at thigh and knee."""
+    """Twill, faded at thigh and knee."""
     twill = np.sin(2 * np.pi * (across + 0.6 * place.y) / 0.006)
     worn = bump(place.y, 0.62, 0.20) * smoothstep(1.5, 0.3, np.abs(place.leg_angle))
     worn = worn * np.clip(0.75 + 0.35 * noise(across / 0.5, place.y / 0.9), 0, 1.4)
@@ -134,7 +134,7 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
 
 
 def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
-    """Front pockets, patch pockets behind, the fly; in a contrasting thread on jeans."""
+    """Front pockets, patch pockets behind and the fly; jeans have stitches in a contrasting colour."""
     thread = np.array([0.72, 0.50, 0.25]) if bottom.kind == "jeans" else None
 
     def stitch(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -154,6 +154,7 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
 
 
 def _skirt_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
+    """Texture [h, w, 3] of a skirt."""
     piece = chart("skirt")
     place = piece.texel_place
     across = place.trunk_angle * 0.17
