@@ -18,8 +18,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
-from ghgs_lit.synthesis.people.meshing import vertex_normals
+from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh, sample_texture
+from ghgs_lit.synthesis.people.meshing import smooth_normals
 from ghgs_lit.types import Cameras
 
 # Rays traced at once: as many as fit the processor's cache, three times as fast as a whole photograph.
@@ -114,44 +114,6 @@ class Photographs:
     images: np.ndarray
     masks: np.ndarray
     depths: np.ndarray
-
-
-def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit vertex normals [n, 3] float32; vertices that a UV seam splits at one position share one."""
-    first, merged = trimesh.grouping.unique_rows(vertices, digits=6)
-    return vertex_normals(vertices[first].astype(np.float64), merged[faces])[merged].astype(np.float32)
-
-
-def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Sample a repeating texture bilinearly.
-
-    Colours of a texture with alpha are weighted by it, so that cut-away texels do not bleed into others.
-
-    Args:
-        texture: [h, w, c] uint8, c = 3 or 4.
-        uv: [n, 2], origin at the bottom left.
-
-    Returns:
-        [n, c] in [0, 1].
-    """
-    height, width, channels = texture.shape
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
-    columns = np.stack((left, left + 1)).astype(np.int64) % width
-    rows = np.stack((top, top + 1)).astype(np.int64) % height
-    texels = texture.reshape(-1, channels)
-    total = np.zeros((len(uv), channels), np.float32)
-    for i, wy in enumerate((1 - fy, fy)):
-        for j, wx in enumerate((1 - fx, fx)):
-            texel = texels[rows[i] * width + columns[j]].astype(np.float32) / 255
-            if channels == 4:
-                texel[:, :3] *= texel[:, 3:]
-            total += (wx * wy)[:, None] * texel
-    if channels == 4:
-        alpha = total[:, 3:]
-        total[:, :3] = np.where(alpha > 0, total[:, :3] / np.where(alpha > 0, alpha, 1), 0)
-    return total
 
 
 def _check_part(name: str, part: TexturedMesh) -> None:
@@ -250,7 +212,7 @@ class Studio:
         u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
         x = (u - matrix[0, 1] * y[:, None]) / matrix[0, 0]
         rays = np.stack((x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)), -1)
-        # [h, n, w, n] -> one row of n * n samples per pixel; rays have z = 1, so distance along them is depth.
+        # [h, n, w, n] -> one row of n * n samples per pixel. Rays have z = 1: their length is the depth.
         rays = rays.reshape(h, n, w, n, 3).transpose(0, 2, 1, 3, 4).reshape(-1, 3)
         directions = (rays @ pose[:3, :3]).astype(np.float32)
         origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)

@@ -72,6 +72,38 @@ class Person:
         return replace(self, parts=parts, body_vertices=body)
 
 
+def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Sample a repeating texture bilinearly.
+
+    Colours of a texture with alpha are weighted by it, so that cut-away texels do not bleed into others.
+
+    Args:
+        texture: [h, w, c] uint8, c = 3 or 4.
+        uv: [n, 2], origin at the bottom left.
+
+    Returns:
+        [n, c] in [0, 1].
+    """
+    height, width, channels = texture.shape
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    columns = np.stack((left, left + 1)).astype(np.int64) % width
+    rows = np.stack((top, top + 1)).astype(np.int64) % height
+    texels = texture.reshape(-1, channels)
+    total = np.zeros((len(uv), channels), np.float32)
+    for i, wy in enumerate((1 - fy, fy)):
+        for j, wx in enumerate((1 - fx, fx)):
+            texel = texels[rows[i] * width + columns[j]].astype(np.float32) / 255
+            if channels == 4:
+                texel[:, :3] *= texel[:, 3:]
+            total += (wx * wy)[:, None] * texel
+    if channels == 4:
+        alpha = total[:, 3:]
+        total[:, :3] = np.where(alpha > 0, total[:, :3] / np.where(alpha > 0, alpha, 1), 0)
+    return total
+
+
 def _expect(name: str, array: np.ndarray, shape: tuple[int | None, ...]) -> None:
     """Raise unless `array` has `shape`, in which None means any length."""
     if array.ndim != len(shape) or any(s not in (None, a) for s, a in zip(shape, array.shape, strict=True)):

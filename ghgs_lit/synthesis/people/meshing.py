@@ -17,6 +17,12 @@ def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return trimesh.geometry.mean_vertex_normals(len(vertices), faces, double_areas)
 
 
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit vertex normals [n, 3] float32; vertices that a UV seam splits at one position share one."""
+    first, merged = trimesh.grouping.unique_rows(vertices, digits=6)
+    return vertex_normals(vertices[first].astype(np.float64), merged[faces])[merged].astype(np.float32)
+
+
 def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Split each quad in four.
 
