@@ -1,30 +1,32 @@
 """Photographs of textured meshes: image, mask and metric depth from pinhole cameras.
 
-Rays are cast with Embree through every pixel of the subject's window, ``samples`` x ``samples`` of
-them a pixel, on a regular grid. Conventions: see :mod:`ghgs_lit.types`.
+Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the window in which the
+subject lies. Conventions: see :mod:`ghgs_lit.types`.
 
-* image: the mean colour of the samples, those that miss being black, so that a silhouette is
-  antialiased and premultiplied by its coverage (as an alpha-blended splat on black would be);
-* mask: at least half of the pixel's samples hit the subject;
-* depth: z of the hit nearest to the pixel's centre (of the centre itself when ``samples`` is odd),
-  0 outside the mask. Samples are never averaged, so that no depth lies between two surfaces.
+* image: the mean colour of the samples; samples that miss are black, so silhouettes are antialiased and
+  premultiplied by their coverage (like an alpha-blended splat on black);
+* mask: at least half of the samples of a pixel hit the subject;
+* depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd), 0 outside
+  the mask. Samples are never averaged, so that no depth lies between two surfaces.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
+from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh, sample_texture
+from ghgs_lit.synthesis.people.meshing import smooth_normals
 from ghgs_lit.types import Cameras
 
-# Rays traced at once: what fits the processor's cache is three times as fast as a whole photograph.
+# Rays traced at once: as many as fit the processor's cache, three times as fast as a whole photograph.
 _CHUNK = 1 << 14
-# Cut-away layers (strands of hair) that a ray may pass before it counts as a miss.
+# Cut-away layers (strands of hair) that a ray may pass; after more it counts as a miss.
 _MAX_LAYERS = 64
-# How far behind a cut-away hit the ray goes on, metres: beyond float32 error, below any real gap.
+# Where a ray continues behind a cut-away hit, metres: more than float32 error, less than any real gap.
 _STEP = 2e-5
 
 
@@ -32,9 +34,16 @@ _STEP = 2e-5
 class Lights:
     """White lights around a person; the same for every camera, so that views agree.
 
-    Shading is Lambertian with soft terminators: ``ambient + sum_l w_l max((n.l + s) / (1 + s), 0)``,
-    applied to texture values as stored. ``jitter`` varies strength and elevation per person; the
-    mean over all directions of the normal is about ``exposure``.
+    Shading is Lambertian with soft terminators, ``ambient + sum_l w_l max((n.l + s) / (1 + s), 0)``, and
+    multiplies texture values as stored.
+
+    Attributes:
+        count: number of lights.
+        ambient: share of the light that comes from everywhere, 0 to 1.
+        softness: s of the formula, 0 (Lambertian) to 1.
+        exposure: mean brightness over all directions of the normal, about.
+        elevation: largest elevation of a light in degrees.
+        jitter: how much the strengths of the lights differ, 0 to below 1.
     """
 
     count: int = 6
@@ -52,7 +61,7 @@ class Lights:
         require(0 <= self.jitter < 1, "lights.jitter", "at least 0 and below 1", self.jitter)
 
     def draw(self, rng: np.random.Generator) -> "LightRig":
-        """Lights of one person: ``count`` azimuths evenly apart, elevations within ± ``elevation``."""
+        """Draw the lights of one person: evenly spaced in azimuth, with random elevations and strengths."""
         azimuth = 2 * np.pi * (np.arange(self.count) + rng.uniform()) / self.count
         elevation = np.radians(self.elevation) * rng.uniform(-0.3, 1.0, self.count)
         strength = 1 + self.jitter * rng.uniform(-1, 1, self.count)
@@ -71,7 +80,14 @@ class Lights:
 
 @dataclass(frozen=True)
 class LightRig:
-    """Drawn lights: ``directions`` [L, 3] towards the lights, ``strengths`` [L]."""
+    """The lights of one person.
+
+    Attributes:
+        directions: [l, 3] unit vectors towards the lights.
+        strengths: [l].
+        ambient: brightness without any light.
+        softness: see :class:`Lights`.
+    """
 
     directions: np.ndarray
     strengths: np.ndarray
@@ -87,61 +103,21 @@ class LightRig:
 
 @dataclass(frozen=True)
 class Photographs:
-    """``images`` [n, h, w, 3] float32 in [0, 1], ``masks`` [n, h, w] bool, ``depths`` [n, h, w] metres."""
+    """Photographs from n cameras.
+
+    Attributes:
+        images: [n, h, w, 3] float32 in [0, 1].
+        masks: [n, h, w] bool.
+        depths: [n, h, w] float32, metres, 0 outside the mask.
+    """
 
     images: np.ndarray
     masks: np.ndarray
     depths: np.ndarray
 
 
-def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit vertex normals [n, 3]: area-weighted over the faces that touch the same position.
-
-    Vertices that a UV seam splits share one normal. Zero where the faces around cancel.
-    """
-    _, weld = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
-    weld = weld.reshape(-1)
-    corners = vertices[faces].astype(np.float64)
-    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    index = weld[faces].T.reshape(-1)
-    total = np.stack(
-        [np.bincount(index, np.tile(areas[:, k], 3), minlength=weld.max() + 1) for k in range(3)], -1
-    )
-    return _unit(total)[weld].astype(np.float32)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1), 0)
-
-
-def sample_texture(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Bilinear lookup [n, c] in [0, 1] at ``uv`` [n, 2] (origin bottom-left, repeating).
-
-    Colours of a texture with alpha are weighted by it: what is cut away does not bleed.
-    """
-    height, width, channels = texture.shape
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = (x - left).astype(np.float32), (y - top).astype(np.float32)
-    columns = np.stack((left, left + 1)).astype(np.int64) % width
-    rows = np.stack((top, top + 1)).astype(np.int64) % height
-    texels = texture.reshape(-1, channels)
-    total = np.zeros((len(uv), channels), np.float32)
-    for i, wy in enumerate((1 - fy, fy)):
-        for j, wx in enumerate((1 - fx, fx)):
-            texel = texels[rows[i] * width + columns[j]].astype(np.float32) / 255
-            if channels == 4:
-                texel[:, :3] *= texel[:, 3:]
-            total += (wx * wy)[:, None] * texel
-    if channels == 4:
-        alpha = total[:, 3:]
-        total[:, :3] = np.where(alpha > 0, total[:, :3] / np.where(alpha > 0, alpha, 1), 0)
-    return total
-
-
 def _check_part(name: str, part: TexturedMesh) -> None:
-    """Refuse what :class:`TexturedMesh` lets pass and Embree would take as garbage."""
+    """Refuse what :class:`TexturedMesh` does not check and Embree would render wrongly."""
     if part.texture.dtype != np.uint8:
         raise InputError(f"{name}: expected a texture of uint8; found {part.texture.dtype}")
     if not np.isfinite(part.vertices).all() or not np.isfinite(part.uv).all():
@@ -149,10 +125,18 @@ def _check_part(name: str, part: TexturedMesh) -> None:
 
 
 class Studio:
-    """A person under fixed lights, to be photographed from any number of cameras.
+    """A person under fixed lights, photographed from any number of cameras.
 
-    Surfaces are double-sided: the normal is turned to the camera. Faces whose texture has an alpha
-    below the part's ``alpha_cutoff`` let rays through.
+    Surfaces are double-sided: normals are flipped towards the camera. Rays pass through a surface where the
+    alpha of its texture is below the part's ``alpha_cutoff``.
+
+    Args:
+        person: whom to photograph.
+        lights: the lights.
+        samples: ``samples`` x ``samples`` rays per pixel, 1 to 16.
+
+    Raises:
+        InputError: no faces, values that are not finite, or a texture that is not uint8.
     """
 
     def __init__(self, person: Person, lights: LightRig, samples: int = 3) -> None:
@@ -176,13 +160,12 @@ class Studio:
             [0.0 if p.alpha_cutoff is None else p.alpha_cutoff for p in parts], np.float32
         )
         corners = self._vertices[self._faces].astype(np.float64)
-        sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._face_normals = _unit(sides).astype(np.float32)
+        self._face_normals = trimesh.unitize(trimesh.triangles.cross(corners)).astype(np.float32)
         self._scene = EmbreeScene(robust=True)
         TriangleMesh(self._scene, self._vertices, self._faces)
 
     def shoot(self, cameras: Cameras) -> Photographs:
-        """Photographs from ``cameras`` with one leading dimension.
+        """Take a photograph with each of ``cameras`` (one leading dimension).
 
         Raises:
             InputError: a camera is not finite or has no focal length.
@@ -209,7 +192,7 @@ class Studio:
     def _window(
         self, matrix: np.ndarray, pose: np.ndarray, height: int, width: int
     ) -> tuple[int, int, int, int]:
-        """Rows and columns (top, bottom, left, right) outside which no vertex projects."""
+        """The window (top, bottom, left, right) in pixels that all vertices project into."""
         points = self._vertices @ pose[:3, :3].T + pose[:3, 3]
         if points[:, 2].min() <= 1e-3:  # partly behind the camera: its projection has no bounds
             return 0, height, 0, width
@@ -223,13 +206,13 @@ class Studio:
     def _expose(
         self, matrix: np.ndarray, pose: np.ndarray, rows: slice, columns: slice
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image, mask and depth of a window."""
+        """Image [h, w, 3], mask [h, w] and depth [h, w] of a window."""
         n, h, w = self.samples, rows.stop - rows.start, columns.stop - columns.start
         y = (rows.start + (np.arange(h * n) + 0.5) / n - matrix[1, 2]) / matrix[1, 1]
         u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
         x = (u - matrix[0, 1] * y[:, None]) / matrix[0, 0]
         rays = np.stack((x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)), -1)
-        # [h, n, w, n] -> one row of n * n samples a pixel; z of the ray is 1, so its length is the depth.
+        # [h, n, w, n] -> one row of n * n samples per pixel. Rays have z = 1: their length is the depth.
         rays = rays.reshape(h, n, w, n, 3).transpose(0, 2, 1, 3, 4).reshape(-1, 3)
         directions = (rays @ pose[:3, :3]).astype(np.float32)
         origin = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
@@ -249,7 +232,7 @@ class Studio:
         return np.clip(image, 0, 1), mask, np.where(mask, center, 0)
 
     def _trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distance, face (-1: none) and barycentric weights [n, 3] of the first hit that is not cut away."""
+        """Distance [n], face [n] (-1: none) and barycentric weights [n, 3] of the first hit not cut away."""
         distance = np.zeros(len(directions), np.float32)
         face = np.full(len(directions), -1, np.int64)
         weights = np.zeros((len(directions), 3), np.float32)
@@ -270,7 +253,7 @@ class Studio:
         return distance, face, weights
 
     def _solid(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Whether hits lie on surface that is not cut away [n]."""
+        """Whether the surface is not cut away [n] at each hit."""
         solid = np.ones(len(face), bool)
         part = self._part[face]
         for k in np.flatnonzero(self._cutoff):
@@ -281,20 +264,22 @@ class Studio:
         return solid
 
     def _textured(self, part: int, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Texture values [n, c] at hits on one part."""
         uv = np.einsum("nk,nkc->nc", weights, self._uv[self._faces[face]])
         return sample_texture(self._textures[part], uv)
 
     def _shade(self, directions: np.ndarray, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Colours [n, 3] of hits seen along ``directions``."""
+        """Colours [n, 3] of hits seen along ``directions`` [n, 3]."""
         colors = np.empty((len(face), 3), np.float32)
         part = self._part[face]
         for k in np.unique(part):
             index = np.flatnonzero(part == k)
             colors[index] = self._textured(k, face[index], weights[index])[:, :3]
         flat = self._face_normals[face]
-        normals = _unit(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
-        # Both are turned to the camera by the side of the face that is seen.
-        normals = np.where((normals != 0).any(-1, keepdims=True), normals, flat)
+        smooth = trimesh.unitize(np.einsum("nk,nkc->nc", weights, self._normals[self._faces[face]]))
+        cancelled = np.square(smooth).sum(-1, keepdims=True) < 0.5
+        normals = np.where(cancelled, flat, smooth)
+        # The side of the face that is seen decides, so that smooth normals flip together with flat ones.
         behind = np.einsum("nc,nc->n", flat, directions) > 0
         normals = np.where(behind[:, None], -normals, normals)
         return colors * self.lights.shade(normals)[:, None]

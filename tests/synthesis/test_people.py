@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.people import Person, TexturedMesh, generate
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, bone_transforms, load_body, skin
+from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.generate import arm_depth, pose_figure
 from ghgs_lit.synthesis.people.meshing import (
     clip,
@@ -19,17 +20,19 @@ from ghgs_lit.synthesis.people.meshing import (
     vertex_normals,
 )
 from ghgs_lit.synthesis.people.noise import Noise
-from ghgs_lit.synthesis.people.surface import CROTCH, chart
+from ghgs_lit.synthesis.people.place import CROTCH
 
 MEGABYTE = 2**20
 
 
 @pytest.fixture(scope="module")
 def people() -> list[Person]:
+    """Six people of one family, for all tests of people."""
     return [generate(7, index) for index in range(6)]
 
 
 def _all_vertices(person: Person) -> np.ndarray:
+    """Vertices of all parts."""
     return np.concatenate([part.vertices for part in person.parts])
 
 
@@ -37,6 +40,7 @@ def _all_vertices(person: Person) -> np.ndarray:
 
 
 def test_asset_is_small_and_comes_with_its_licence():
+    """The package stays small, and the licence of the MakeHuman data is shipped with it."""
     assets = files("ghgs_lit.synthesis.people") / "assets"
     assert len((assets / "body.npz").read_bytes()) < 4 * MEGABYTE
     licence = (assets / "LICENSE").read_text()
@@ -45,6 +49,7 @@ def test_asset_is_small_and_comes_with_its_licence():
 
 
 def test_weights_sum_to_one_and_parents_come_first():
+    """Skinning weights that do not sum to 1 would scale the body; posing needs parents before children."""
     body = load_body()
     np.testing.assert_allclose(body.weights.sum(1), 1.0, atol=1e-9)
     assert (body.weights >= 0).all()
@@ -55,6 +60,7 @@ def test_weights_sum_to_one_and_parents_come_first():
 
 
 def test_identity_pose_is_the_rest_shape():
+    """A body that is not posed does not move."""
     body = load_body()
     rest, joints = body.rest(body.bodies[3])
     identity = np.tile(np.eye(3), (len(joints), 1, 1))
@@ -63,6 +69,7 @@ def test_identity_pose_is_the_rest_shape():
 
 
 def test_turning_every_bone_turns_the_whole_body():
+    """One rotation of all bones is a rigid motion: skinning neither bends nor shears."""
     body = load_body()
     rest, joints = body.rest(body.bodies[5])
     turn = Rotation.from_rotvec([0.3, -0.7, 0.2]).as_matrix()
@@ -72,6 +79,7 @@ def test_turning_every_bone_turns_the_whole_body():
 
 
 def test_bones_keep_their_length_and_joints_lie_inside():
+    """Posing neither stretches bones nor moves joints out of the body."""
     body = load_body()
     rng = np.random.default_rng(1)
     figure = pose_figure(body, body.sample_shape(rng)[0], rng)
@@ -85,6 +93,7 @@ def test_bones_keep_their_length_and_joints_lie_inside():
 
 
 def test_shapes_are_adults():
+    """Stored bodies have the heights of adults and differ in them."""
     body = load_body()
     heights = []
     for index in range(0, len(body.bodies), 8):
@@ -99,6 +108,7 @@ def test_shapes_are_adults():
 
 
 def test_same_numbers_same_person(people):
+    """The cache of rendered people relies on it: the same two numbers give the same arrays."""
     again = generate(7, 2)
     assert again.name == people[2].name
     np.testing.assert_array_equal(again.body_vertices, people[2].body_vertices)
@@ -110,6 +120,7 @@ def test_same_numbers_same_person(people):
 
 
 def test_no_two_alike(people):
+    """Other numbers give other shapes, poses and colours."""
     people = [*people, generate(8, 2)]
     assert len({person.name for person in people}) == len(people)
     for i, one in enumerate(people):
@@ -119,6 +130,7 @@ def test_no_two_alike(people):
 
 
 def test_stands_on_the_ground_near_the_origin(people):
+    """Camera rigs look at the origin: nobody floats, sinks into the ground or stands beside it."""
     for person in people:
         vertices = _all_vertices(person)
         assert vertices[:, 1].min() == pytest.approx(0.0, abs=1e-5)
@@ -130,6 +142,7 @@ def test_stands_on_the_ground_near_the_origin(people):
 
 
 def test_faces_forward_within_the_yaw(people):
+    """Feet point to +z, so that the first camera sees the front."""
     body = load_body()
     eyes = np.unique(body.surfaces["eyes"].quads)
     assert eyes.min() >= BODY_VERTICES
@@ -141,6 +154,7 @@ def test_faces_forward_within_the_yaw(people):
 
 
 def test_arrays_are_finite_and_in_their_types(people):
+    """What is rendered has the documented types and shapes, no NaN and no unused vertices."""
     for person in people:
         assert person.body_vertices.dtype == np.float32
         assert person.body_vertices.shape == (BODY_VERTICES, 3)
@@ -156,7 +170,7 @@ def test_arrays_are_finite_and_in_their_types(people):
 
 
 def test_normals_point_outwards(people):
-    """From most of the surface one step outwards leads away from the body's nearest joint axis."""
+    """Faces are wound outwards: most rays inwards hit the body, most rays outwards miss it."""
     import trimesh
 
     for person in people[:3]:
@@ -179,7 +193,7 @@ def test_normals_point_outwards(people):
 
 
 def test_clothes_cover_the_hips(people):
-    """Looking at the hips from 20 cm away one sees cloth (or a hand before it)."""
+    """No bare hips: rays from 20 cm away hit cloth (or a hand in front of it) before skin."""
     import trimesh
 
     body = load_body()
@@ -200,6 +214,7 @@ def test_clothes_cover_the_hips(people):
 
 
 def test_arms_stay_out_of_the_trunk():
+    """Poses whose arms cut into the trunk are drawn again."""
     body = load_body()
     faces = triangles(body.surfaces["body"].quads)
     depths = []
@@ -212,6 +227,7 @@ def test_arms_stay_out_of_the_trunk():
 
 
 def test_negative_numbers_are_refused():
+    """The message names the number that is wrong."""
     with pytest.raises(InputError, match="seed"):
         generate(-1, 0)
     with pytest.raises(InputError, match="index"):
@@ -219,6 +235,7 @@ def test_negative_numbers_are_refused():
 
 
 def test_textured_mesh_refuses_other_shapes():
+    """Arrays that do not fit together are refused when the mesh is made, not when it is rendered."""
     square = {
         "vertices": np.zeros((4, 3), np.float32),
         "faces": np.array([[0, 1, 2], [0, 2, 3]]),
@@ -238,6 +255,7 @@ def test_textured_mesh_refuses_other_shapes():
 
 
 def test_clip_keeps_the_area_on_its_side():
+    """Garments are cut where their field is zero: both sides make up the area, no face is flipped."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
     index = np.arange(81).reshape(9, 9)
@@ -259,6 +277,7 @@ def test_clip_keeps_the_area_on_its_side():
 
 
 def test_subdivision_and_smoothing_keep_a_plane():
+    """Finer charts keep the outline and stay flat where the base mesh is flat."""
     quads = np.array([[0, 1, 4, 3], [1, 2, 5, 4]])
     points = np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1.0]])
     operator, fine = subdivide(quads, 6)
@@ -273,6 +292,7 @@ def test_subdivision_and_smoothing_keep_a_plane():
 
 
 def test_rasterise_finds_the_place_of_texels():
+    """Each texel is painted for the place that it is seen at, not for one half a texel away."""
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     texels, face, bary, nearest = rasterise(uv, faces, 6, 4)
@@ -284,14 +304,21 @@ def test_rasterise_finds_the_place_of_texels():
 
 
 def test_normals_of_a_sphere():
+    """Clothes are moved along normals: they have unit length, point outwards and weight faces by area."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=3)
     normals = vertex_normals(np.asarray(sphere.vertices), np.asarray(sphere.faces))
     assert (np.einsum("ni,ni->n", normals, sphere.vertices) > 0.999).all()
+    roof = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 3.0]]
+    )  # faces of areas 1/2 and 3/2 at right angles
+    normals = vertex_normals(roof, np.array([[0, 1, 2], [0, 3, 1]]))
+    np.testing.assert_allclose(normals[:2], np.tile(np.array([0, 3, 1]) / np.sqrt(10), (2, 1)))
 
 
 def test_noise_has_no_seam_and_unit_variance():
+    """Patterns repeat without a visible seam and keep their strength."""
     noise = Noise(np.random.default_rng(3), 1.3, 2.0)
     u = np.linspace(0, 1, 50)
     np.testing.assert_allclose(noise(u, u + 1), noise(u + 2, u), atol=2e-3)

@@ -8,8 +8,9 @@ import trimesh
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, unproject_maps
-from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
-from ghgs_lit.synthesis.photograph import Lights, Studio, sample_texture, smooth_normals
+from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh, sample_texture
+from ghgs_lit.synthesis.people.meshing import smooth_normals
+from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.types import Cameras
 
@@ -19,10 +20,12 @@ LIGHT = Lights(count=6, ambient=1.0, exposure=1.0).draw(
 
 
 def plain(color=(255, 255, 255), size=4) -> np.ndarray:
+    """A texture of one colour."""
     return np.tile(np.array(color, np.uint8), (size, size, 1))
 
 
 def mesh_part(mesh: trimesh.Trimesh, texture=None, cutoff=None) -> TexturedMesh:
+    """A mesh in one plain colour."""
     vertices = np.asarray(mesh.vertices, np.float32)
     uv = np.full((len(vertices), 2), 0.5, np.float32)
     return TexturedMesh(vertices, np.asarray(mesh.faces), uv, plain() if texture is None else texture, cutoff)
@@ -45,12 +48,13 @@ def front_camera(size=48, distance=2.0, focal=1.0, shift=0.0) -> Cameras:
 
 
 def shoot(parts, cameras, samples=3, lights=LIGHT):
+    """Image, mask and depth from the first of the cameras."""
     photographs = Studio(Person("p", tuple(parts), None), lights, samples).shoot(cameras)
     return photographs.images[0], photographs.masks[0], photographs.depths[0]
 
 
 def test_sphere_depth_and_coverage_are_analytic():
-    """Ray-sphere intersection in float64 at pixel centres; disc coverage by dense sampling."""
+    """Depth and coverage are metric: compared with ray-sphere intersection in float64 and dense sampling."""
     radius, size, distance = 0.6, 56, 2.0
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     camera = front_camera(size, distance, shift=3.3)
@@ -76,7 +80,7 @@ def test_sphere_depth_and_coverage_are_analytic():
 
 
 def test_square_covers_exactly_the_pixels_it_should():
-    """Edges at pixel boundaries give a binary image, edges in mid-pixel a coverage of one third."""
+    """No shift by half a pixel: edges at pixel boundaries are sharp, others have their exact coverage."""
     size = 32
     image, mask, depth = shoot([quad(half=0.5)], front_camera(size))  # ± 0.5 * 32 / 2 = ± 8 pixels
     expected = np.zeros((size, size))
@@ -91,6 +95,7 @@ def test_square_covers_exactly_the_pixels_it_should():
 
 
 def test_depth_never_mixes_two_surfaces():
+    """At edges the depth is that of one surface, never a mean that floats between two."""
     near = quad(z=0.5, half=0.2, x=0.05)
     far = quad(z=-0.5, half=0.9)
     for samples in (1, 2, 3, 4):
@@ -101,7 +106,7 @@ def test_depth_never_mixes_two_surfaces():
 
 
 def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
-    """Odd sampling: the depth is that of the very centre, so unprojected points satisfy the plane."""
+    """With an odd number of samples depth is exact at pixel centres: unprojected points lie on the plane."""
     part = quad(half=0.6)
     turned = trimesh.transformations.rotation_matrix(0.7, [0.3, 1, 0.1])[:3, :3].astype(np.float32)
     part = TexturedMesh(part.vertices @ turned.T, part.faces, part.uv, part.texture)
@@ -109,13 +114,14 @@ def test_depth_of_pixel_centers_lies_on_a_slanted_plane():
     _, mask, depth = shoot([part], camera)
     points = unproject_maps(torch.from_numpy(depth), camera[0]).numpy()[mask]
     assert len(points) > 200
-    # A pixel whose centre misses takes the nearest hit instead: half a pixel away at most, at the rim.
+    # At the rim a pixel whose centre misses takes the nearest hit, at most half a pixel away.
     distance = np.abs(points @ turned[:, 2])
     assert np.quantile(distance, 0.9) < 1e-6
     assert distance.max() < 0.03
 
 
 def test_vertices_project_into_the_mask_from_every_side():
+    """Photographs agree with their cameras: vertices project into the mask, depths lie on the surface."""
     rng = subject_rng(3, "capsule")
     capsule = trimesh.creation.capsule(height=1.2, radius=0.25, count=[64, 64])
     capsule.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
@@ -141,6 +147,7 @@ def test_vertices_project_into_the_mask_from_every_side():
 
 
 def test_cut_away_texels_show_what_lies_behind():
+    """Rays pass through cut-away strands of hair, whose colour does not bleed into what remains."""
     strands = np.full((8, 8, 4), 255, np.uint8)
     strands[:, :4, 3] = 0
     strands[:, :4, :3] = 0  # black under the cut: must not bleed into what stays
@@ -158,6 +165,7 @@ def test_cut_away_texels_show_what_lies_behind():
 
 
 def test_texture_is_upright_and_bilinear():
+    """Textures are neither flipped nor shifted by half a texel, and repeat."""
     texture = plain((0, 0, 0), 2)
     texture[0, 0] = (255, 0, 0)  # top left
     texture[1, 1] = (0, 255, 0)  # bottom right
@@ -169,8 +177,9 @@ def test_texture_is_upright_and_bilinear():
 
 
 def test_light_is_lambertian_seam_free_and_the_same_for_every_view():
+    """Shading follows its formula, UV seams are invisible, and all views of a point agree."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    exploded = TexturedMesh(  # every face its own vertices, as along UV seams
+    exploded = TexturedMesh(  # every face has its own vertices, as along UV seams
         np.asarray(sphere.triangles, np.float32).reshape(-1, 3),
         np.arange(len(sphere.faces) * 3).reshape(-1, 3),
         np.zeros((len(sphere.faces) * 3, 2), np.float32),
@@ -194,6 +203,7 @@ def test_light_is_lambertian_seam_free_and_the_same_for_every_view():
 
 
 def test_both_sides_are_lit_and_winding_does_not_matter():
+    """Scans with flipped faces are lit like others."""
     lights = Lights(count=1, ambient=0.2, jitter=0.0).draw(np.random.default_rng(0))
     part = quad()
     flipped = TexturedMesh(part.vertices, part.faces[:, ::-1].copy(), part.uv, part.texture)
@@ -203,7 +213,7 @@ def test_both_sides_are_lit_and_winding_does_not_matter():
 
 
 def test_camera_beside_and_inside_the_subject():
-    """Nothing in view: all empty; vertices behind the camera: no wrong window."""
+    """An empty view gives empty maps; vertices behind the camera do not make the window too small."""
     away = front_camera(16)
     away.intrinsics[:, 0, 2] += 1000
     _, mask, depth = shoot([quad()], away)
@@ -216,6 +226,7 @@ def test_camera_beside_and_inside_the_subject():
 
 @pytest.mark.parametrize("value", [0.0, -5.0, float("nan")])
 def test_bad_focal_length_is_refused(value):
+    """The message names the camera, in place of an empty photograph."""
     camera = front_camera(16)
     camera.intrinsics[:, 0, 0] = value
     with pytest.raises(InputError, match="camera 0: expected finite values and focal lengths above 0"):
@@ -223,6 +234,7 @@ def test_bad_focal_length_is_refused(value):
 
 
 def test_ring_has_the_angles_of_the_layout():
+    """Cameras stand where stereo readers of the THuman2.0 layout expect each view."""
     rig, rng = Rig(), subject_rng(0, "a")
     yaws = rig.yaws(rng)
     cameras = rig.cameras(yaws, 128, 128)
@@ -247,6 +259,7 @@ def test_ring_has_the_angles_of_the_layout():
 
 
 def test_placing_scales_and_moves_body_and_clothes_alike():
+    """Subjects stand on the ground at the asked height, with the body still inside the clothes."""
     box = trimesh.creation.box((0.4, 3.0, 0.2))
     part = mesh_part(box)
     part = TexturedMesh(part.vertices + np.float32([5, 7, -2]), part.faces, part.uv, part.texture)

@@ -1,1 +1,1 @@
-"""Small data sets in the published layouts, made of built-in people: to try a loader without the data."""
+"""Small data sets of built-in people in the published layouts, to try a loader without the real data."""

@@ -1,10 +1,14 @@
-"""What rigs of still cameras around a performer have in common: where cameras look, where people stand."""
+"""Shared by the miniatures: cameras around a person, people moved about, studios and image files."""
 
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import torch
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from ghgs_lit.synthesis.people.mesh import Person
+from ghgs_lit.types import Cameras
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -19,35 +23,45 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
 
 
 def ring(count: int, radius: float, height: float, rng: np.random.Generator) -> np.ndarray:
-    """Centres [count, 3] of cameras around the y axis, in order, none of them quite where it should be."""
+    """Centres [count, 3] of cameras in order around the y axis, with random deviations."""
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.15, 0.15, count)) / count
     radii = radius * rng.uniform(0.93, 1.07, count)
     heights = height + rng.uniform(-0.35, 0.35, count)
     return np.stack((radii * np.sin(angles), heights, radii * np.cos(angles)), -1)
 
 
-def moved(person: Person, pose: np.ndarray) -> Person:
-    """``person`` in another frame: ``pose`` [4, 4] maps old to new."""
-
-    def move(vertices: np.ndarray) -> np.ndarray:
-        return (vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-
-    parts = tuple(replace(part, vertices=move(part.vertices)) for part in person.parts)
-    return replace(person, parts=parts, body_vertices=move(person.body_vertices))
-
-
-def turned(degrees: float, shift: np.ndarray) -> np.ndarray:
-    """[4, 4]: a turn about the y axis, then a ``shift`` [3]."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+def rigid(degrees: float, translation: np.ndarray) -> np.ndarray:
+    """A rigid transform [4, 4]: a rotation about the y axis, then a ``translation`` [3]."""
     pose = np.eye(4)
-    pose[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    pose[:3, 3] = shift
+    pose[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    pose[:3, 3] = translation
     return pose
 
 
-def studio_background(height: int, width: int, tint: float) -> np.ndarray:
-    """[h, w, 3] uint8: a grey wall over a brown floor, so that a forgotten mask shows."""
-    rows = np.linspace(0, 1, height)[:, None, None]
-    wall = np.array([150, 155, 160]) * (0.8 + 0.3 * rows) * tint
+def moved(person: Person, pose: np.ndarray) -> Person:
+    """``person`` in another frame: ``pose`` [4, 4] maps old to new."""
+    return person.mapped(lambda vertices: vertices @ pose[:3, :3].T + pose[:3, 3])
+
+
+def cameras_of(matrices: np.ndarray, poses: np.ndarray, height: int, width: int) -> Cameras:
+    """Cameras, float32, of intrinsics [n, 3, 3] and world-to-camera poses [n, 4, 4]."""
+    return Cameras(*(torch.from_numpy(array).float() for array in (matrices, poses)), height, width)
+
+
+def before_wall(image: np.ndarray, mask: np.ndarray, brightness: float) -> np.ndarray:
+    """A photograph [h, w, 3] in [0, 1] of a person, 0 to 255 in front of a studio.
+
+    The studio has a grey wall over a brown floor, so that it shows when a mask is not applied.
+    """
+    rows = np.linspace(0, 1, len(mask))[:, None, None]
+    wall = np.array([150, 155, 160]) * (0.8 + 0.3 * rows) * brightness
     floor = np.array([120, 95, 70]) * (0.7 + 0.3 * rows)
-    return np.broadcast_to(np.where(rows < 0.8, wall, floor), (height, width, 3)).astype(np.uint8).copy()
+    studio = np.where(rows < 0.8, wall, floor).astype(np.uint8)
+    return np.where(mask[..., None], np.round(image * 255), studio)
+
+
+def save_image(path: Path, image: np.ndarray | Image.Image, quality: int = 95) -> None:
+    """Write an image, making its folder; ``quality`` counts for JPEG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = image if isinstance(image, Image.Image) else Image.fromarray(image)
+    image.save(path, quality=quality)

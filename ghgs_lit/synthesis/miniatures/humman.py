@@ -1,8 +1,9 @@
 """A small HuMMan-Recon v1.0 of built-in people: folders, names, dtypes, units and oddities of the real one.
 
-Ten Kinects, photographs of 16:9 in front of a wall, matting with soft rims, depth maps of other cameras in
-millimetres with the floor in them, frames that are multiples of 6 with one missing, camera 0 as the world.
-Textured meshes, which nothing reads, are not made. Beside the root lies a stand-in for the licensed SMPL.
+Ten Kinects; photographs of 16:9 in front of a wall; masks with soft edges; depth maps in millimetres from
+other cameras, with the floor in them; frame numbers that are multiples of 6, one of them missing; the world
+frame is that of camera 0. Textured meshes, which nothing reads, are not made. A stand-in for the licensed
+SMPL model is written beside the root.
 """
 
 import json
@@ -14,19 +15,19 @@ import torch
 from PIL import Image, ImageFilter
 
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.miniatures.capture import look_at, moved, ring, studio_background, turned
+from ghgs_lit.synthesis.miniatures import capture
 from ghgs_lit.synthesis.miniatures.smpl import parameters, write_stand_in
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import LightRig, Lights, Studio
 from ghgs_lit.types import Cameras
 
 KINECTS = 10
-# Frame 12 lacks.
+# Frame 12 is missing.
 FRAMES = (0, 6, 18)
-# Of a photograph with a longer side of 1920: height, width, focal length; and of a depth map.
+# Height, width and focal length in pixels of the real photographs and of the real depth maps.
 _COLOR, _DEPTH = (1080, 1920, 970.0), (576, 640, 504.0)
-# The depth camera looks from here, metres to the right of and below the colour camera.
-_BESIDE = np.array([0.032, 0.002, 0.0])
+# Position of the depth camera in the frame of the colour camera, metres.
+_DEPTH_OFFSET = np.array([0.032, 0.002, 0.0])
 
 
 def make(
@@ -37,10 +38,18 @@ def make(
     seed: int = 0,
     frames: Sequence[int] = FRAMES,
 ) -> list[Path]:
-    """Write ``people_of["train"]`` sequences and the first ``people_of["val"]`` of ``test``.
+    """Write training sequences, and test sequences with the first names of ``test``.
 
-    The longer side of the photographs has ``size`` pixels. Returns the folders of the sequences, and last
-    that of the stand-in for SMPL, ``<root>_body_models``.
+    Args:
+        root: folder of the sequences.
+        test: names of the test sequences.
+        people_of: how many sequences, ``{train: n, val: n}``.
+        size: longer side of the photographs in pixels.
+        seed: of people, cameras and lights.
+        frames: their numbers.
+
+    Returns:
+        The folders of the sequences, and last that of the stand-in for SMPL, ``<root>_body_models``.
     """
     training = [f"p{100001 + 7 * i:06d}_a{48 + 11 * i:06d}" for i in range(people_of["train"])]
     folders = []
@@ -62,19 +71,19 @@ def _write_sequence(
     from_world = torch.from_numpy(np.linalg.inv(to_world))
     _write_cameras(folder, color, depth, from_world)
     for number in frames:
-        pose = turned(4.0 * number, np.array([0.05 * np.sin(number), 0, 0.05 * np.cos(number)]))
+        pose = capture.rigid(4.0 * number, np.array([0.05 * np.sin(number), 0, 0.05 * np.cos(number)]))
         fit = parameters(*identity, person, to_world @ pose)
         (folder / "smpl_params").mkdir(exist_ok=True)
         np.savez(folder / "smpl_params" / f"{number:06d}.npz", **fit)
-        _write_frame(folder, number, moved(person, pose), lights, color, depth, manual)
+        _write_frame(folder, number, capture.moved(person, pose), lights, color, depth, manual)
 
 
 def _rig(scale: float, rng: np.random.Generator) -> tuple[Cameras, Cameras]:
     """Colour and depth cameras around the floor's origin, y up, pixel centres at +0.5."""
-    centers = ring(KINECTS, 2.4, 1.1, rng)
-    poses = np.stack([look_at(c, np.array([0, 0.92, 0]), np.array([0, 1.0, 0])) for c in centers])
+    centers = capture.ring(KINECTS, 2.4, 1.1, rng)
+    poses = np.stack([capture.look_at(c, np.array([0, 0.92, 0]), np.array([0, 1.0, 0])) for c in centers])
     beside = poses.copy()
-    beside[:, :3, 3] -= _BESIDE
+    beside[:, :3, 3] -= _DEPTH_OFFSET
     return _cameras(_COLOR, scale, poses, rng), _cameras(_DEPTH, scale, beside, rng)
 
 
@@ -87,11 +96,11 @@ def _cameras(
         focal = shape[2] * scale * rng.uniform(0.99, 1.01)
         middle = np.array([width, height]) * rng.uniform(0.49, 0.51, 2)
         matrices[k] = [[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1]]
-    return Cameras(*(torch.from_numpy(a).float() for a in (matrices, poses)), height, width)
+    return capture.cameras_of(matrices, poses, height, width)
 
 
 def _write_cameras(folder: Path, color: Cameras, depth: Cameras, from_world: torch.Tensor) -> None:
-    """``cameras.json``: centres at integers, the world in the frame of the first colour camera."""
+    """Write ``cameras.json``: pixel centres at integers, the world frame is the first colour camera's."""
     content = {}
     for kind, cameras in (("color", color), ("depth", depth)):
         for k in range(KINECTS):
@@ -110,26 +119,23 @@ def _write_frame(
     studio = Studio(person, lights, samples=1)
     shots, depths = studio.shoot(color), studio.shoot(depth).depths
     for k in range(KINECTS):
-        mask, wall = shots.masks[k], studio_background(color.height, color.width, 0.9 + 0.02 * k)
-        image = np.where(mask[..., None], np.round(shots.images[k] * 255), wall).astype(np.uint8)
-        hard = Image.fromarray(mask.astype(np.uint8) * 255)
+        image = capture.before_wall(shots.images[k], shots.masks[k], 0.9 + 0.02 * k)
+        hard = Image.fromarray(shots.masks[k].astype(np.uint8) * 255)
         floor = _floor_depth(depth, k)
         metres = np.where(depths[k] > 0, depths[k], np.where(floor < 5.4, floor, 0))
         written = {
-            "kinect_color": Image.fromarray(image),
+            "kinect_color": image.astype(np.uint8),
             "kinect_mask": hard.filter(ImageFilter.GaussianBlur(0.5)),
-            "kinect_depth": Image.fromarray(np.round(metres * 1000).astype(np.uint16)),
+            "kinect_depth": np.round(metres * 1000).astype(np.uint16),
         }
         if manual:
             written["kinect_mask_manual"] = hard
         for kind, picture in written.items():
-            path = folder / kind / f"kinect_{k:03d}" / f"{number:06d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            picture.save(path)
+            capture.save_image(folder / kind / f"kinect_{k:03d}" / f"{number:06d}.png", picture)
 
 
 def _floor_depth(cameras: Cameras, k: int) -> np.ndarray:
-    """z [h, w] of the floor y = 0 in one camera; infinite where it is not seen."""
+    """z [h, w] in camera ``k`` of the floor y = 0; infinite where rays do not reach it."""
     matrix, pose = cameras.intrinsics[k].double().numpy(), cameras.extrinsics[k].double().numpy()
     rows, columns = np.mgrid[: cameras.height, : cameras.width] + 0.5
     rays = np.stack((columns, rows, np.ones_like(rows)), -1) @ np.linalg.inv(matrix).T @ pose[:3, :3]

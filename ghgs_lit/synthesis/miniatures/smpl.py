@@ -1,7 +1,7 @@
-"""A stand-in for the licensed SMPL model, made of the built-in body, and its parameters of built-in people.
+"""A stand-in for the licensed SMPL model, made from the built-in body, and parameters of built-in people.
 
-It has SMPL's arrays, shapes and 24 joints, so that ``smplx`` poses it, but none of its data: shapes are the
-built-in body's first ten components, pose blend shapes are zero.
+It has SMPL's arrays, shapes and 24 joints, so that ``smplx`` can pose it, but none of its data: shape blend
+shapes are the first ten components of the built-in body, pose blend shapes are zero.
 """
 
 import pickle
@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, load_body
@@ -16,7 +17,7 @@ from ghgs_lit.synthesis.people.generate import pose_figure
 from ghgs_lit.synthesis.people.mesh import Person
 
 VERTICES, SHAPES = 6890, 10
-# The joints of SMPL in order: the built-in bone that each is the head of, and its parent.
+# The joints of SMPL in order: the built-in bone that starts at each, and the index of the parent joint.
 JOINTS = (
     ("root", -1), ("upperleg01.L", 0), ("upperleg01.R", 0), ("spine05", 0), ("lowerleg01.L", 1),
     ("lowerleg01.R", 2), ("spine03", 3), ("foot.L", 4), ("foot.R", 5), ("spine01", 6), ("toe2-1.L", 7),
@@ -25,12 +26,12 @@ JOINTS = (
     ("finger3-1.L", 20), ("finger3-1.R", 21),
 )  # fmt: skip
 PARENTS = np.array([parent for _, parent in JOINTS])
-# How many vertices near a joint say where it is.
+# How many of the nearest vertices a joint is regressed from.
 _NEAR = 150
 
 
 def chosen_vertices() -> np.ndarray:
-    """Which of the built-in body's vertices the stand-in has [6890]."""
+    """Indices [6890] of the built-in body's vertices that the stand-in has."""
     return np.linspace(0, BODY_VERTICES - 1, VERTICES).astype(int)
 
 
@@ -51,7 +52,7 @@ def stand_in() -> dict[str, np.ndarray]:
 
 
 def write_stand_in(folder: Path) -> Path:
-    """``<folder>/smpl/SMPL_NEUTRAL.pkl``, as ``smplx`` looks for it; gives ``folder``."""
+    """Write ``<folder>/smpl/SMPL_NEUTRAL.pkl``, where ``smplx`` looks for it; return ``folder``."""
     path = folder / "smpl" / "SMPL_NEUTRAL.pkl"
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as stream:
@@ -60,12 +61,15 @@ def write_stand_in(folder: Path) -> Path:
 
 
 def parameters(seed: int, index: int, person: Person, pose: np.ndarray) -> dict[str, np.ndarray]:
-    """SMPL parameters of ``people.generate(seed, index)`` after ``pose`` [4, 4], as HuMMan stores them."""
+    """SMPL parameters of ``people.generate(seed, index)`` moved by ``pose`` [4, 4], as HuMMan stores them."""
     body = load_body()
     streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(4)]
     coefficients, _, _ = body.sample_shape(streams[0])
     figure = pose_figure(body, coefficients, streams[1])
-    place = pose @ _rigid(figure.posed, person.body_vertices)
+    to_person, _, _ = trimesh.registration.procrustes(
+        figure.posed, person.body_vertices, reflection=False, scale=False
+    )
+    place = pose @ to_person
     bones = [body.bone(name) for name, _ in JOINTS]
     turns = place[:3, :3] @ figure.transforms[bones, :, :3]
     local = [turns[0], *(turns[p].T @ turn for p, turn in zip(PARENTS[1:], turns[1:], strict=True))]
@@ -83,18 +87,8 @@ def parameters(seed: int, index: int, person: Person, pose: np.ndarray) -> dict[
     }
 
 
-def _rigid(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """[4, 4] that takes ``source`` [n, 3] to ``target``."""
-    a, b = source.mean(0), target.astype(np.float64).mean(0)
-    rotation, _ = Rotation.align_vectors(target - b, source - a)
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.as_matrix()
-    pose[:3, 3] = b - pose[:3, :3] @ a
-    return pose
-
-
 def _regressor(body: BodyModel, chosen: np.ndarray, joint: int) -> np.ndarray:
-    """Weights [6890] of sum 1 of the vertices around a joint that give it for every shape."""
+    """Weights [6890] of the vertices near a joint, summing to 1, whose mean is the joint for every shape."""
     distance = np.linalg.norm(body.mean[chosen] - body.mean[joint], axis=-1)
     near = np.argsort(distance)[:_NEAR]
     shapes = np.concatenate((body.mean[None], body.components[:SHAPES]))
@@ -106,7 +100,7 @@ def _regressor(body: BodyModel, chosen: np.ndarray, joint: int) -> np.ndarray:
 
 
 def _weights(body: BodyModel) -> np.ndarray:
-    """Skinning weights [n, 24]: every bone counts for the joint above it in the rig."""
+    """Skinning weights [n, 24]: every bone counts for the nearest joint of SMPL above it in the rig."""
     joint_of = {body.bone(name): j for j, (name, _) in enumerate(JOINTS)}
     weights = np.zeros((body.vertex_count, len(JOINTS)))
     for bone in range(len(body.bone_names)):

@@ -2,7 +2,7 @@
 
 Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2_scans`,
 :mod:`ghgs_lit.data.layout`). Bodies are MakeHuman's in place of SMPL-X: the parameters in
-``smplx_param.pkl`` have the right shapes and say where the body stands, not how it is posed.
+``smplx_param.pkl`` have the right shapes and place the body correctly, but do not pose it.
 """
 
 import pickle
@@ -20,12 +20,15 @@ from ghgs_lit.data.layout import position_name
 from ghgs_lit.data.sampling import VIEW_IDS, subject_rng
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.miniatures.capture import save_image
 from ghgs_lit.synthesis.people.generate import join
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.types import Cameras
 
+FIT_FOLDER = "THuman2.0_smplx"
+# Id of the first scan of each phase.
 FIRST = {"train": 0, "val": 426}
 POSE_SIZES = {
     "betas": 10,
@@ -49,7 +52,7 @@ def names(people: Mapping[str, int]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class _Scan:
-    """A person as one mesh in a scan's frame, with the fit that maps the body there."""
+    """A person as one mesh in a scan's frame, with the fit that maps the body to it."""
 
     mesh: TexturedMesh
     body: np.ndarray
@@ -60,7 +63,7 @@ class _Scan:
 
 @lru_cache(maxsize=4)
 def _scan(name: str, seed: int) -> _Scan:
-    """Person number ``int(name)`` turned by some yaw, in units that are not metres."""
+    """Person number ``int(name)``, turned by a random yaw, in units that are not metres."""
     person = people.generate(seed, int(name))
     rng = subject_rng(seed, name)
     yaw = float(rng.uniform(-np.pi, np.pi))
@@ -75,22 +78,23 @@ def _scan(name: str, seed: int) -> _Scan:
     return _Scan(moved, place(person.body_vertices), yaw, scale, translation)
 
 
-def make_raw(
-    source: Path,
-    people: Mapping[str, int],
-    size: int,
-    seed: int,
-    fit_folder: str = "THuman2.0_smplx",
-) -> Path:
-    """Write scans below ``source``, their fits into ``fit_folder`` beside it, and the split files.
+def make_raw(source: Path, people: Mapping[str, int], size: int, seed: int) -> Path:
+    """Write scans below ``source``, their fits into a folder beside it, and the split files.
 
-    ``size``: textures are scaled to at most twice as many pixels a side. Returns ``source``.
+    Args:
+        source: folder of the scans.
+        people: how many, ``{train: n, val: n}``.
+        size: textures are scaled down to at most twice as many pixels a side.
+        seed: of people and their placement.
+
+    Returns:
+        ``source``.
     """
     listed = names(people)
     for name in (name for phase in listed.values() for name in phase):
         scan = _scan(name, seed)
         _write_obj(source / name, name, scan.mesh, 2 * size)
-        _write_fit(source.parent / fit_folder / name, scan, subject_rng(seed + 1, name))
+        _write_fit(source.parent / FIT_FOLDER / name, scan, subject_rng(seed + 1, name))
     for phase, phase_names in listed.items():
         (source / f"split_{phase}.txt").write_text("".join(f"{name}\n" for name in phase_names))
     return source
@@ -99,14 +103,17 @@ def make_raw(
 def _write_obj(folder: Path, name: str, mesh: TexturedMesh, texture_size: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["mtllib material0.mtl", "usemtl material0"]
-    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices]
-    lines += [f"vt {u:.6f} {v:.6f}" for u, v in mesh.uv]
+    lines += [*_obj_lines("v", mesh.vertices), *_obj_lines("vt", mesh.uv)]
     lines += ["f " + " ".join(f"{i}/{i}" for i in face) for face in mesh.faces + 1]
     (folder / f"{name}.obj").write_text("\n".join(lines) + "\n")
     (folder / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
     texture = Image.fromarray(mesh.texture)
     texture.thumbnail((texture_size, texture_size), Image.Resampling.BOX)
-    texture.save(folder / "material0.jpeg", quality=95)
+    save_image(folder / "material0.jpeg", texture)
+
+
+def _obj_lines(keyword: str, rows: np.ndarray) -> list[str]:
+    return [" ".join((keyword, *(f"{number:.6f}" for number in row))) for row in rows]
 
 
 def _write_fit(folder: Path, scan: _Scan, rng: np.random.Generator) -> None:
@@ -117,8 +124,7 @@ def _write_fit(folder: Path, scan: _Scan, rng: np.random.Generator) -> None:
     fit["translation"] = scan.translation.astype(np.float32).view(TrackedArray)
     with (folder / "smplx_param.pkl").open("wb") as stream:
         pickle.dump(fit, stream)
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in scan.body]
-    (folder / "mesh_smplx.obj").write_text("\n".join(lines) + "\n")
+    (folder / "mesh_smplx.obj").write_text("\n".join(_obj_lines("v", scan.body)) + "\n")
 
 
 def make(
@@ -131,9 +137,21 @@ def make(
 ) -> Path:
     """Write renders below ``root`` in the layout that the published scripts make.
 
-    Theirs are: pixel centres at integers, principal point 25/1024 of the side below the middle, masks of
-    three channels, inverse depth cut (not rounded) to 16 bits, cameras 3 x 4, photographs of twice the
-    size (``<vid>_hr.jpg``) of the views between cameras, bodies in ``smpl`` with their normals.
+    In it pixel centres are at integers, the principal point is 25/1024 of the side below the middle, masks
+    have three channels, inverse depth is truncated (not rounded) to 16 bits, extrinsics are 3 x 4, the views
+    between cameras also have photographs of twice the size (``<view>_hr.jpg``), and bodies lie in ``smpl``
+    with their normals.
+
+    Args:
+        root: folder of the phases.
+        people: how many, ``{train: n, val: n}``.
+        size: side of the square photographs in pixels.
+        seed: of people, cameras and lights.
+        vids: the views at each position.
+        positions: how many around the subject.
+
+    Returns:
+        ``root``.
     """
     rig = Rig(positions=positions)
     for phase, listed in names(people).items():
@@ -143,9 +161,9 @@ def make(
             person = rig.place(Person(name, (scan.mesh,), scan.body.astype(np.float32)), rng)
             studio = Studio(person, Lights().draw(rng), samples=2)
             yaws = rig.yaws(rng) + np.degrees(scan.yaw)
-            for pid in range(positions):
-                cameras = rig.cameras(yaws[pid, list(vids)], size, size)
-                _write_position(root / phase, position_name(name, pid), studio, cameras, vids)
+            for position in range(positions):
+                cameras = rig.cameras(yaws[position, list(vids)], size, size)
+                _write_position(root / phase, position_name(name, position), studio, cameras, vids)
             _write_body(root / phase / "smpl" / name, person.body_vertices, rng)
     return root
 
@@ -153,27 +171,25 @@ def make(
 def _write_position(
     phase: Path, position: str, studio: Studio, cameras: Cameras, vids: Sequence[int]
 ) -> None:
-    """The views of one position. Their renderer puts integers where this package has half pixels."""
-    folders = [phase / kind / position for kind in ("img", "mask", "depth", "parm")]
-    for folder in folders:
-        folder.mkdir(parents=True, exist_ok=True)
-    img, mask, depth, parm = folders
+    """Write the views of one position."""
+    img, mask, depth, parm = (phase / kind / position for kind in ("img", "mask", "depth", "parm"))
+    parm.mkdir(parents=True, exist_ok=True)
+    # The published renderer puts pixel centres at integers, this package at half pixels.
     half = cameras.intrinsics.clone()
     half[:, :2, 2] += 0.5
     photographs = studio.shoot(replace(cameras, intrinsics=half))
     for n, vid in enumerate(vids):
         image = np.round(photographs.images[n] * 255).astype(np.uint8)
-        Image.fromarray(image).save(img / f"{vid}.jpg", quality=95)
-        subject = photographs.masks[n]
-        Image.fromarray(np.repeat(subject[..., None] * np.uint8(255), 3, -1)).save(mask / f"{vid}.png")
+        save_image(img / f"{vid}.jpg", image)
+        save_image(mask / f"{vid}.png", np.repeat(photographs.masks[n][..., None] * np.uint8(255), 3, -1))
         z = photographs.depths[n]
         inverse = np.where(z > 0, 2.0**15 / np.where(z > 0, z, 1), 0).astype(np.uint16)
-        Image.fromarray(inverse).save(depth / f"{vid}.png")
+        save_image(depth / f"{vid}.png", inverse)
         np.save(parm / f"{vid}_intrinsic.npy", cameras.intrinsics[n].double().numpy())
         np.save(parm / f"{vid}_extrinsic.npy", cameras.extrinsics[n, :3].double().numpy())
         if vid >= 2:
             large = Image.fromarray(image).resize((2 * cameras.width, 2 * cameras.height))
-            large.save(img / f"{vid}_hr.jpg")
+            save_image(img / f"{vid}_hr.jpg", large, quality=75)
 
 
 def _write_body(folder: Path, vertices: np.ndarray, rng: np.random.Generator) -> None:

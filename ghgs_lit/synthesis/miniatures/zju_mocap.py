@@ -1,8 +1,8 @@
 """A small ZJU-MoCap of built-in people: folders, names, dtypes, units and oddities of the real one.
 
-Photographs are taken through distorting lenses in front of a grey wall. Neither ``mask_cihp`` nor ``mask``
-is whole: their union is. ``vertices`` is a worse fit than ``new_vertices``. The parameters of a body model
-(``params``, ``new_params``) have the right keys and shapes and a true ``Rh`` and ``Th``; poses and shapes
+Photographs are taken through distorting lenses in front of a grey wall. ``mask_cihp`` and ``mask`` both have
+holes; their union has none. ``vertices`` fits worse than ``new_vertices``. The parameters of a body model
+(``params``, ``new_params``) have the right keys and shapes and a correct ``Rh`` and ``Th``; poses and shapes
 are zero, because the bodies are not SMPL's.
 """
 
@@ -13,30 +13,36 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.geometry.calibration import undistort_points
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.miniatures.capture import look_at, moved, ring, studio_background, turned
+from ghgs_lit.synthesis.miniatures import capture
+from ghgs_lit.synthesis.miniatures.smpl import chosen_vertices
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
-from ghgs_lit.types import Cameras
 
-# Sequences whose files have long names, numbered from 1, and that have two cameras less.
+# Sequences with long file names, frames numbered from 1, and two cameras fewer.
 OLD = ("313", "315")
 OLD_CAMERAS = (*range(1, 20), 22, 23)
 NEW_CAMERAS = tuple(range(1, 24))
-VERTICES = 6890
-# Built-in people have y up, ZJU-MoCap has z up.
+# In built-in people y is up, in ZJU-MoCap z.
 _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 # Labels of the parsing model (hair, face, upper clothes, trousers, shoes) from top to bottom.
 _LABELS = np.array([2, 13, 5, 5, 5, 9, 9, 9, 9, 18], np.uint8)
 
 
 def make(root: Path, sequences: Sequence[str], size: int = 256, seed: int = 0, frames: int = 6) -> list[Path]:
-    """Write ``sequences`` (ids such as 377) with ``frames`` frames of ``size`` x ``size`` photographs each.
+    """Write sequences.
 
-    Returns their folders. The same numbers make the same files.
+    Args:
+        root: folder of the sequences.
+        sequences: ids such as 377.
+        size: side of the square photographs in pixels.
+        seed: of people, cameras and lights.
+        frames: how many per sequence.
+
+    Returns:
+        The folders of the sequences.
     """
     folders = []
     for index, sequence in enumerate(sequences):
@@ -53,7 +59,7 @@ def _write_sequence(
     rng = np.random.default_rng(seed)
     old = sequence in OLD
     names = [f"Camera ({k})" for k in OLD_CAMERAS] if old else [f"Camera_B{k}" for k in NEW_CAMERAS]
-    stage = np.array([0.4, 0.1, -0.3])  # the world's origin is not where people stand
+    stage = np.array([0.4, 0.1, -0.3])  # people stand beside the world's origin
     matrices, lenses, poses = _calibration(len(names), size, stage, rng)
     grids = [_distorting_grid(matrix, lens, size) for matrix, lens in zip(matrices, lenses, strict=True)]
     lights = Lights().draw(rng)
@@ -62,18 +68,16 @@ def _write_sequence(
         stem = _long_stem if old else _short_stem
         photographs = [f"{name}/{stem(sequence, name, frame)}.jpg" for name in names]
         listed.append({"ims": photographs})
-        # Standing people turn and step about.
+        # The person turns and takes small steps.
         step = np.array([0.06 * np.sin(frame), 0, 0.06 * np.cos(2 * frame)])
-        pose = _Z_UP @ turned(35.0 * frame, stage + step)
-        posed = moved(person, pose)
+        pose = _Z_UP @ capture.rigid(35.0 * frame, stage + step)
+        posed = capture.moved(person, pose)
         _write_body(folder, frame + 1 if old else frame, posed.body_vertices, pose, rng)
         studio = Studio(posed, lights, samples=1)
         half = matrices + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        cameras = Cameras(*(torch.from_numpy(a).float() for a in (half, poses)), size, size)
-        shots = studio.shoot(cameras)
+        shots = studio.shoot(capture.cameras_of(half, poses, size, size))
         for k, path in enumerate(photographs):
-            wall = studio_background(size, size, 0.9 + 0.2 * k / len(names))
-            image = np.where(shots.masks[k][..., None], np.round(shots.images[k] * 255), wall)
+            image = capture.before_wall(shots.images[k], shots.masks[k], 0.9 + 0.2 * k / len(names))
             _write_photograph(folder, path, *_through_lens(image, shots.masks[k], grids[k]), k)
     cams = {
         "K": list(matrices),
@@ -99,13 +103,13 @@ def _calibration(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """K [n, 3, 3] with centres at integers, lens coefficients [n, 5], world to camera [n, 4, 4] in metres."""
     matrices, poses = np.zeros((count, 3, 3)), np.zeros((count, 4, 4))
-    centers = ring(count, 2.9, 1.2, rng) + stage
+    centers = capture.ring(count, 2.9, 1.2, rng) + stage
     for k in range(count):
         f = 1.03 * size * rng.uniform(0.99, 1.01)
         middle = size * rng.uniform(0.48, 0.52, 2)
         matrices[k] = [[f, 0, middle[0]], [0, f * rng.uniform(0.999, 1.001), middle[1]], [0, 0, 1]]
         target = stage + np.array([0, 0.92, 0]) + rng.uniform(-0.05, 0.05, 3)
-        poses[k] = look_at(centers[k], target, np.array([0, 1.0, 0])) @ _Z_UP.T
+        poses[k] = capture.look_at(centers[k], target, np.array([0, 1.0, 0])) @ _Z_UP.T
     lenses = np.array([-0.24, 0.14, 0.0, 0.0, -0.03]) * rng.uniform(0.9, 1.1, (count, 5))
     lenses[:, 2:4] = rng.uniform(-1e-3, 1e-3, (count, 2))
     return matrices, lenses, poses
@@ -114,8 +118,8 @@ def _calibration(
 def _write_body(
     folder: Path, number: int, vertices: np.ndarray, pose: np.ndarray, rng: np.random.Generator
 ) -> None:
-    """Both fits of one frame, with as many vertices as SMPL has."""
-    chosen = vertices[np.linspace(0, len(vertices) - 1, VERTICES).astype(int)]
+    """Write both fits of one frame, with as many vertices as SMPL has."""
+    chosen = vertices[chosen_vertices()]
     worse = chosen + rng.normal(0, 0.015, 3)
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     params = {
@@ -131,7 +135,7 @@ def _write_body(
 
 
 def _distorting_grid(matrix: np.ndarray, lens: np.ndarray, size: int) -> torch.Tensor:
-    """Where each pixel of a photograph lies in that of a lens without distortion, for ``grid_sample``."""
+    """Where ``grid_sample`` reads each distorted pixel in the undistorted photograph [1, h, w, 2]."""
     rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
     pixels = torch.stack((columns, rows), -1).reshape(1, -1, 2).double()
     places = undistort_points(
@@ -148,10 +152,8 @@ def _through_lens(image: np.ndarray, mask: np.ndarray, grid: torch.Tensor) -> tu
 
 
 def _write_photograph(folder: Path, path: str, image: np.ndarray, mask: np.ndarray, camera: int) -> None:
-    """A photograph and its two label maps, each with a hole that the other has not."""
-    place = folder / path
-    place.parent.mkdir(exist_ok=True)
-    Image.fromarray(image).save(place, quality=95)
+    """Write a photograph and its two label maps, each with a hole that the other does not have."""
+    capture.save_image(folder / path, image)
     rows = np.flatnonzero(mask.any(1))
     top, bottom = (rows[0], rows[-1] + 1) if len(rows) else (0, 1)
     band = np.clip((np.arange(len(mask)) - top) * len(_LABELS) // (bottom - top), 0, len(_LABELS) - 1)
@@ -163,6 +165,4 @@ def _write_photograph(folder: Path, path: str, image: np.ndarray, mask: np.ndarr
     if camera == 3:  # some real label maps have three channels
         labels = np.stack((labels, 0 * labels, 0 * labels), -1)
     for kind, content in (("mask_cihp", labels), ("mask", whole)):
-        place = (folder / kind / path).with_suffix(".png")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(content).save(place)
+        capture.save_image((folder / kind / path).with_suffix(".png"), content)

@@ -1,8 +1,8 @@
 """The body model: shapes as principal components, a rig, linear blend skinning.
 
-The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), baked by ``scripts/bake_body.py``. Metres,
-y up, facing +z; the person's left is +x. At rest the feet stand on y = 0 and the arms hang 45 degrees off the
-body.
+The asset holds MakeHuman data (CC0 1.0, see ``assets/LICENSE``), converted by ``scripts/bake_body.py``.
+Metres, y up, facing +z; the person's left is +x. At rest the feet stand on y = 0 and the arms hang at 45
+degrees from the body.
 """
 
 from dataclasses import dataclass
@@ -11,30 +11,37 @@ from importlib.resources import as_file, files
 
 import numpy as np
 
-BODY_VERTICES = 13380  # the skin comes first; then eyes and the helper surfaces that clothes are made of
+BODY_VERTICES = 13380  # of the skin; after them come eyes and the helper surfaces for clothes
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A quad mesh of the base mesh: vertex numbers [m, 4], its own UV numbers [m, 4]."""
+    """Quads of the base mesh: indices of vertices [m, 4] and of points in the UV layout [m, 4]."""
 
     quads: np.ndarray
     uv_quads: np.ndarray
 
+    def __getitem__(self, chosen: np.ndarray) -> "Surface":
+        """The quads where the mask `chosen` [m] is true."""
+        return Surface(self.quads[chosen], self.uv_quads[chosen])
+
 
 @dataclass(frozen=True)
 class BodyModel:
-    """The baked asset.
+    """The body model as stored in the asset.
 
     Attributes:
-        mean: [n + b, 3] float64, vertices and then the b joints of the average adult at rest.
-        components: [k, n + b, 3] float64, for coefficients of unit variance.
-        bodies: [s, k] coefficients of plausible adults; female [s] bool, age [s] (0.67 young, 1 old).
-        bone_names, bone_parents: b names; [b] int, -1 for the root; parents come before children.
-        weights: [n, b] float64, rows sum to 1.
-        uv: [t, 2] float32, UV layout of the base mesh.
-        head_uv: [4] the island of the head in it: left, bottom, right, top.
-        head_masks: [h, w, 4] uint8 over head_uv: lips, eyelids, ears, face.
+        mean: [n + b, 3] float64, the n vertices and then the b joints of the average adult at rest.
+        components: [k, n + b, 3] float64, principal components for coefficients of unit variance.
+        bodies: [s, k] coefficients of plausible adults.
+        female: [s] bool.
+        age: [s] from 0.67 (young) to 1 (old).
+        bone_names: b names.
+        bone_parents: [b] int, -1 for the root; parents come before children.
+        weights: [n, b] float64, skinning weights; rows sum to 1.
+        uv: [t, 2] float32, points of the UV layout of the base mesh.
+        head_uv: [4] box of the head in the UV layout: left, bottom, right, top.
+        head_masks: [h, w, 4] uint8 over that box: lips, eyelids, ears, face.
         surfaces: body, eyes, tights, skirt.
     """
 
@@ -56,6 +63,7 @@ class BodyModel:
         return len(self.weights)
 
     def bone(self, name: str) -> int:
+        """Index of a bone."""
         return self.bone_names.index(name)
 
     def rest(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -65,7 +73,7 @@ class BodyModel:
         return points[: self.vertex_count], points[self.vertex_count :]
 
     def sample_shape(self, rng: np.random.Generator) -> tuple[np.ndarray, bool, float]:
-        """Draw an adult between two baked ones of one sex: coefficients [k], female, age."""
+        """Draw an adult between two stored ones of one sex: coefficients [k], female, age."""
         female = bool(rng.random() < 0.5)
         pool = np.flatnonzero(self.female == female)
         one, two = rng.choice(pool, 2, replace=False)
@@ -76,7 +84,7 @@ class BodyModel:
 
 @lru_cache(maxsize=1)
 def load_body() -> BodyModel:
-    """Read the asset that lies beside this module (once a process)."""
+    """Read the asset in the folder of this module, once per process."""
     with as_file(files("ghgs_lit.synthesis.people") / "assets" / "body.npz") as path, np.load(path) as data:
         asset = {name: data[name] for name in data.files}
     weights = np.zeros((len(asset["weights"]), len(asset["bone_names"])))
@@ -104,13 +112,16 @@ def load_body() -> BodyModel:
 def bone_transforms(
     parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
 ) -> np.ndarray:
-    """Rest to posed, [b, 3, 4], from world-axis rotations of each bone.
+    """Transforms of the bones from rest to pose.
 
     Args:
-        parents: [b], -1 for the root, parents first.
-        joints: [b, 3] at rest.
-        rotations: [b, 3, 3] of each bone in the world's axes (not relative to its parent).
-        root: [3], where the root joint goes.
+        parents: [b], -1 for the root; parents come before children.
+        joints: [b, 3] at rest, metres.
+        rotations: [b, 3, 3] of each bone in world axes (not relative to its parent).
+        root: [3], position of the root joint in the pose, metres.
+
+    Returns:
+        [b, 3, 4] rotations and translations.
     """
     posed = np.empty_like(joints)
     for bone, parent in enumerate(parents):

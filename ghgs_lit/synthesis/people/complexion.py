@@ -1,13 +1,15 @@
-"""Paint skin, face and eyes."""
+"""Colours of a person, and textures of head, skin and eyes."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from ghgs_lit.synthesis.people.blending import bump, darken, mix, smoothstep
 from ghgs_lit.synthesis.people.body import load_body
-from ghgs_lit.synthesis.people.noise import Noise, smoothstep
+from ghgs_lit.synthesis.people.charts import Chart, chart
+from ghgs_lit.synthesis.people.noise import Noise
 from ghgs_lit.synthesis.people.outfit import Shoes
-from ghgs_lit.synthesis.people.surface import EYE, Chart, chart, face_frame, hairline
+from ghgs_lit.synthesis.people.place import EYE, face_frame, hairline
 
 SKINS = (
     (0.92, 0.75, 0.65), (0.88, 0.69, 0.57), (0.83, 0.64, 0.50), (0.72, 0.52, 0.38), (0.56, 0.38, 0.27),
@@ -18,7 +20,15 @@ IRISES = ((0.28, 0.17, 0.08), (0.20, 0.12, 0.06), (0.35, 0.45, 0.55), (0.33, 0.4
 
 @dataclass(frozen=True)
 class Complexion:
-    """Colours [3] of skin, lips, hair, irises; strength of beard, brows, make-up, freckles (about 0 to 1)."""
+    """The colours of a person.
+
+    Attributes:
+        skin, lips, hair, iris: [3] in [0, 1].
+        beard, brows, makeup, freckles: strengths, about 0 to 1.
+        beard_style: none, stubble, full, goatee or moustache.
+        noise: coarse noise.
+        fine: fine noise.
+    """
 
     skin: np.ndarray
     lips: np.ndarray
@@ -34,7 +44,7 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, female: bool, age: float) -> Complexion:
-    """Draw the colours of a person; dark skin goes with dark hair and eyes, age with grey."""
+    """Draw the colours of a person: with dark skin hair and eyes are dark, with age hair turns grey."""
     tone = rng.uniform(0, len(SKINS) - 1)
     skin = np.array([np.interp(tone, range(len(SKINS)), [s[i] for s in SKINS]) for i in range(3)])
     skin = np.clip(skin * (1 + rng.normal(0, 0.025, 3)), 0.08, 0.97)
@@ -85,13 +95,13 @@ def _blob(
 
 
 def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
-    """Mottled skin as a factor [k]."""
+    """Irregular tone of the skin as a factor [k]."""
     u, v = point[:, 0] + 0.5 * point[:, 2], point[:, 1] + 0.3 * point[:, 2]
     return 1 + 0.030 * look.noise(u / 0.45, v / 0.45) + 0.018 * look.fine(u / 0.12, v / 0.12)
 
 
 def head_texture(look: Complexion, scalp: float) -> np.ndarray:
-    """Texture [h, w, 3] of the head; `scalp` (0 to 1) is how much hair shows on the scalp."""
+    """Texture [h, w, 3] of the head; `scalp` (0 to 1) is how strongly hair covers the scalp."""
     piece = chart("head")
     point = face_frame(piece.texel_place.point)
     above = hairline(piece.texel_place.point)
@@ -104,25 +114,25 @@ def head_texture(look: Complexion, scalp: float) -> np.ndarray:
     flush = flush * (0.5 + 0.6 * look.makeup) + 0.35 * ears
     colour = colour * (1 - flush[:, None] * np.array([0.02, 0.16, 0.14]))
     hollow = _blob(point, (0.030, 1.568, 0.205), (0.022, 0.014, 0.03))
-    colour = colour * (1 - 0.16 * hollow)[:, None]
+    colour = darken(colour, hollow, 0.16)
     u, v = point[:, 0], point[:, 1]
     if look.freckles:
         spots = smoothstep(1.4, 2.2, look.fine(u / 0.09, v / 0.09)) * _blob(
             point, (0.03, 1.53, 0.21), (0.035, 0.03, 0.04)
         )
-        colour = colour * (1 - 0.35 * look.freckles * spots)[:, None]
-    colour = colour + (look.lips - colour) * (0.85 * lips)[:, None]
-    seam = np.exp(-(((v - 1.496) / 0.0016) ** 2)) * (np.abs(u) < 0.026) * (point[:, 2] > 0.19)
-    colour = colour * (1 - 0.5 * seam)[:, None]
+        colour = darken(colour, spots, 0.35 * look.freckles)
+    colour = mix(colour, 0.85 * lips, look.lips)
+    seam = bump(v, 1.496, 0.0016) * (np.abs(u) < 0.026) * (point[:, 2] > 0.19)
+    colour = darken(colour, seam, 0.5)
     colour = colour * _grain(look, point)[:, None]
     colour = _eyes_and_brows(colour, look, point, lids)
     colour = _beard(colour, look, point, lips)
     strands = 0.8 + 0.2 * look.fine(point[:, 0] / 0.10, point[:, 2] / 0.10)
     shadow = smoothstep(-0.004, 0.012, above + 0.003 * look.fine(u / 0.06, v / 0.06)) * (1 - ears) * scalp
     shadow = shadow * (1 - smoothstep(1.48, 1.46, point[:, 1]))
-    colour = colour + (look.hair * 0.85 * strands[:, None] - colour) * (0.92 * shadow)[:, None]
+    colour = mix(colour, 0.92 * shadow, look.hair * 0.85 * strands[:, None])
     nostril = _blob(point, (0.0085, 1.5155, 0.2235), (0.0035, 0.0028, 0.006))
-    return piece.image(colour * (1 - 0.6 * nostril)[:, None])
+    return piece.image(darken(colour, nostril, 0.6))
 
 
 def _masks(piece: Chart) -> np.ndarray:
@@ -137,8 +147,8 @@ def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lid
     distance = np.linalg.norm(np.stack([x, y, z], 1) - EYE, axis=1)
     lash = (1 - smoothstep(0.0150, 0.0168, distance)) * (z > 0.19) * np.where(y > EYE[1] - 0.002, 1.0, 0.45)
     shadow = np.array([0.45, 0.30, 0.38])
-    colour = colour + (shadow * look.skin - colour) * (0.45 * look.makeup * lids)[:, None]
-    colour = colour + (dark - colour) * ((0.55 + 0.35 * look.makeup) * lash)[:, None]
+    colour = mix(colour, 0.45 * look.makeup * lids, shadow * look.skin)
+    colour = mix(colour, (0.55 + 0.35 * look.makeup) * lash, dark)
     t = np.clip((x - 0.0125) / 0.040, 0, 1)
     arch = EYE[1] + 0.0195 + 0.0065 * np.sin(np.pi * (0.12 + 0.72 * t)) - 0.002 * t
     half = 0.0044 * look.brows * (1 - 0.65 * t**1.5)
@@ -148,7 +158,7 @@ def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lid
         * smoothstep(0.010, 0.014, x)
         * smoothstep(0.056, 0.050, x)
     )
-    return colour + (dark - colour) * np.clip(0.85 * brow * strokes * (z > 0.15), 0, 1)[:, None]
+    return mix(colour, np.clip(0.85 * brow * strokes * (z > 0.15), 0, 1), dark)
 
 
 def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.ndarray) -> np.ndarray:
@@ -171,7 +181,7 @@ def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.nda
     area = np.maximum(area, moustache) * (1 - lips)
     density = (0.30 + 0.25 * look.beard if look.beard_style == "stubble" else 0.55 + 0.4 * look.beard) * area
     hairs = np.clip(0.75 + 0.35 * look.fine(point[:, 0] / 0.05, y / 0.08), 0, 1.2)
-    return colour + (look.hair * 0.8 - colour) * np.clip(density * hairs, 0, 1)[:, None]
+    return mix(colour, np.clip(density * hairs, 0, 1), look.hair * 0.8)
 
 
 def skin_texture(look: Complexion, shoes: Shoes) -> np.ndarray:
@@ -185,7 +195,7 @@ def skin_texture(look: Complexion, shoes: Shoes) -> np.ndarray:
         height, sock = shoes.socks
         ribs = 1 + 0.06 * np.sin(place.y * 2 * np.pi / 0.006)
         mask = 1 - smoothstep(height - 0.002, height, place.y)
-        colour = colour + (sock * ribs[:, None] - colour) * mask[:, None]
+        colour = mix(colour, mask, sock * ribs[:, None])
     return piece.image(colour)
 
 
@@ -197,11 +207,11 @@ def eye_texture(look: Complexion) -> np.ndarray:
     angle = np.degrees(np.arctan2(np.hypot(folded[:, 0], folded[:, 1]), folded[:, 2]))
     colour = np.tile([0.90, 0.88, 0.86], (len(point), 1))
     iris = 1 - smoothstep(26.0, 30.0, angle)
-    ring = np.exp(-(((angle - 27.0) / 3.0) ** 2))
-    colour = colour + (look.iris - colour) * iris[:, None]
-    colour = colour * (1 - 0.5 * ring[:, None])
+    ring = bump(angle, 27.0, 3.0)
+    colour = mix(colour, iris, look.iris)
+    colour = darken(colour, ring, 0.5)
     colour = colour * smoothstep(9.0, 12.0, angle)[:, None]
     glint = 1 - smoothstep(
         3.0, 5.0, np.degrees(np.hypot(folded[:, 0] - 0.002, folded[:, 1] - 0.003) / 0.0145)
     )
-    return piece.image(colour + (0.95 - colour) * (glint * (folded[:, 2] > 0))[:, None])
+    return piece.image(mix(colour, glint * (folded[:, 2] > 0), 0.95))

@@ -1,13 +1,14 @@
-"""Cloth as colour: weaves, patterns and prints as functions of metres along and around the body."""
+"""Colours of cloth: weaves, patterns and prints as functions of metres along and around the body."""
 
 import colorsys
 from dataclasses import dataclass
 
 import numpy as np
 
-from ghgs_lit.synthesis.people.noise import Noise, smoothstep
+from ghgs_lit.synthesis.people.blending import mix, smoothstep
+from ghgs_lit.synthesis.people.noise import Noise
 
-PATTERNS = {
+PATTERNS = {  # how often each is drawn, relative to the others
     "plain": 5.0, "melange": 2.0, "knit": 1.5, "stripes": 2.5, "pinstripes": 1.0, "checks": 2.0,
     "gingham": 1.0, "dots": 1.2, "blobs": 1.5, "camouflage": 0.7, "block": 1.4, "gradient": 0.6,
     "zigzag": 0.7, "argyle": 0.7,
@@ -19,7 +20,7 @@ NEUTRALS = (
 
 
 def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
-    """A colour that clothes are sold in, [3] in [0, 1]; `neutral` is the share of greys, navy, browns."""
+    """A colour of clothes, [3] in [0, 1]; `neutral` is the probability of greys, navy and browns."""
     if rng.random() < neutral:
         return np.clip(np.array(NEUTRALS[rng.integers(len(NEUTRALS))]) + rng.normal(0, 0.025, 3), 0.04, 0.96)
     saturation, value = rng.uniform(0.35, 0.88), rng.uniform(0.35, 0.92)
@@ -28,7 +29,17 @@ def random_colour(rng: np.random.Generator, neutral: float = 0.4) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Fabric:
-    """A pattern in up to three colours; `scale` is its period in metres, `tilt` turns it (radians)."""
+    """A pattern in up to three colours.
+
+    Attributes:
+        pattern: one of `PATTERNS`.
+        colours: [3, 3] in [0, 1].
+        scale: period of the pattern in metres.
+        tilt: rotation of the pattern in radians.
+        grain: strength of the fine noise.
+        noise: coarse noise.
+        fine: fine noise.
+    """
 
     pattern: str
     colours: np.ndarray
@@ -40,12 +51,12 @@ class Fabric:
 
 
 def sample_fabric(rng: np.random.Generator, patterns: tuple[str, ...] | None = None) -> Fabric:
-    """Draw a fabric, its pattern among `patterns` or any."""
+    """Draw a fabric with one of `patterns` (None: any)."""
     names = tuple(patterns or PATTERNS)
     weights = np.array([PATTERNS[name] for name in names])
     pattern = str(rng.choice(names, p=weights / weights.sum()))
     colours = np.stack([random_colour(rng, 0.35), random_colour(rng, 0.45), random_colour(rng, 0.3)])
-    if np.abs(colours[0] - colours[1]).sum() < 0.5:  # a pattern that nobody sees is none
+    if np.abs(colours[0] - colours[1]).sum() < 0.5:  # make the pattern visible
         colours[1] = np.where(colours[0].mean() > 0.5, colours[1] * 0.35, 0.65 + 0.35 * colours[1])
     scale = rng.uniform(0.03, 0.085)
     tilt = rng.uniform(-0.5, 0.5) if pattern in ("blobs", "camouflage") else 0.0
@@ -65,16 +76,15 @@ def _wave(x: np.ndarray) -> np.ndarray:
 
 
 def paint(fabric: Fabric, across: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Colours [k, 3] of points at metres `across` (around the body) and `along` it."""
+    """Colours [k, 3] of points at `across` metres around the body and `along` metres up it."""
     one, two, three = fabric.colours
     u = (np.cos(fabric.tilt) * across + np.sin(fabric.tilt) * along) / fabric.scale
     v = (np.cos(fabric.tilt) * along - np.sin(fabric.tilt) * across) / fabric.scale
     soft = 0.0012 / fabric.scale
     coarse = fabric.noise(across / 0.9, along / 0.9)
     fine = fabric.fine(across / 0.16, along / 0.16)
-    mix, third = _pattern(fabric.pattern, u, v, along, soft, coarse, fabric)
-    colour = one + (two - one) * mix[:, None]
-    colour = colour + (three - colour) * third[:, None]
+    second, third = _pattern(fabric.pattern, u, v, along, soft, coarse, fabric)
+    colour = mix(mix(one, second, two), third, three)
     shade = 1 + fabric.grain * fine + 0.025 * coarse
     if fabric.pattern == "knit":
         ribs = np.sin(2 * np.pi * across / 0.016) * (0.75 + 0.25 * np.sin(2 * np.pi * along / 0.013))
@@ -131,7 +141,7 @@ def _pattern(
 def print_emblem(
     colour: np.ndarray, x: np.ndarray, y: np.ndarray, centre: tuple[float, float], rng: np.random.Generator
 ) -> np.ndarray:
-    """Print a random emblem on colours [k, 3] at places (x, y) in metres of the front or back."""
+    """Print a random emblem on colours [k, 3] at places (x, y), metres, of front or back."""
     kind = str(rng.choice(("disc", "letters", "bars", "star", "rings", "number")))
     ink, size = random_colour(rng, 0.3), rng.uniform(0.05, 0.10)
     if np.abs(ink - colour.mean(0)).sum() < 0.6:
@@ -151,11 +161,11 @@ def print_emblem(
         mask = (1 - _edge(radius, 1, soft)) * _edge(_wave(radius * rng.uniform(1.6, 3.2)), 0.45, 4 * soft)
     else:
         mask = _glyphs(u, v, 2 if kind == "number" else int(rng.integers(3, 6)), soft, rng)
-    return colour + (ink - colour) * (0.94 * mask)[:, None]
+    return mix(colour, 0.94 * mask, ink)
 
 
 def _glyphs(u: np.ndarray, v: np.ndarray, count: int, soft: float, rng: np.random.Generator) -> np.ndarray:
-    """Letter-like signs: strokes between the nodes of a small grid, `count` of them in a row."""
+    """Mask [k] of `count` letter-like signs in a row: strokes between the nodes of a small grid."""
     mask = np.zeros_like(u)
     pitch, height = 2.6 / count, min(0.75, 2.2 / count)
     nodes = np.array([(i, j) for j in (-1.0, 0.0, 1.0) for i in (-0.36, 0.36)])

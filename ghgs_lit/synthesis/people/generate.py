@@ -1,4 +1,4 @@
-"""Make a person: shape, pose, clothes, colours, all from two numbers."""
+"""Generate a person from two numbers: shape, pose, clothes, colours."""
 
 from functools import lru_cache
 
@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis.people import garments
+from ghgs_lit.synthesis.people.ambient_occlusion import Spheres, ambient_occlusion, occluding_spheres
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, load_body, skin
-from ghgs_lit.synthesis.people.cloth import bottom_texture, shoe_texture, top_texture
+from ghgs_lit.synthesis.people.charts import Chart, chart
 from ghgs_lit.synthesis.people.complexion import (
     Complexion,
     eye_texture,
@@ -17,27 +18,32 @@ from ghgs_lit.synthesis.people.complexion import (
     sample_complexion,
     skin_texture,
 )
+from ghgs_lit.synthesis.people.garment_textures import bottom_texture, shoe_texture, top_texture
 from ghgs_lit.synthesis.people.garments import Figure
 from ghgs_lit.synthesis.people.hair import make_beanie, make_hair, sample_haircut, under_hat
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 from ghgs_lit.synthesis.people.meshing import triangles, vertex_normals
 from ghgs_lit.synthesis.people.noise import Noise
 from ghgs_lit.synthesis.people.outfit import Outfit, sample_outfit
+from ghgs_lit.synthesis.people.place import Place
 from ghgs_lit.synthesis.people.pose import sample_pose
-from ghgs_lit.synthesis.people.shading import shade, spheres
-from ghgs_lit.synthesis.people.surface import Chart, Place, chart
 
-Spheres = tuple[np.ndarray, np.ndarray]
-HIDDEN = 0.03  # skin and inner layers this far inside an outer garment are left out, metres
-YAW = 30.0  # degrees to either side
-TRIES = 6  # poses drawn until the arms are clear of the trunk, each with the arms spread further
+OVERLAP = 0.03  # how far skin and inner layers go on below an outer garment, metres
+MAX_YAW = 30.0  # degrees to either side
+MAX_POSES = 6  # drawn until the arms are clear of the trunk, each with the arms further apart
 
 
 def generate(seed: int, index: int) -> Person:
-    """Make person `index` of the family `seed`: the same person on every machine, up to rounding.
+    """Generate person `index` of the family `seed`: the same person on every machine, up to rounding.
 
-    Stands on y = 0, the box around the body centred over the origin, facing +z up to 30 degrees of yaw.
-    Metres; adults of 1.52 to 1.87 m, barefoot and upright. Part 0 is the skin; clothes, hair, a cap follow.
+    Args:
+        seed: number of the family, at least 0.
+        index: number of the person, at least 0.
+
+    Returns:
+        An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of
+        the body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin; clothes, hair
+        and a cap follow.
 
     Raises:
         InputError: a number is negative.
@@ -54,27 +60,31 @@ def generate(seed: int, index: int) -> Person:
     cut = sample_haircut(look_rng, female)
     if outfit.beanie:
         cut = under_hat(cut)
-    balls = spheres(figure)
-    parts = [naked_part(figure, outfit, look, balls, scalp=0.25 if cut.style == "bald" else 1.0)]
-    parts += dress(figure, outfit, balls, cloth_rng)
+    spheres = occluding_spheres(figure)
+    parts = [skin_part(figure, outfit, look, spheres, scalp=0.25 if cut.style == "bald" else 1.0)]
+    parts += dress(figure, outfit, spheres, cloth_rng)
     parts += make_hair(figure, cut, look, look_rng)
     if outfit.beanie:
         parts.append(make_beanie(figure, outfit.beanie))
     parts = [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
-    turn = Rotation.from_euler("y", pose_rng.uniform(-YAW, YAW), degrees=True).as_matrix()
-    return _on_the_ground(f"person_{seed}_{index:04d}", parts, figure.posed, turn)
+    turn = Rotation.from_euler("y", pose_rng.uniform(-MAX_YAW, MAX_YAW), degrees=True).as_matrix()
+    ground = min(float(part.vertices[:, 1].min()) for part in parts)
+    middle = 0.5 * (figure.posed.min(0) + figure.posed.max(0))
+    origin = np.array([middle[0], ground, middle[2]])
+    person = Person(f"person_{seed}_{index:04d}", tuple(parts), figure.posed)
+    return person.mapped(lambda vertices: (vertices - origin) @ turn.T)
 
 
 def pose_figure(body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator) -> Figure:
-    """The naked person in a pose whose arms do not run into the trunk."""
+    """The naked person in a random pose in which the arms do not run into the trunk."""
     rest, joints = body.rest(coefficients)
     faces = triangles(body.surfaces["body"].quads)
-    for attempt in range(TRIES):
-        pose = sample_pose(body, joints, rng, widen=attempt / (TRIES - 1))
-        posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], pose.transforms)
+    for attempt in range(MAX_POSES):
+        transforms = sample_pose(body, joints, rng, widen=attempt / (MAX_POSES - 1))
+        posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], transforms)
         if arm_depth(posed, faces) < 0.012:
             break
-    return Figure(rest, joints, faces, pose.transforms, posed)
+    return Figure(rest, joints, faces, transforms, posed)
 
 
 def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
@@ -90,7 +100,7 @@ def arm_depth(posed: np.ndarray, faces: np.ndarray) -> float:
 
 @lru_cache(maxsize=1)
 def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
-    """Some vertices of forearms and hands, and of what they must not run into."""
+    """Indices of some vertices of forearms and hands, and of what they must not run into."""
     body = load_body()
     bones = body.weights[:BODY_VERTICES].argmax(1)
     limbs = [name.startswith(("lowerarm", "wrist", "finger")) for name in body.bone_names]
@@ -98,20 +108,20 @@ def _limbs_and_trunk() -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(np.array(limbs)[bones])[::4], np.flatnonzero(np.array(trunk)[bones])[::3]
 
 
-def dress(figure: Figure, outfit: Outfit, balls: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Top and jacket, trousers or skirt, shoes, each without what the next one hides."""
+def dress(figure: Figure, outfit: Outfit, spheres: Spheres, rng: np.random.Generator) -> list[TexturedMesh]:
+    """Top and jacket, trousers or skirt, shoes; each without what the next one hides."""
     noise = Noise(rng, 2.3, 3.0, 128)
     top, jacket, bottom, shoes = outfit.top, outfit.jacket, outfit.bottom, outfit.shoes
     upper, lower, feet = chart("upper"), chart("skirt" if bottom.kind == "skirt" else "lower"), chart("shoes")
 
     def sew(piece: Chart, points: np.ndarray, field: np.ndarray, texture: np.ndarray) -> TexturedMesh:
-        return piece.mesh(points, field, piece.shaded(texture, shade(piece, points, balls)))
+        return piece.mesh(points, field, piece.shaded(texture, ambient_occlusion(piece, points, spheres)))
 
     field = garments.top_field(upper.place, top)
     if top.tucked:
-        field = np.minimum(field, HIDDEN - garments.bottom_field(upper.place, bottom))
+        field = np.minimum(field, OVERLAP - garments.bottom_field(upper.place, bottom))
     if jacket:
-        field = np.minimum(field, HIDDEN - garments.top_field(upper.place, jacket))
+        field = np.minimum(field, OVERLAP - garments.top_field(upper.place, jacket))
     points, texture = garments.drape_top(figure, top, noise), top_texture(top, noise, rng)
     parts = [sew(upper, points, field, texture)]
     if top.neck == "collar":
@@ -123,7 +133,7 @@ def dress(figure: Figure, outfit: Outfit, balls: Spheres, rng: np.random.Generat
     field = garments.bottom_field(lower.place, bottom)
     for outer in (jacket, None if top.tucked else top):
         if outer:
-            field = np.minimum(field, HIDDEN - garments.top_field(lower.place, outer))
+            field = np.minimum(field, OVERLAP - garments.top_field(lower.place, outer))
     if bottom.kind == "skirt":
         points = garments.drape_skirt(figure, bottom, noise, rng)
     else:
@@ -131,15 +141,15 @@ def dress(figure: Figure, outfit: Outfit, balls: Spheres, rng: np.random.Generat
     parts.append(sew(lower, points, field, bottom_texture(bottom, noise)))
     field = garments.shoe_field(feet.place, shoes)
     if bottom.hem < 0.2:  # what trousers cover
-        field = np.minimum(field, bottom.hem + HIDDEN - feet.place.y)
+        field = np.minimum(field, bottom.hem + OVERLAP - feet.place.y)
     parts.append(sew(feet, garments.shape_shoes(figure, shoes), field, shoe_texture(shoes)))
     return parts
 
 
-def naked_part(
-    figure: Figure, outfit: Outfit, look: Complexion, balls: Spheres, scalp: float
+def skin_part(
+    figure: Figure, outfit: Outfit, look: Complexion, spheres: Spheres, scalp: float
 ) -> TexturedMesh:
-    """Head, eyes and the skin that clothes leave bare: one mesh, so that normals agree across the neck."""
+    """Head, eyes and the skin that clothes leave bare, as one mesh, so that normals agree at the neck."""
     textures = {
         "head": head_texture(look, scalp),
         "skin": skin_texture(look, outfit.shoes),
@@ -148,14 +158,14 @@ def naked_part(
     parts = []
     for name, texture in textures.items():
         piece = chart(name)
-        points = skin(piece.operator @ figure.rest, piece.weights, figure.transforms)
+        points = skin(piece.interpolation @ figure.rest, piece.weights, figure.transforms)
         field = np.ones(len(points))
         if name != "eyes":
-            texture = piece.shaded(texture, shade(piece, points, balls))
+            texture = piece.shaded(texture, ambient_occlusion(piece, points, spheres))
         if name == "skin":
             field = bare_field(piece.place, outfit)
-            under = np.clip(HIDDEN - field, 0.0, HIDDEN)  # what clothes cover keeps clear of them
-            points = points - 0.12 * under[:, None] * vertex_normals(points, piece.vertex_faces)
+            under = np.clip(OVERLAP - field, 0.0, OVERLAP)  # skin below clothes must not pierce them
+            points = points - 0.12 * under[:, None] * vertex_normals(points, piece.point_faces)
         parts.append(piece.mesh(points, field, texture))
     return join(parts)
 
@@ -177,26 +187,10 @@ def join(parts: list[TexturedMesh]) -> TexturedMesh:
 
 
 def bare_field(place: Place, outfit: Outfit) -> np.ndarray:
-    """Positive where skin shows, and a little way under the clothes."""
+    """Positive where skin shows, and `OVERLAP` further below the clothes."""
     covered = np.maximum(garments.top_field(place, outfit.top), garments.shoe_field(place, outfit.shoes))
     bottom = garments.bottom_field(place, outfit.bottom)
-    if outfit.bottom.kind == "skirt":  # legs are seen from below
+    if outfit.bottom.kind == "skirt":  # below it legs are visible
         bottom = np.minimum(bottom, place.y - outfit.bottom.hem - 0.12)
     covered = np.maximum(covered, bottom)
-    return HIDDEN - covered
-
-
-def _on_the_ground(name: str, parts: list[TexturedMesh], naked: np.ndarray, turn: np.ndarray) -> Person:
-    """Turn about y, centre in x and z, put the lowest point on y = 0."""
-    low = min(float(part.vertices[:, 1].min()) for part in parts)
-    middle = 0.5 * (naked.min(0) + naked.max(0))
-    shift = np.array([-middle[0], -low, -middle[2]])
-
-    def place(points: np.ndarray) -> np.ndarray:
-        return ((points.astype(np.float64) + shift) @ turn.T).astype(np.float32)
-
-    moved = tuple(
-        TexturedMesh(place(part.vertices), part.faces, part.uv, part.texture, part.alpha_cutoff)
-        for part in parts
-    )
-    return Person(name, moved, place(naked))
+    return OVERLAP - covered

@@ -1,4 +1,4 @@
-"""Hair: a shell over the scalp, a curtain that falls from it, a tail or a bun."""
+"""Hair (a shell over the scalp, a curtain that falls from it, a ponytail, a bun) and knitted caps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ghgs_lit.synthesis.people.blending import bump, smoothstep
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body, skin
+from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.complexion import Complexion
 from ghgs_lit.synthesis.people.fabric import Fabric, paint
 from ghgs_lit.synthesis.people.garments import Figure, push_out
 from ghgs_lit.synthesis.people.mesh import TexturedMesh
 from ghgs_lit.synthesis.people.meshing import triangles, vertex_normals
-from ghgs_lit.synthesis.people.noise import smoothstep
-from ghgs_lit.synthesis.people.surface import chart, face_frame, hairline
+from ghgs_lit.synthesis.people.place import face_frame, hairline
 
 STYLES = ("bald", "crop", "short", "quiff", "afro", "bob", "long", "tail", "bun")
 SHARES = {  # by sex (True: female), in the order of the styles
@@ -25,7 +26,14 @@ ROWS, COLUMNS = 56, 80
 
 @dataclass(frozen=True)
 class Haircut:
-    """`thickness` of the shell (metres), height where a curtain ends on the average body, `wave` (0 to 1)."""
+    """A haircut.
+
+    Attributes:
+        style: one of `STYLES`.
+        thickness: of the shell in metres.
+        end: height on the average body where a curtain ends, metres.
+        wave: how wavy the strands are, 0 to 1.
+    """
 
     style: str
     thickness: float
@@ -45,7 +53,7 @@ def sample_haircut(rng: np.random.Generator, female: bool) -> Haircut:
 
 
 def make_hair(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> list[TexturedMesh]:
-    """Parts of the hair in the pose; none for a bald head."""
+    """Meshes of the hair in the pose; none for a bald head."""
     if cut.style == "bald":
         return []
     if cut.style in ("bob", "long"):
@@ -71,8 +79,8 @@ def _shell(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
     piece = chart("scalp")
     point = piece.place.point
     above = hairline(point)
-    points = piece.operator @ figure.rest
-    normals = vertex_normals(points, piece.vertex_faces)
+    points = piece.interpolation @ figure.rest
+    normals = vertex_normals(points, piece.point_faces)
     for _ in range(6):
         normals = piece.smooth @ normals
     centred = point - [0.0, 1.585, 0.105]
@@ -129,7 +137,7 @@ def _grid_mesh(
 
 
 def _hanging_weights(heights: np.ndarray, neck: float) -> np.ndarray:
-    """Skinning weights [n, b] of hair at rest heights [n]: the head's above the neck, then the chest's."""
+    """Skinning weights [n, b] of hair at rest heights [n]: above the neck the head's, below the chest's."""
     body = load_body()
     weights = np.zeros((len(heights), len(body.bone_names)))
     chest = smoothstep(neck, neck - 0.16, heights)
@@ -148,7 +156,7 @@ def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
 
 
 def _curtain(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
-    """Hair that leaves the crown in all directions, frames the face and falls behind and beside the neck."""
+    """Hair that grows from the crown in all directions and falls behind and beside the neck."""
     centre, scale, radius_at = _skull(figure)
     columns = np.linspace(-1, 1, COLUMNS)
     half = ROWS // 2
@@ -180,7 +188,7 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
     """Centre [3] of the cranium, its size against the average one, its radius along directions [..., 3]."""
     piece = chart("head")
     upper = piece.place.y > 1.50
-    head, mean = (piece.operator @ figure.rest)[upper], piece.place.point[upper]
+    head, mean = (piece.interpolation @ figure.rest)[upper], piece.place.point[upper]
     scale = np.ptp(head[:, 1]) / np.ptp(mean[:, 1])
     centre = head.mean(0) + (np.array([0.0, 1.575, 0.100]) - mean.mean(0)) * scale
     radii = np.linalg.norm(head - centre, axis=1)
@@ -195,37 +203,35 @@ def _skull(figure: Figure) -> tuple[np.ndarray, float, Callable[[np.ndarray], np
 
 
 def _face(height: np.ndarray) -> np.ndarray:
-    """Half of the angle, in degrees, that hair leaves to the face at heights of the average head."""
+    """Half of the angle in degrees around the face without hair, at heights of the average head."""
     return np.interp(height, [1.44, 1.552, 1.572, 1.600, 1.622, 1.634, 1.64], [98, 84, 74, 60, 42, 12, 0.5])
 
 
 def make_beanie(figure: Figure, fabric: Fabric) -> TexturedMesh:
     """A knitted cap down to the ears, its brim turned up."""
     piece = chart("scalp")
-    points = piece.operator @ figure.rest
+    points = piece.interpolation @ figure.rest
     for _ in range(12):
         points = piece.smooth @ points
     at = face_frame(piece.place.point)
     above = at[:, 1] - 1.610 - 0.30 * (at[:, 2] - 0.2)
     height = 0.019 + 0.006 * (1 - smoothstep(0.040, 0.046, above)) + 0.010 * smoothstep(0.03, 0.1, above)
-    points = points + height[:, None] * vertex_normals(points, piece.vertex_faces)
+    points = points + height[:, None] * vertex_normals(points, piece.point_faces)
     texel = face_frame(piece.texel_place.point)
     azimuth = np.arctan2(texel[:, 0], texel[:, 2] - 0.105)
     rise = texel[:, 1] - 1.610 - 0.30 * (texel[:, 2] - 0.2)
-    colour = (
-        paint(fabric, azimuth * 0.09, rise) * (1 - 0.35 * np.exp(-(((rise - 0.043) / 0.004) ** 2)))[:, None]
-    )
+    colour = paint(fabric, azimuth * 0.09, rise) * (1 - 0.35 * bump(rise, 0.043, 0.004))[:, None]
     return piece.mesh(skin(points, piece.weights, figure.transforms), above, piece.image(colour))
 
 
 def under_hat(cut: Haircut) -> Haircut:
-    """The haircut as a hat leaves it: flat on the scalp."""
+    """The haircut below a hat: flat on the scalp."""
     style = cut.style if cut.style in ("bald", "bob", "long") else "crop"
     return Haircut(style, min(cut.thickness, 0.007), cut.end, cut.wave)
 
 
 def _tail(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:
-    """A pony tail or a bun: a tube of rings behind the crown."""
+    """A ponytail or a bun: a tube of rings behind the crown."""
     body = load_body()
     skull = body.mean[:BODY_VERTICES]
     anchor = int(np.argmin(np.linalg.norm(skull - [0.0, rng.uniform(1.57, 1.64), 0.0], axis=1)))

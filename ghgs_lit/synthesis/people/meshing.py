@@ -1,6 +1,7 @@
 """Operations on triangle and quad meshes: normals, subdivision, smoothing, clipping, rasterising UV."""
 
 import numpy as np
+import trimesh
 from scipy import sparse
 from scipy.ndimage import distance_transform_edt
 
@@ -11,18 +12,27 @@ def triangles(quads: np.ndarray) -> np.ndarray:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals [n, 3], faces weighted by area; vertices of no face get (0, 1, 0)."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    total = np.empty_like(vertices)
-    for axis in range(3):
-        total[:, axis] = np.bincount(faces.ravel(), np.repeat(normals[:, axis], 3), minlength=len(vertices))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
+    """Unit normals [n, 3], the mean of the faces around each vertex weighted by area; 0 where they cancel."""
+    double_areas = trimesh.triangles.cross(vertices[faces])  # their length is what weights them
+    return trimesh.geometry.mean_vertex_normals(len(vertices), faces, double_areas)
+
+
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit vertex normals [n, 3] float32; vertices that a UV seam splits at one position share one."""
+    first, merged = trimesh.grouping.unique_rows(vertices, digits=6)
+    return vertex_normals(vertices[first].astype(np.float64), merged[faces])[merged].astype(np.float32)
 
 
 def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Split each quad in four: the operator [count + edges + m, count] to new vertices, quads [4 m, 4]."""
+    """Split each quad in four.
+
+    Args:
+        quads: [m, 4] indices of vertices.
+        count: number of vertices.
+
+    Returns:
+        The operator [count + edges + m, count] that gives the new vertices, and the new quads [4 m, 4].
+    """
     edges = np.sort(np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2), 1)
     unique, inverse = np.unique(edges, axis=0, return_inverse=True)
     mid = count + inverse.reshape(-1, 4)
@@ -39,7 +49,7 @@ def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndar
 
 
 def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
-    """Operator [count, count] halfway to the mean of a vertex's neighbours; the border stays in place."""
+    """Operator [count, count]: half the way to the mean of the neighbours; the border stays in place."""
     pairs = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
     graph = sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count)).tocsr()
     both = graph + graph.T
@@ -55,10 +65,14 @@ def neighbour_mean(faces: np.ndarray, count: int) -> sparse.csr_matrix:
 
 
 def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cut a mesh along the zero line of a value per vertex; what is positive stays.
+    """Cut a mesh along the zero line of a field and keep the positive side.
+
+    Args:
+        faces: [m, 3] indices of vertices.
+        field: [n] a value at each vertex.
 
     Returns:
-        faces [k, 3] over new vertices, and for each of these two old ones `a`, `b` and the share `t` of `b`:
+        Faces [k, 3] of new vertices, and for each of these two old ones `a`, `b` and the share `t` of `b`:
         an attribute of the new mesh is `(1 - t) * x[a] + t * x[b]`.
     """
     count = len(field)
@@ -90,14 +104,17 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tuple[np.ndarray, ...]:
-    """Find what each texel of a texture shows.
+    """Find the face that each texel of a texture shows.
 
     Args:
-        uv: [n, 2] in [0, 1], origin at the bottom left; faces: [m, 3].
+        uv: [n, 2] in [0, 1], origin at the bottom left.
+        faces: [m, 3].
+        height: of the texture in texels.
+        width: of the texture in texels.
 
     Returns:
-        texels [k] (flat numbers of the covered ones), their face [k] and barycentric coordinates [k, 3], and
-        `nearest` [height * width]: the position in `texels` of the covered texel nearest to each texel.
+        Flat indices [k] of the covered texels, their face [k] and barycentric coordinates [k, 3], and
+        `nearest` [height * width]: for each texel the position among the k of the nearest covered one.
     """
     corners = np.stack([uv[faces][..., 0] * width, (1 - uv[faces][..., 1]) * height], -1) - 0.5
     low = np.maximum(np.ceil(corners.min(1) - 1e-6).astype(np.int64), 0)

@@ -1,7 +1,7 @@
-"""What a person wears: drawn once, then cut (`garments`) and painted (`cloth`).
+"""What a person wears, as numbers: `garments` makes shapes of it, `garment_textures` colours.
 
 Heights are those of the average body at rest (metres above the soles; crotch 0.77, waist about 1.0, neck
-1.43), sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
+1.43); sleeves are measured from the shoulder joint along the arm (elbow 0.25, wrist 0.50).
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,17 @@ SKIRTINGS = ("plain", "dots", "blobs", "checks", "zigzag", "gradient", "gingham"
 class Top:
     """A garment for the upper body.
 
-    `kind`: tee, sweater, shirt, tank or jacket. `sleeve` is its length; of a tank, how far from the middle
-    the armhole is. `neck` is the neckline: crew, scoop, vee, collar or straps. `ease` is the air between
-    cloth and body in metres, `hang` (0 to 1) how far it falls straight down from the chest, `opening` the
-    half width in metres of a jacket that is not closed.
+    Attributes:
+        kind: tee, sweater, shirt, tank or jacket.
+        sleeve: length of the sleeves in metres; of a tank, distance of the armholes from the middle.
+        hem: height in metres.
+        neck: neckline: crew, scoop, vee, collar or straps.
+        ease: air between cloth and body in metres.
+        hang: 0 to 1, how straight it falls from the chest.
+        tucked: into trousers or skirt.
+        fabric: its cloth.
+        emblem: printed on the front, the back or both; None: nowhere.
+        opening: half width in metres of the gap of an open jacket.
     """
 
     kind: str
@@ -43,10 +50,16 @@ class Top:
 
 @dataclass(frozen=True)
 class Bottom:
-    """Trousers (jeans, chinos, joggers, leggings, shorts) or a skirt.
+    """Trousers or a skirt.
 
-    `waist` and `hem` are heights, `width` the radius of a leg's hem in metres; of shorts, what it has over
-    the thigh; of a skirt, its flare.
+    Attributes:
+        kind: jeans, chinos, joggers, leggings, shorts or skirt.
+        waist: height in metres.
+        hem: height in metres.
+        width: radius of a leg at the hem in metres; of shorts, how much wider than the thigh; of a skirt, its
+            flare.
+        fabric: its cloth.
+        belt: colour [3]; None: no belt.
     """
 
     kind: str
@@ -59,7 +72,14 @@ class Bottom:
 
 @dataclass(frozen=True)
 class Shoes:
-    """Shoes (sneakers, leather, boots): `top` height, colours of upper, sole and laces; socks or none."""
+    """Shoes and socks.
+
+    Attributes:
+        kind: sneakers, leather or boots.
+        top: height in metres.
+        upper, sole, laces: colours [3].
+        socks: height in metres and colour [3]; None: no socks.
+    """
 
     kind: str
     top: float

@@ -1,8 +1,9 @@
 """Standing poses within the limits of human joints: gestures for the arms, stances for the legs.
 
-Arms are posed forward: a direction of the upper arm, an elbow angle, and where the forearm heads. Legs are
-solved from the feet up: the soles are placed on the ground and the knees follow, so feet do not float.
-Directions are in the person's frame: +x left, +y up, +z forward; for the right side x is mirrored.
+Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and where the forearm
+points. Legs are posed by inverse kinematics: the soles are placed on the ground and the knees follow, so feet
+do not float. Directions are in the person's frame: +x left, +y up, +z forward; for the right side x is
+mirrored.
 """
 
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ SPINE = ("spine05", "spine04", "spine03", "spine02", "spine01")
 NECK = ("neck01", "neck02", "neck03", "head")
 FINGERS = ("finger2", "finger3", "finger4", "finger5")
 
-# Upper arm (x outwards), where the forearm heads; elbow, forearm twist, curl of the fingers: mean and half
-# range in degrees. Directions need no unit length.
+# Direction of the upper arm (x outwards), direction in which the elbow bends; then elbow, forearm twist and
+# curl of the fingers as (mean, half range) in degrees. Directions need no unit length.
 GESTURES = {
     "relaxed": ((0.20, -1.0, 0.00), (-0.25, 0.2, 1.0), (18, 9), (-35, 15), (28, 14)),
     "loose": ((0.34, -1.0, 0.10), (-0.35, 0.2, 1.0), (32, 14), (-25, 15), (30, 15)),
@@ -37,29 +38,46 @@ STANCES = ("stand", "contrapposto", "walk", "step", "crouch", "wide")
 
 
 @dataclass(frozen=True)
-class Pose:
-    """Transforms of the bones [b, 3, 4] from rest to pose, and what was asked for."""
+class _Skeleton:
+    """Joints at rest [b, 3] and the rotations [b, 3, 3] of the bones in world axes, which posing fills in."""
 
-    transforms: np.ndarray
-    stance: str
-    gestures: tuple[str, str]
+    body: BodyModel
+    joints: np.ndarray
+    rotations: np.ndarray
+
+    def rest(self, *bones: str, end: str = "") -> np.ndarray:
+        """Joints [k, 3] of k named bones at rest; `end` is added to every name."""
+        return self.joints[[self.body.bone(bone + end) for bone in bones]]
+
+    def rotate(self, bone: str, rotation: np.ndarray) -> None:
+        """Set the rotation [3, 3] of a bone."""
+        self.rotations[self.body.bone(bone)] = rotation
 
 
-def sample_pose(body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0) -> Pose:
-    """Draw a pose for a shape with rest `joints` [b, 3]; `widen` (0 to 1) moves the arms off the body."""
-    local = np.tile(np.eye(3), (len(joints), 1, 1))
+def sample_pose(
+    body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0
+) -> np.ndarray:
+    """Draw a pose.
+
+    Args:
+        body: the body model.
+        joints: [b, 3] at rest, of one shape.
+        rng: random numbers.
+        widen: 0 to 1, how far the arms move away from the body.
+
+    Returns:
+        Transforms [b, 3, 4] of the bones from rest to pose.
+    """
     stance = str(rng.choice(STANCES, p=(0.24, 0.22, 0.22, 0.12, 0.08, 0.12)))
-    root = _bend_trunk(body, local, stance, rng)
-    rotations = _compose(body.bone_parents, local)
+    local = np.tile(np.eye(3), (len(joints), 1, 1))
+    pelvis = _bend_trunk(body, local, stance, rng)
+    skeleton = _Skeleton(body, joints, _compose(body.bone_parents, local))
     gestures = _gestures(stance, rng)
-    swing = rng.uniform(0.25, 0.5) * rng.choice((-1, 1))  # of the left foot, in strides
+    stride = rng.uniform(0.25, 0.5) * rng.choice((-1, 1))  # of the left foot, in lengths of the leg
     for side, gesture in zip((1, -1), gestures, strict=True):
-        _pose_arm(
-            body, joints, rotations, side, gesture, widen, -swing * side if stance == "walk" else 0.0, rng
-        )
-    hips = _pose_legs(body, joints, rotations, root, stance, swing, rng)
-    transforms = bone_transforms(body.bone_parents, joints, rotations, hips)
-    return Pose(transforms, stance, gestures)
+        _pose_arm(skeleton, side, gesture, widen, -stride * side if stance == "walk" else 0.0, rng)
+    root = _pose_legs(skeleton, pelvis, stance, stride, rng)
+    return bone_transforms(body.bone_parents, joints, skeleton.rotations, root)
 
 
 def _gestures(stance: str, rng: np.random.Generator) -> tuple[str, str]:
@@ -84,13 +102,10 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
         twist *= 0.5
     pelvis = Rotation.from_euler("zxy", [tilt, 0.35 * lean, 0.25 * twist], degrees=True).as_matrix()
     local[body.bone("root")] = pelvis
-    for name in SPINE:
-        share = [side / 5, 0.65 * lean / 5, 0.75 * twist / 5]
-        local[body.bone(name)] = Rotation.from_euler("zxy", share, degrees=True).as_matrix()
     nod, turn, roll = rng.uniform(-9, 9) - 0.6 * lean, rng.uniform(-30, 30) - 0.5 * twist, rng.uniform(-6, 6)
-    for name in NECK:
-        share = [roll / 4, nod / 4, turn / 4]
-        local[body.bone(name)] = Rotation.from_euler("zxy", share, degrees=True).as_matrix()
+    for names, angles in ((SPINE, (side, 0.65 * lean, 0.75 * twist)), (NECK, (roll, nod, turn))):
+        share = Rotation.from_euler("zxy", np.array(angles) / len(names), degrees=True).as_matrix()
+        local[[body.bone(name) for name in names]] = share
     return pelvis
 
 
@@ -111,126 +126,102 @@ def _frame(along: np.ndarray, across: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(third, first), third], 1)
 
 
-def _subtree(body: BodyModel, bone: int) -> list[int]:
-    """A bone and all that hang on it."""
-    members = [bone]
-    for child in range(bone + 1, len(body.bone_parents)):
-        if body.bone_parents[child] in members:
+def _descendants(body: BodyModel, bone: str) -> list[int]:
+    """A bone and all bones below it in the rig."""
+    members = [body.bone(bone)]
+    for child, parent in enumerate(body.bone_parents):
+        if parent in members:
             members.append(child)
     return members
 
 
 def _pose_arm(
-    body: BodyModel,
-    joints: np.ndarray,
-    rotations: np.ndarray,
-    side: int,
-    gesture: str,
-    widen: float,
-    swing: float,
-    rng: np.random.Generator,
+    skeleton: _Skeleton, side: int, gesture: str, widen: float, swing: float, rng: np.random.Generator
 ) -> None:
-    """Set the rotations of one arm (side +1: left) in place; `swing` moves it along when walking."""
+    """Rotate one arm (side +1: left); `swing` moves it forward (back where negative) when walking."""
     end = ".L" if side > 0 else ".R"
     mirror = np.array([side, 1.0, 1.0])
-    upper, heads, elbow, forearm, curl = GESTURES[gesture]
-    chest = rotations[body.bone("spine01")]
+    upper, bend, elbow, forearm, curl = GESTURES[gesture]
+    chest = skeleton.rotations[skeleton.body.bone("spine01")]
     upper = np.array(upper) + rng.normal(0, 0.07, 3) + np.array([0.55 * widen, 0, 0.9 * swing])
     upper = upper / np.linalg.norm(upper)
     flex, twist, curl = (
         np.radians(mean + half * rng.uniform(-1, 1)) for mean, half in (elbow, forearm, curl)
     )
-    heads = np.array(heads) + rng.normal(0, 0.08, 3)
-    heads = heads - (heads @ upper) * upper
-    lower = np.cos(flex) * upper + np.sin(flex) * heads / np.linalg.norm(heads)
+    bend = np.array(bend) + rng.normal(0, 0.08, 3)
+    bend = bend - (bend @ upper) * upper
+    lower = np.cos(flex) * upper + np.sin(flex) * bend / np.linalg.norm(bend)
     upper, lower = chest @ (mirror * upper), chest @ (mirror * lower)
 
-    # The shoulder girdle follows an arm that goes up.
+    # The shoulder girdle follows a raised arm.
     lift = np.radians(np.interp(upper @ chest[:, 1], [-0.6, 0.0, 0.9], [0.0, 6.0, 24.0])) * side
     girdle = Rotation.from_rotvec(chest @ np.array([0, 0, lift])).as_matrix() @ chest
     for name, weight in (("clavicle", 0.6), ("shoulder01", 1.0)):
-        rotations[body.bone(name + end)] = chest @ _fraction(chest.T @ girdle, weight)
+        skeleton.rotate(name + end, chest @ _fraction(chest.T @ girdle, weight))
 
-    shoulder, elbow_at, wrist = (joints[body.bone(n + end)] for n in ("upperarm01", "lowerarm01", "wrist"))
+    shoulder, elbow_at, wrist = skeleton.rest("upperarm01", "lowerarm01", "wrist", end=end)
     hinge_rest = np.cross(elbow_at - shoulder, wrist - elbow_at)
     hinge = np.cross(upper, lower)
     full = _frame(upper, hinge) @ _frame(elbow_at - shoulder, hinge_rest).T
-    swung = _minimal(girdle @ (elbow_at - shoulder), upper) @ girdle
-    rotations[body.bone("upperarm01" + end)] = swung @ _fraction(swung.T @ full, 0.5)
-    rotations[body.bone("upperarm02" + end)] = full
+    swung = _shortest(girdle @ (elbow_at - shoulder), upper) @ girdle
+    skeleton.rotate("upperarm01" + end, swung @ _fraction(swung.T @ full, 0.5))
+    skeleton.rotate("upperarm02" + end, full)
     fore = _frame(lower, hinge) @ _frame(wrist - elbow_at, hinge_rest).T
     pronate = Rotation.from_rotvec(lower * twist * side).as_matrix()
-    rotations[body.bone("lowerarm01" + end)] = fore
-    rotations[body.bone("lowerarm02" + end)] = _fraction(pronate, 0.5) @ fore
-    _pose_hand(body, joints, rotations, end, pronate @ fore, curl, rng)
+    skeleton.rotate("lowerarm01" + end, fore)
+    skeleton.rotate("lowerarm02" + end, _fraction(pronate, 0.5) @ fore)
+    _pose_hand(skeleton, end, pronate @ fore, curl, rng)
 
 
 def _pose_hand(
-    body: BodyModel,
-    joints: np.ndarray,
-    rotations: np.ndarray,
-    end: str,
-    hand: np.ndarray,
-    curl: float,
-    rng: np.random.Generator,
+    skeleton: _Skeleton, end: str, hand: np.ndarray, curl: float, rng: np.random.Generator
 ) -> None:
-    """Bend the wrist a little and curl the fingers, in place."""
-    at = {name: joints[body.bone(name + end)] for name in ("finger2-1", "finger5-1")}
-    across = at["finger2-1"] - at["finger5-1"]
-    across /= np.linalg.norm(across)
+    """Bend the wrist a little and curl the fingers by `curl` radians."""
+    index, little = skeleton.rest("finger2-1", "finger5-1", end=end)
+    across = (index - little) / np.linalg.norm(index - little)
     rest_curl = 0.0
     for finger in FINGERS:
-        one, two, three = (joints[body.bone(f"{finger}-{i}{end}")] for i in (1, 2, 3))
+        one, two, three = skeleton.rest(*(f"{finger}-{i}" for i in (1, 2, 3)), end=end)
         rest_curl += np.cross(across, two - one) @ (three - two)
     across *= np.sign(rest_curl)
-    bend = rng.uniform(-0.2, 0.2)
-    hand = hand @ Rotation.from_rotvec(across * bend).as_matrix()
-    for bone in _subtree(body, body.bone("wrist" + end)):
-        rotations[bone] = hand
-    along = {
-        f: joints[body.bone(f"{f}-2{end}")] - joints[body.bone(f"{f}-1{end}")] for f in (*FINGERS, "finger1")
-    }
-    along = {finger: way / np.linalg.norm(way) for finger, way in along.items()}
+    hand = hand @ Rotation.from_rotvec(across * rng.uniform(-0.2, 0.2)).as_matrix()
+    skeleton.rotations[_descendants(skeleton.body, "wrist" + end)] = hand
+    along = {}
+    for finger in (*FINGERS, "finger1"):
+        one, two = skeleton.rest(f"{finger}-1", f"{finger}-2", end=end)
+        along[finger] = (two - one) / np.linalg.norm(two - one)
     middle = np.mean([along[finger] for finger in FINGERS], 0)
     close = rng.uniform(0.2, 0.9)  # the hand at rest is spread
     for number, finger in enumerate(FINGERS):
         amount = curl * (0.75 + 0.14 * number) + rng.uniform(-0.06, 0.06)
-        sideways = _minimal(along[finger], (1 - close) * along[finger] + close * middle)
+        sideways = _shortest(along[finger], (1 - close) * along[finger] + close * middle)
         for joint, share in enumerate((0.55, 1.35, 1.7), start=1):
             turn = Rotation.from_rotvec(across * amount * share).as_matrix()
-            rotations[body.bone(f"{finger}-{joint}{end}")] = hand @ turn @ sideways
-    thumb = hand @ _minimal(along["finger1"], along["finger1"] + 0.5 * close * middle)
+            skeleton.rotate(f"{finger}-{joint}{end}", hand @ turn @ sideways)
+    thumb = hand @ _shortest(along["finger1"], along["finger1"] + 0.5 * close * middle)
     for joint in (1, 2, 3):
-        rotations[body.bone(f"finger1-{joint}{end}")] = thumb
+        skeleton.rotate(f"finger1-{joint}{end}", thumb)
 
 
 def _pose_legs(
-    body: BodyModel,
-    joints: np.ndarray,
-    rotations: np.ndarray,
-    pelvis: np.ndarray,
-    stance: str,
-    swing: float,
-    rng: np.random.Generator,
+    skeleton: _Skeleton, pelvis: np.ndarray, stance: str, stride: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Place the soles on the ground, solve hips and knees in place; return where the root joint goes [3]."""
-    root = joints[body.bone("root")]
-    feet = _feet(stance, swing, joints, body, rng)
+    """Place the soles on the ground, solve hips and knees; return where the root joint goes [3]."""
+    (root,) = skeleton.rest("root")
+    feet = _feet(skeleton, stance, stride, rng)
     ankles, hips, lengths = [], [], []
     for end, (across, forward, yaw, heel) in zip((".L", ".R"), feet, strict=True):
-        hip, knee, ankle, toes = (
-            joints[body.bone(n + end)] for n in ("upperleg01", "lowerleg01", "foot", "toe2-1")
-        )
+        hip, knee, ankle, toes = skeleton.rest("upperleg01", "lowerleg01", "foot", "toe2-1", end=end)
         turn = Rotation.from_euler("y", yaw, degrees=True).as_matrix()
         lifted = turn @ Rotation.from_euler("x", heel, degrees=True).as_matrix()
         ball = np.array([across, toes[1], forward]) + turn @ [0, 0, toes[2] - ankle[2]]
         ankles.append(ball + lifted @ (ankle - toes))
         hips.append(pelvis @ (hip - root))
         lengths.append((np.linalg.norm(knee - hip), np.linalg.norm(ankle - knee)))
-        rotations[body.bone("foot" + end)] = lifted
-        rotations[body.bone("toe2-1" + end)] = turn
+        skeleton.rotate("foot" + end, lifted)
+        skeleton.rotate("toe2-1" + end, turn)
     centre = np.mean(ankles, 0) - np.mean(hips, 0)
-    if stance == "contrapposto":  # the weight rests on the leg whose hip is the higher one
+    if stance == "contrapposto":  # the leg with the higher hip carries the weight
         centre += 0.3 * (ankles[0] - ankles[1]) * (1 if hips[0][1] > hips[1][1] else -1)
     bend = rng.uniform(0.55, 0.8) if stance == "crouch" else 1.0
     heights = []
@@ -241,42 +232,40 @@ def _pose_legs(
     centre[1] = min(heights)
     for end, ankle, hip, (thigh, shin), foot in zip((".L", ".R"), ankles, hips, lengths, feet, strict=True):
         toward = Rotation.from_euler("y", 0.7 * foot[2], degrees=True).as_matrix() @ [0, 0, 1.0]
-        _solve_leg(body, joints, rotations, end, centre + hip, ankle, (thigh, shin), toward)
+        _solve_leg(skeleton, end, centre + hip, ankle, (thigh, shin), toward)
     return centre
 
 
 def _feet(
-    stance: str, swing: float, joints: np.ndarray, body: BodyModel, rng: np.random.Generator
+    skeleton: _Skeleton, stance: str, stride: float, rng: np.random.Generator
 ) -> list[tuple[float, float, float, float]]:
     """For the left and the right foot: ankle across and forward (metres), yaw and heel lift (degrees)."""
-    leg = joints[body.bone("upperleg01.L"), 1]
-    half = joints[body.bone("upperleg01.L"), 0] * rng.uniform(0.85, 1.25)
+    half, leg, _ = skeleton.rest("upperleg01.L")[0]
+    half = half * rng.uniform(0.85, 1.25)
     feet = []
     for side in (1, -1):
         x, z, yaw, heel = side * half, rng.normal(0, 0.015), side * rng.uniform(2, 16), 0.0
         if stance in ("walk", "step"):
             scale = 0.62 if stance == "walk" else 0.35
-            x, z = side * half * 0.7, scale * leg * swing * side
+            x, z = side * half * 0.7, scale * leg * stride * side
             heel = rng.uniform(14, 32) if z < 0 and stance == "walk" else 0.0
         elif stance in ("wide", "crouch"):
             x, yaw = side * half * rng.uniform(1.5, 2.1), side * rng.uniform(10, 26)
-        elif stance == "contrapposto" and side * swing > 0:
+        elif stance == "contrapposto" and side * stride > 0:
             x, z, yaw = side * half * 1.35, rng.uniform(0.03, 0.14), side * rng.uniform(14, 32)
         feet.append((x, z, yaw, heel))
     return feet
 
 
 def _solve_leg(
-    body: BodyModel,
-    joints: np.ndarray,
-    rotations: np.ndarray,
+    skeleton: _Skeleton,
     end: str,
     hip: np.ndarray,
     ankle: np.ndarray,
     lengths: tuple[float, float],
     toward: np.ndarray,
 ) -> None:
-    """Two-bone inverse kinematics by the law of cosines; the knee points `toward`."""
+    """Two-bone inverse kinematics by the law of cosines; the knee points `toward` a direction [3]."""
     thigh, shin = lengths
     line = ankle - hip
     distance = min(np.linalg.norm(line), 0.999 * (thigh + shin))
@@ -285,13 +274,13 @@ def _solve_leg(
     out = toward - (toward @ line) * line
     knee = hip + thigh * (np.cos(angle) * line + np.sin(angle) * out / np.linalg.norm(out))
     hinge = np.cross(toward, line)
-    rest = [joints[body.bone(n + end)] for n in ("upperleg01", "lowerleg01", "foot")]
-    axis = np.array([1.0, 0, 0])  # what knees turn about at rest
+    rest = skeleton.rest("upperleg01", "lowerleg01", "foot", end=end)
+    axis = np.array([1.0, 0, 0])  # of the knees at rest
     upper = _frame(knee - hip, hinge) @ _frame(rest[1] - rest[0], axis).T
     lower = _frame(ankle - knee, hinge) @ _frame(rest[2] - rest[1], axis).T
     for name, rotation in (("upperleg", upper), ("lowerleg", lower)):
-        rotations[body.bone(f"{name}01{end}")] = rotation
-        rotations[body.bone(f"{name}02{end}")] = rotation
+        skeleton.rotate(f"{name}01{end}", rotation)
+        skeleton.rotate(f"{name}02{end}", rotation)
 
 
 def _fraction(rotation: np.ndarray, share: float) -> np.ndarray:
@@ -299,11 +288,9 @@ def _fraction(rotation: np.ndarray, share: float) -> np.ndarray:
     return Rotation.from_rotvec(share * Rotation.from_matrix(rotation).as_rotvec()).as_matrix()
 
 
-def _minimal(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _shortest(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """The smallest rotation [3, 3] that turns direction `start` into `end`."""
-    start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis = np.cross(start, end)
-    sine, cosine = np.linalg.norm(axis), start @ end
-    if sine < 1e-9:
-        return np.eye(3)
-    return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+    sine = np.linalg.norm(axis)
+    angle = np.arctan2(sine, start @ end)
+    return Rotation.from_rotvec(axis * (angle / max(sine, 1e-12))).as_matrix()

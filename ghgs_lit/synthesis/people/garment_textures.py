@@ -1,12 +1,14 @@
-"""Paint clothes: patterns on charts, seams, hems, pockets, buttons, belts, soles and laces."""
+"""Textures of garments: patterns, seams, hems, pockets, buttons, belts, soles and laces."""
 
 import numpy as np
 
+from ghgs_lit.synthesis.people.blending import bump, darken, mix, smoothstep
+from ghgs_lit.synthesis.people.charts import chart
 from ghgs_lit.synthesis.people.fabric import Fabric, paint, print_emblem
 from ghgs_lit.synthesis.people.garments import ANKLE, neckline
-from ghgs_lit.synthesis.people.noise import Noise, smoothstep
+from ghgs_lit.synthesis.people.noise import Noise
 from ghgs_lit.synthesis.people.outfit import Bottom, Shoes, Top
-from ghgs_lit.synthesis.people.surface import Place, chart
+from ghgs_lit.synthesis.people.place import Place
 
 
 def _line(distance: np.ndarray, width: float) -> np.ndarray:
@@ -14,16 +16,8 @@ def _line(distance: np.ndarray, width: float) -> np.ndarray:
     return 1 - smoothstep(0.4 * width, width, np.abs(distance))
 
 
-def _darken(colour: np.ndarray, mask: np.ndarray, amount: float) -> np.ndarray:
-    return colour * (1 - amount * mask)[:, None]
-
-
-def _tint(colour: np.ndarray, mask: np.ndarray, ink: np.ndarray) -> np.ndarray:
-    return colour + (ink - colour) * mask[:, None]
-
-
 def _folds(across: np.ndarray, along: np.ndarray, noise: Noise, strength: np.ndarray) -> np.ndarray:
-    """Light and dark of folds as a factor [k]: the hollows are darker."""
+    """Shading of folds as a factor [k]: hollows are darker."""
     height = noise(across / 0.95 + 0.13, along / 0.45)
     return 1 + strength * np.clip(0.8 * height, -1.2, 0.5)
 
@@ -51,9 +45,9 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
     colour = _trim(colour, edge, top, rng)
     if top.kind in ("shirt", "jacket"):
         colour = _front_closure(colour, place, top, on_arm)
-    colour = _darken(colour, _line(place.arm - 0.5, 0.10) * (place.y > 1.15), 0.12)  # armhole seam
-    strength = 0.04 + 0.09 * on_arm * np.exp(-(((place.sleeve - 0.25) / 0.10) ** 2))
-    strength = strength + 0.06 * ~on_arm * np.exp(-(((place.y - 1.0) / 0.12) ** 2))
+    colour = darken(colour, _line(place.arm - 0.5, 0.10) * (place.y > 1.15), 0.12)  # armhole seam
+    strength = 0.04 + 0.09 * on_arm * bump(place.sleeve, 0.25, 0.10)
+    strength = strength + 0.06 * ~on_arm * bump(place.y, 1.0, 0.12)
     shade = _folds(across, along, noise, strength)
     armpit = [(np.abs(place.x) - 0.165) / 0.035, (place.y - 1.235) / 0.05, (place.z - 0.06) / 0.05]
     shade = shade * (1 - 0.25 * np.exp(-np.square(armpit).sum(0)))
@@ -61,32 +55,32 @@ def top_texture(top: Top, noise: Noise, rng: np.random.Generator) -> np.ndarray:
 
 
 def _trim(colour: np.ndarray, edge: np.ndarray, top: Top, rng: np.random.Generator) -> np.ndarray:
-    """Ribs or a stitched hem along every edge (metres from it)."""
+    """Ribs or a stitched hem along all edges; `edge` [k] is the distance to the nearest in metres."""
     if top.kind in ("tee", "tank"):
         if rng.random() < 0.25:
-            colour = _tint(colour, 1 - smoothstep(0.013, 0.015, edge), top.fabric.colours[1])
-        return _darken(colour, _line(edge - 0.017, 0.0022), 0.28)
+            colour = mix(colour, 1 - smoothstep(0.013, 0.015, edge), top.fabric.colours[1])
+        return darken(colour, _line(edge - 0.017, 0.0022), 0.28)
     if top.kind == "sweater":
         band = 1 - smoothstep(0.030, 0.033, edge)
         if rng.random() < 0.3:
-            colour = _tint(colour, band, top.fabric.colours[1])
-        return _darken(_darken(colour, band, 0.10), _line(edge - 0.032, 0.003), 0.25)
-    return _darken(colour, _line(edge - 0.008, 0.002), 0.22)
+            colour = mix(colour, band, top.fabric.colours[1])
+        return darken(darken(colour, band, 0.10), _line(edge - 0.032, 0.003), 0.25)
+    return darken(colour, _line(edge - 0.008, 0.002), 0.22)
 
 
 def _front_closure(colour: np.ndarray, place: Place, top: Top, on_arm: np.ndarray) -> np.ndarray:
     """Placket and buttons of a shirt, the zip edge of a jacket, chest pocket."""
     front = (place.z > 0.08) & ~on_arm
     if top.opening:
-        return _darken(colour, _line(np.abs(place.x) - top.opening - 0.014, 0.003) * front, 0.3)
+        return darken(colour, _line(np.abs(place.x) - top.opening - 0.014, 0.003) * front, 0.3)
     for at in (-0.014, 0.014):
-        colour = _darken(colour, _line(place.x - at, 0.0022) * front, 0.25)
+        colour = darken(colour, _line(place.x - at, 0.0022) * front, 0.25)
     row = (place.y - 0.02) / 0.085
     button = np.hypot(place.x, (row - np.rint(row)) * 0.085)
     ink = np.full(3, 0.9) if top.fabric.colours[0].mean() < 0.5 else np.full(3, 0.25)
-    colour = _tint(colour, (1 - smoothstep(0.0042, 0.0056, button)) * front, ink)
+    colour = mix(colour, (1 - smoothstep(0.0042, 0.0056, button)) * front, ink)
     pocket = np.maximum(np.abs(place.x - 0.075) - 0.042, np.abs(place.y - 1.235) - 0.05)
-    return _darken(colour, _line(pocket, 0.0025) * front, 0.3)
+    return darken(colour, _line(pocket, 0.0025) * front, 0.3)
 
 
 def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
@@ -100,36 +94,36 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
         colour = _denim(bottom.fabric, across, place, noise)
     else:
         colour = paint(bottom.fabric, across, place.y)
-    colour = _darken(colour, _line(place.leg_angle - np.pi / 2, 0.035), 0.2)
+    colour = darken(colour, _line(place.leg_angle - np.pi / 2, 0.035), 0.2)
     if bottom.kind != "leggings":
         colour = _pockets(colour, place, bottom)
     edge = np.minimum(place.y - max(bottom.hem, ANKLE), bottom.waist - place.y)
-    colour = _darken(colour, _line(edge - 0.016, 0.0025), 0.25)
+    colour = darken(colour, _line(edge - 0.016, 0.0025), 0.25)
     band = _line(np.clip(place.y - bottom.waist + 0.018, -1, 1), 0.021)
     colour = _belt(colour, band, bottom, place)
-    strength = 0.03 + 0.09 * np.exp(-(((place.y - 0.49) / 0.08) ** 2))
-    strength = strength + 0.09 * np.exp(-(((place.y - 0.18) / 0.08) ** 2))
+    strength = 0.03 + 0.09 * bump(place.y, 0.49, 0.08)
+    strength = strength + 0.09 * bump(place.y, 0.18, 0.08)
     strength = strength * (0.4 if bottom.kind == "leggings" else 1.0)
-    inner = 1 - 0.18 * np.exp(-((place.x / 0.035) ** 2)) * smoothstep(0.86, 0.74, place.y)
+    inner = 1 - 0.18 * bump(place.x, 0.0, 0.035) * smoothstep(0.86, 0.74, place.y)
     return piece.image(colour * (_folds(across, place.y, noise, strength) * inner)[:, None])
 
 
 def _belt(colour: np.ndarray, band: np.ndarray, bottom: Bottom, place: Place) -> np.ndarray:
     """A belt with a buckle, or a waistband."""
     if bottom.belt is None:
-        return _darken(colour, _line(place.y - bottom.waist + 0.038, 0.003), 0.3)
-    colour = _tint(colour, band, bottom.belt)
+        return darken(colour, _line(place.y - bottom.waist + 0.038, 0.003), 0.3)
+    colour = mix(colour, band, bottom.belt)
     buckle = np.maximum(np.abs(place.x) - 0.022, np.abs(place.y - bottom.waist + 0.018) - 0.016)
-    return _tint(colour, _line(buckle, 0.006) * (place.z > 0.08), np.array([0.75, 0.72, 0.62]))
+    return mix(colour, _line(buckle, 0.006) * (place.z > 0.08), np.array([0.75, 0.72, 0.62]))
 
 
 def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np.ndarray:
-    """Twill, worn at thigh and knee."""
+    """Twill, faded at thigh and knee."""
     twill = np.sin(2 * np.pi * (across + 0.6 * place.y) / 0.006)
-    worn = np.exp(-(((place.y - 0.62) / 0.20) ** 2)) * smoothstep(1.5, 0.3, np.abs(place.leg_angle))
+    worn = bump(place.y, 0.62, 0.20) * smoothstep(1.5, 0.3, np.abs(place.leg_angle))
     worn = worn * np.clip(0.75 + 0.35 * noise(across / 0.5, place.y / 0.9), 0, 1.4)
     base = fabric.colours[0]
-    colour = base + (np.minimum(base * 1.5 + 0.16, 0.92) - base) * (0.42 * worn)[:, None]
+    colour = mix(base, 0.42 * worn, np.minimum(base * 1.5 + 0.16, 0.92))
     shade = (
         1
         + 0.06 * twill
@@ -140,12 +134,12 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
 
 
 def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
-    """Front pockets, patch pockets behind, the fly; in a contrasting thread on jeans."""
+    """Front pockets, patch pockets behind and the fly; jeans have stitches in a contrasting colour."""
     thread = np.array([0.72, 0.50, 0.25]) if bottom.kind == "jeans" else None
 
     def stitch(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        colour = _darken(colour, mask, 0.35)
-        return colour if thread is None else _tint(colour, 0.5 * mask, thread)
+        colour = darken(colour, mask, 0.35)
+        return colour if thread is None else mix(colour, 0.5 * mask, thread)
 
     x, low = np.abs(place.x), place.y - (bottom.waist - 0.03)
     front, back = place.z > 0.09, place.z < 0.06
@@ -160,11 +154,12 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
 
 
 def _skirt_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
+    """Texture [h, w, 3] of a skirt."""
     piece = chart("skirt")
     place = piece.texel_place
     across = place.trunk_angle * 0.17
     colour = paint(bottom.fabric, across, place.y)
-    colour = _darken(colour, _line(place.y - bottom.hem - 0.018, 0.0025), 0.25)
+    colour = darken(colour, _line(place.y - bottom.hem - 0.018, 0.0025), 0.25)
     colour = _belt(colour, _line(np.clip(place.y - bottom.waist + 0.018, -1, 1), 0.021), bottom, place)
     shade = 1 - 0.06 * np.clip(0.6 - noise(across / 0.5, place.y / 2.5), 0, 1.6)
     return piece.image(colour * shade[:, None])
@@ -178,17 +173,15 @@ def shoe_texture(shoes: Shoes) -> np.ndarray:
     x = np.abs(place.x) - 0.197
     instep = (np.abs(x) < 0.020) & (place.z > 0.075) & (place.z < 0.175) & (place.y > 0.035)
     if shoes.kind == "sneakers":
-        colour = _tint(colour, smoothstep(0.215, 0.217, place.z) * 0.8, shoes.sole)
+        colour = mix(colour, smoothstep(0.215, 0.217, place.z) * 0.8, shoes.sole)
         swoosh = (
-            _line(place.y - 0.045 - 0.5 * (place.z - 0.10) ** 1, 0.008)
-            * (np.abs(x) > 0.022)
-            * (place.z < 0.16)
+            _line(place.y - 0.045 - 0.5 * (place.z - 0.10), 0.008) * (np.abs(x) > 0.022) * (place.z < 0.16)
         )
-        colour = _tint(colour, 0.9 * swoosh * (place.z > 0.04), shoes.laces)
+        colour = mix(colour, 0.9 * swoosh * (place.z > 0.04), shoes.laces)
     row = place.z / 0.016
     laces = (np.abs(row - np.rint(row)) < 0.24) & instep
     if shoes.kind != "leather" or shoes.upper.mean() > 0.12:
-        colour = _darken(colour, instep.astype(float), 0.25)
-        colour = _tint(colour, laces.astype(float), shoes.laces)
-    colour = _darken(colour, _line(place.y - 0.018, 0.003), 0.35)
-    return piece.image(_tint(colour, 1 - smoothstep(0.014, 0.017, place.y), shoes.sole))
+        colour = darken(colour, instep.astype(float), 0.25)
+        colour = mix(colour, laces.astype(float), shoes.laces)
+    colour = darken(colour, _line(place.y - 0.018, 0.003), 0.35)
+    return piece.image(mix(colour, 1 - smoothstep(0.014, 0.017, place.y), shoes.sole))

@@ -1,29 +1,30 @@
-"""Soft shadows that belong to the surface: how much of its surroundings a point sees past the person's body.
+"""Ambient occlusion: how much of the light from all around reaches a point past the person's own body.
 
-The body is a set of spheres inside trunk and limbs; what a sphere hides from a surface element is known in
-closed form (about cos(angle) (radius / distance)^2 of its light). Folds and hollows finer than the spheres
-come from the distance between the surface and its smoothed self. Both are smooth functions of the points,
-unlike an estimate from random rays.
+The body is approximated by spheres inside trunk and limbs, because the share of light that a sphere blocks
+has a closed form (about cos(angle) (radius / distance)^2). Folds and hollows finer than the spheres are found
+by the distance between the surface and a smoothed copy of it. Both are smooth functions of the points, unlike
+an estimate from random rays.
 """
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
+from ghgs_lit.synthesis.people.charts import Chart
 from ghgs_lit.synthesis.people.garments import Figure
 from ghgs_lit.synthesis.people.meshing import vertex_normals
-from ghgs_lit.synthesis.people.surface import Chart
 
-CHAINS = (  # from joint, to joint, spheres
+CHAINS = (  # from joint, to joint, number of spheres
     ("upperleg01", "lowerleg01", 6), ("lowerleg01", "foot", 6), ("foot", "toe2-1", 2),
     ("upperarm01", "lowerarm01", 5), ("lowerarm01", "wrist", 5), ("wrist", "finger3-1", 2),
 )  # fmt: skip
 TRUNK = ("root", "spine05", "spine04", "spine03", "spine02", "spine01", "neck01", "neck03", "head")
-STRENGTH = 0.75  # of the spheres' shadow
-HOLLOW = 45.0  # darkness per metre of depth of a hollow
+Spheres = tuple[np.ndarray, np.ndarray]  # centres [s, 3], radii [s], metres
+STRENGTH = 0.75  # of the shadows of spheres
+HOLLOW = 45.0  # share of the light that a hollow loses per metre of depth
 
 
-def spheres(figure: Figure) -> tuple[np.ndarray, np.ndarray]:
+def occluding_spheres(figure: Figure) -> Spheres:
     """Centres [s, 3] in the pose and radii [s] of spheres that touch the skin from inside."""
     body = load_body()
     naked = figure.rest[:BODY_VERTICES]
@@ -48,12 +49,16 @@ def spheres(figure: Figure) -> tuple[np.ndarray, np.ndarray]:
     return np.einsum("sij,sj->si", transforms[:, :, :3], centres) + transforms[:, :, 3], radii
 
 
-def surroundings(
-    points: np.ndarray, normals: np.ndarray, centres: np.ndarray, radii: np.ndarray
-) -> np.ndarray:
-    """Share [g] of the surroundings, weighted by the cosine, that spheres and the ground leave free."""
+def visibility(points: np.ndarray, normals: np.ndarray, spheres: Spheres) -> np.ndarray:
+    """Share [g] of the surroundings, weighted by the cosine, that spheres and the ground do not hide.
+
+    Args:
+        points: [g, 3] metres.
+        normals: [g, 3] unit normals.
+        spheres: centres [s, 3] and radii [s].
+    """
     light = np.ones(len(points))
-    for centre, radius in zip(centres, radii, strict=True):
+    for centre, radius in zip(*spheres, strict=True):
         away = centre - points
         square = np.einsum("gi,gi->g", away, away)
         facing = np.clip(np.einsum("gi,gi->g", away, normals) / np.sqrt(np.maximum(square, 1e-12)), 0, None)
@@ -62,12 +67,12 @@ def surroundings(
     return light * (1 - 0.5 * floor)
 
 
-def shade(piece: Chart, points: np.ndarray, balls: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Factor [g] on the colours of a chart whose posed points [g, 3] are among the spheres `balls`."""
-    normals = vertex_normals(points, piece.vertex_faces)
+def ambient_occlusion(piece: Chart, points: np.ndarray, spheres: Spheres) -> np.ndarray:
+    """Factor [g] on the colours of a chart with posed points [g, 3]."""
+    normals = vertex_normals(points, piece.point_faces)
     smooth = points
     for _ in range(5):
         smooth = piece.smooth @ smooth
     depth = np.einsum("gi,gi->g", smooth - points, normals)
-    light = 1 - STRENGTH * (1 - surroundings(points, normals, *balls))
+    light = 1 - STRENGTH * (1 - visibility(points, normals, spheres))
     return light * (1 - np.clip(HOLLOW * depth, -0.10, 0.30))
