@@ -19,10 +19,10 @@ from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
     final_numbers,
-    go_on,
     hyperparameters,
     log_hyperparameters,
     log_results,
+    resume,
 )
 from ghgs_lit.training.validation_pictures import Attention, Pictures, PointClouds
 from tests.helpers.training import Standin, StepData, flat_renderer
@@ -126,12 +126,12 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
 
 def test_nothing_of_the_clock_stays(run):
     _, subject = run
-    assert subject.clock is None
+    assert not subject.clock.running
     assert not subject.model.encoder._forward_hooks
     assert not subject.model.encoder._forward_pre_hooks
 
 
-def test_logs_go_on_where_the_checkpoint_was(tmp_path):
+def test_logs_resume_where_the_checkpoint_was(tmp_path):
     for logger in (first := loggers(tmp_path)):
         for step in range(10):
             logger.log_metrics({"a": step, **({"b": 1} if step % 2 else {})}, step)
@@ -140,7 +140,7 @@ def test_logs_go_on_where_the_checkpoint_was(tmp_path):
         file.write("7")  # killed while it wrote
     first[0].experiment.close()
     second = loggers(tmp_path)
-    go_on(second, 6)
+    resume(second, 6)
     for logger in second:
         for step in range(6, 8):
             logger.log_metrics({"a": 100 + step, "c": 2}, step)
@@ -182,16 +182,16 @@ def test_final_numbers_name_their_protocol():
 def test_a_clock_gives_each_span_to_the_part_that_ends_it(monkeypatch):
     now = iter([0.0, 1.0, 3.0, 3.5, 10.0, 10.0, 11.0, 11.0, 12.0, 20.0, 20.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(now))
-    clock = StepClock(torch.device("cpu"))
-    clock.mark("render")  # before the first start: nothing to measure from
-    clock.start()
+    clock = StepClock()
+    clock.mark("render")  # does not run yet: nothing to measure from
+    clock.start(torch.device("cpu"))
     for part in ("data", "encode", "data"):
         clock.mark(part)
-    clock.end()  # at 10.0
+    clock.end_step()  # at 10.0
     clock.mark("data")
-    clock.start()  # a validation: forgotten
+    clock.restart()  # a validation: not counted
     clock.mark("data")
-    clock.end()
+    clock.end_step()
     means = clock.means()
     assert means == {"data": 1250.0, "encode": 1000.0, "optimizer": 7250.0, "step": 9500.0}
     assert clock.means() == {}

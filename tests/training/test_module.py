@@ -167,12 +167,12 @@ def test_held_parameters_stay_for_their_share_of_the_run(tmp_path):
             seen.append((pl_module.model.depth.item(), pl_module.model.shift.detach().clone()))
 
     subject = module()
-    subject.optimization = Optimization(lr=0.05, weight_decay=0.1, hold={"shift": 0.5})
+    subject.optimization = Optimization(lr=0.05, weight_decay=0.1, freeze_until={"shift": 0.5})
     trainer(tmp_path, steps=6, callbacks=[Look()]).fit(subject, loader(1))
     assert [bool(shift.abs().max() > 0) for _, shift in seen] == [False] * 3 + [True] * 3
     assert seen[0][0] != seen[1][0]
-    subject.optimization = Optimization(lr=0.05, hold={"nothing": 0.5})
-    with pytest.raises(InputError, match=r"optimizer\.hold\.nothing"):
+    subject.optimization = Optimization(lr=0.05, freeze_until={"nothing": 0.5})
+    with pytest.raises(InputError, match=r"optimizer\.freeze_until\.nothing"):
         trainer(tmp_path, steps=6).fit(subject, loader(1))
 
 
@@ -206,7 +206,7 @@ def test_callbacks_write_pictures_and_numbers(tmp_path):
         ({"lr": 1.0, "warmup": 1.0}, r"optimizer\.warmup"),
         ({"lr": 1.0, "clip": 0.0}, r"optimizer\.clip"),
         ({"lr": 1.0, "end_factor": 2.0}, r"optimizer\.end_factor"),
-        ({"lr": 1.0, "hold": {"head": 2.0}}, r"optimizer\.hold\.head"),
+        ({"lr": 1.0, "freeze_until": {"head": 2.0}}, r"optimizer\.freeze_until\.head"),
     ],
 )
 def test_impossible_values_name_their_key(values, key):

@@ -12,8 +12,9 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.checkpoints import Checkpoints, WholeFiles
-from ghgs_lit.training.loggers import CsvLog, TensorBoardLog, go_on
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO, Checkpoints
+from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
+from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
 from tests.helpers.training import Standin, StepData, flat_renderer
 
@@ -43,11 +44,10 @@ class Cut(L.Callback):
 
 
 def module() -> GHGSModule:
-    # Held parameters and points drawn at random: both must know where the run stands.
+    # Frozen parameters and points drawn at random: both must know where the run stands.
     losses = Losses({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
-    return GHGSModule(
-        Standin(), flat_renderer, losses, Optimization(lr=0.05, warmup=0.1, hold={"shift": 0.4}), CONFIG
-    )
+    optimization = Optimization(lr=0.05, warmup=0.1, freeze_until={"shift": 0.4})
+    return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
 
 def fit(folder, cut: Cut, resume=None, every=3, **options):
@@ -55,7 +55,8 @@ def fit(folder, cut: Cut, resume=None, every=3, **options):
     best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
     last = Checkpoints(filename="last", every_n_train_steps=every)
     trainer = L.Trainer(
-        accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder, plugins=[WholeFiles()],
+        accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder,
+        plugins=[AtomicCheckpointIO()],
         logger=[CsvLog(folder, name="csv", version="", flush_logs_every_n_steps=1),
                 TensorBoardLog(folder, name="tensorboard", version="")],
         callbacks=[cut, best, last], enable_model_summary=False, enable_progress_bar=False,
@@ -63,7 +64,7 @@ def fit(folder, cut: Cut, resume=None, every=3, **options):
         **options,
     )  # fmt: skip
     if resume is not None:
-        go_on(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
+        resume_logs(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
     subject = module()
     trainer.fit(subject, StepData(), ckpt_path=resume)
     return subject
@@ -162,14 +163,13 @@ def test_time_that_was_used_stays_used(tmp_path):
 
 
 def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
-    path, files = tmp_path / "last.ckpt", WholeFiles()
+    path, files = tmp_path / "last.ckpt", AtomicCheckpointIO()
     files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
     child = os.fork()
     if child == 0:
 
-        def half(content, file):
-            file.write(b"half a checkpoint")
-            file.flush()
+        def half(content, path):
+            path.write_bytes(b"half a checkpoint")
             os.kill(os.getpid(), signal.SIGKILL)
 
         monkeypatch.setattr(torch, "save", half)
@@ -190,7 +190,7 @@ def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
     for name in ("fsync", "replace"):
         real = getattr(os, name)
         monkeypatch.setattr(os, name, lambda *a, _n=name, _r=real: (calls.append(_n), _r(*a)))
-    WholeFiles().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
+    AtomicCheckpointIO().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
     assert calls == ["fsync", "replace", "fsync"]
 
 
