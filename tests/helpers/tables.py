@@ -69,12 +69,8 @@ def start_run(folder: Path, ablation, seed=1, **changes) -> None:
 def tables_of(folder: Path, layout="ablation", by=(), others=(), illustration=False, **options):
     """The tables of a sweep with their words."""
     test = t.PairedTest(**options.pop("test", {}))
-    chosen = t.TableOptions(t.layout_named(layout), test=test, **options)
-    tables = t.build_tables(t.read_sweep([folder], by), others, chosen)
-    for table in tables:
-        table.caption = t.write_caption(table)
-        table.notes = t.write_notes(table, test, illustration)
-    return tables
+    chosen = t.TableOptions(t.layout_named(layout), test=test, illustration=illustration, **options)
+    return t.build_tables(t.read_sweep([folder], by), others, chosen)
 
 
 def body(markdown: str):

@@ -111,7 +111,7 @@ def test_targets_are_tables_of_their_own_and_can_be_picked(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 18.0, targets="midway")
     write_run(tmp_path / "2", "full", 18.0, protocol="release")
-    settings = [tuple(t.about["records"][0].setting.__dict__.values()) for t in tables_of(tmp_path)]
+    settings = [tuple(t.records[0].setting.__dict__.values()) for t in tables_of(tmp_path)]
     assert [s[2:] for s in settings] == [
         ("release", "correct"),
         ("midway", "correct"),
@@ -164,7 +164,7 @@ def test_results_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"metrics\.json"):
         read_sweep([tmp_path])
     path.write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="format_version 1; found 99"):
+    with pytest.raises(InputError, match=r"format_version .*1.*; found 99"):
         read_results(path)
     with pytest.raises(InputError, match="at least one"):
         write_results(tmp_path, [], {})
