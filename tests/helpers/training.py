@@ -34,6 +34,7 @@ def ring(count: int, size: int, radius: float = 2.0, start: float = 0.0) -> Came
 
 
 def batched(cameras: Cameras, count: int) -> Cameras:
+    """``count`` copies of the same cameras [count, V]."""
     return cameras[None][torch.zeros(count, dtype=torch.long)]
 
 

@@ -122,6 +122,7 @@ def test_a_checkpoint_that_is_due_at_a_validation_comes_after_it(tmp_path):
 
 
 def test_accumulated_steps_are_saved_whole(whole, tmp_path):
+    """No checkpoint is written between two batches of one step, where gradients would be lost."""
     expected = fit(tmp_path / "whole", Cut(), accumulate_grad_batches=2)
     with pytest.raises(PowerCut):
         fit(tmp_path / "cut", Cut(10), accumulate_grad_batches=2)
@@ -132,6 +133,7 @@ def test_accumulated_steps_are_saved_whole(whole, tmp_path):
 
 
 def test_a_run_that_goes_on_elsewhere_takes_its_best_along(whole, tmp_path):
+    """A run that resumes in another folder keeps its best checkpoint and score."""
     folder, _, _ = whole
     with pytest.raises(PowerCut):
         fit(tmp_path / "a", Cut(13))
@@ -163,6 +165,7 @@ def test_time_that_was_used_stays_used(tmp_path):
 
 
 def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    """A kill in the middle of writing costs neither the previous checkpoint nor disk space."""
     path, files = tmp_path / "last.ckpt", AtomicCheckpointIO()
     files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
     child = os.fork()
@@ -186,6 +189,7 @@ def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
 
 
 def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
+    """After a power cut the file has its content: it is synced before it gets its name."""
     calls = []
     for name in ("fsync", "replace"):
         real = getattr(os, name)
@@ -195,6 +199,8 @@ def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
 
 
 def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
+    """Resuming needs the same model and the state of the optimizer; changed settings are reported."""
+
     class Other(Standin):
         def __init__(self):
             super().__init__()
@@ -215,12 +221,14 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
 
 
 def test_a_longer_budget_is_no_difference():
+    """Only settings that the weights depend on are reported when a run resumes."""
     before = {"trainer": {"max_steps": 10, "precision": 32}, "logger": {"csv": {"name": "a"}}}
     now = {"trainer": {"max_steps": 20, "precision": 16}, "logger": {}}
     assert differences(before, now) == ["trainer.precision: 32 -> 16"]
 
 
 def test_one_way_to_start(tmp_path):
+    """init_from beside resume is ambiguous, except for a run that began with init_from."""
     both = {"resume": "elsewhere/last.ckpt", "init_from": "a.ckpt"}
     with pytest.raises(InputError, match="init_from"):
         check_start(both, tmp_path)
@@ -230,10 +238,12 @@ def test_one_way_to_start(tmp_path):
 
 @pytest.mark.parametrize("minutes", [0, -1.0])
 def test_minutes_are_positive(minutes):
+    """An impossible interval is refused with its key."""
     with pytest.raises(InputError, match="minutes"):
         Checkpoints(filename="last", minutes=minutes)
 
 
 def test_minutes_and_steps_exclude_one_another():
+    """One callback saves by steps or by time; both would silently mean one of them."""
     with pytest.raises(MisconfigurationException):
         Checkpoints(filename="last", minutes=1, every_n_train_steps=3)
