@@ -151,7 +151,7 @@ def test_others_that_fit_nowhere_are_refused(tmp_path):
 
 
 def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
-    """It stands in a run's results, and not yet in its plan."""
+    """The results of a run name it; its configuration before training does not."""
     path = write_run(tmp_path / "0", "full", 20.0, weights="vggt.safetensors").with_name("config.yaml")
     path.write_text(path.read_text().replace("vggt.safetensors", "null"))
     (table,) = tables_of(tmp_path, "table3", reported=False)

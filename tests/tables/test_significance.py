@@ -122,7 +122,7 @@ def test_a_t_test_of_four_subjects_marks_nothing_however_small_its_p(tmp_path):
 
 
 def test_subjects_are_averaged_over_seeds_before_the_test(tmp_path):
-    """More seeds are no more subjects."""
+    """More seeds do not give more subjects."""
     table = table_of(tmp_path, 1.0, seeds=(1, 2, 3))
     assert table.lines[0].cells[table.columns[0]].test.n == 20
 

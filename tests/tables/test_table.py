@@ -1,4 +1,4 @@
-"""The ablation table out of fabricated runs: rows, columns, best, seeds, what is missing, what is refused."""
+"""The ablation table of invented runs: rows, columns, best, seeds, missing and refused runs."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that go on."""
+"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that continue."""
 
 import csv
 import importlib.util
@@ -46,7 +46,7 @@ def loggers(folder):
 
 
 class Staged(Standin):
-    """A stand-in with some stages to time."""
+    """The simple model with some stages to time."""
 
     def __init__(self):
         super().__init__()

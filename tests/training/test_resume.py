@@ -1,4 +1,4 @@
-"""A run that is cut off goes on to the same weights, logs and best checkpoint; its files stay whole."""
+"""An interrupted run resumes to the same weights, logs and best checkpoint; its files stay complete."""
 
 import csv
 import os
@@ -132,7 +132,7 @@ def test_accumulated_steps_are_saved_whole(whole, tmp_path):
         assert torch.equal(a, b)
 
 
-def test_a_run_that_goes_on_elsewhere_takes_its_best_along(whole, tmp_path):
+def test_a_run_that_resumes_elsewhere_takes_its_best_along(whole, tmp_path):
     """A run that resumes in another folder keeps its best checkpoint and score."""
     folder, _, _ = whole
     with pytest.raises(PowerCut):
@@ -142,7 +142,7 @@ def test_a_run_that_goes_on_elsewhere_takes_its_best_along(whole, tmp_path):
 
 
 def test_time_that_was_used_stays_used(tmp_path):
-    """With a budget of time the learning rate goes on where it was."""
+    """With a budget of time the learning rate continues where it was."""
     seen = []
 
     class Look(Cut):

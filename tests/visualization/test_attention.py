@@ -98,13 +98,11 @@ def test_attention_of_cropped_views_lies_on_the_crop():
     assert own.images.shape[-2:] == tuple(14 * n for n in tokens.grid[2:])
     assert own.images.shape[-2:] < batch.images.shape[-2:]
     picture = attention_sheet(own, tokens, attention)
-    dark = attention_sheet(
-        type(own)(**{**vars(own), "images": torch.zeros_like(own.images)}), tokens, attention
-    )
+    black = type(own)(**{**vars(own), "images": torch.zeros_like(own.images)})
+    dark = attention_sheet(black, tokens, attention)
     assert picture.dtype == np.uint8
     assert picture.shape == dark.shape
     assert picture.shape[1] >= 3 * own.images.shape[-1]
-    assert dark.max() < 256
     assert not np.array_equal(picture, dark)
 
 
