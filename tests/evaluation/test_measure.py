@@ -8,9 +8,11 @@ import sys
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 from ghgs_lit.cli.main import main
+from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure
 from ghgs_lit.evaluation.report import target_protocols
@@ -146,21 +148,13 @@ def test_a_checkpoint_measures_the_same_again_beside_the_baselines(trained, boxe
 
 def test_each_target_protocol_has_the_values_of_its_own_file():
     """Only the selected protocol has overrides; the others are read from conf/targets."""
-    release = {"name": "release", "kind": "release", "vid": 2, "per_subject": "all"}
+    release = {"name": "release", "kind": "release", "per_subject": "all"}
     config = {"targets": release, "evaluation": {"targets": ["midway", "release", "ghg"]}}
     found = target_protocols(config)
     assert list(found) == ["midway", "release", "ghg"]
     assert found["release"] == release
-    assert (found["midway"]["kind"], found["midway"]["vid"], found["midway"]["positions"]) == (
-        "midway",
-        3,
-        None,
-    )
-    assert (found["ghg"]["kind"], found["ghg"]["vid"], found["ghg"]["positions"]) == (
-        "cameras",
-        0,
-        [3, 8, 13],
-    )
+    for name in ("midway", "ghg"):
+        assert found[name] == yaml.safe_load((conf_dir() / "targets" / f"{name}.yaml").read_text())
     config["evaluation"]["targets"] = ["release", "midwy"]
     said = r"evaluation\.targets: expected one of cameras, ghg, .*; found 'midwy' \(did you mean midway\?\)"
     with pytest.raises(InputError, match=said):
@@ -171,7 +165,7 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
     """One evaluation of shipped protocols and one of the user's, none of which is selected by targets=."""
     mine = tmp_path / "conf" / "targets" / "mine.yaml"
     mine.parent.mkdir(parents=True)
-    mine.write_text("defaults: [ghg, _self_]\nname: mine\nvid: 2\npositions: [1, 4]\n")
+    mine.write_text("defaults: [rogsplat, _self_]\nname: mine\npositions: [1, 4]\n")
     code = ghgs(
         "evaluate", f"--config-dir={tmp_path / 'conf'}", *data_of(boxes), "baselines=[black]",
         "evaluation.views=[3]", "evaluation.targets=[ghg,mine,release]", "targets.per_subject=2",
@@ -184,7 +178,7 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
         seen.setdefault(row["targets"], []).append(row["target"])
     assert seen == {
         "ghg": ["003/0", "008/0", "013/0"] * 2,
-        "mine": ["001/2", "004/2"] * 2,
+        "mine": ["001/3", "004/3"] * 2,
         "release": ["000/3", "005/3"] * 2,
     }
     protocols = content["provenance"]["protocol"]["target_protocols"]
