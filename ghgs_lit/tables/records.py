@@ -217,8 +217,8 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
         return None
     if not isinstance(config, Mapping) or not all(k in config for k in ("ablation", "trainer", "data")):
         return None
-    config, done = upgrade(config), (path.parent / "metrics.json").exists()
-    data = str(lookup(config, "data.name"))
+    config = upgrade(config)
+    data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
 
 
