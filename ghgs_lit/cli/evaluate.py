@@ -5,13 +5,14 @@ from typing import Any
 import lightning.pytorch as L
 from omegaconf import DictConfig
 
+from ghgs_lit.cli.inputs import build_data, choices, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
-from ghgs_lit.evaluation.session import build_data, measure_and_write, pick_device, with_trained_data
+from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS, read_checkpoint
 
 
@@ -49,7 +50,8 @@ def run(cfg: DictConfig) -> None:
     cache = attach_cache(methods["model"].model, config["feature_cache"]) if "model" in methods else None
     data = build_data(config)
     data.prepare_data()
-    path = measure_and_write(methods, data, config, directory, device, verb="evaluate", **facts)
+    facts |= {"verb": "evaluate", "choices": choices()}
+    path = measure_and_write(methods, data, config, directory, device, **facts)
     if cache is not None:
         print(cache.report(), flush=True)
     announce(path)

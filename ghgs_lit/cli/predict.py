@@ -6,10 +6,10 @@ import torch
 from lightning.pytorch import LightningDataModule
 from omegaconf import DictConfig
 
+from ghgs_lit.cli.inputs import build_data, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.evaluation.session import build_data, pick_device, with_trained_data
 from ghgs_lit.export.ply import write_ply
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch

@@ -37,6 +37,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
         reported=config["reported"],
         test=from_config(t.PairedTest, "test", config["test"]),
         unit=unit,
+        illustration=config["illustration"],
     )
 
 
@@ -49,9 +50,6 @@ def run(cfg: DictConfig) -> None:
     ]
     sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
     tables = t.build_tables(sweep, others, options)
-    for table in tables:
-        table.caption = t.write_caption(table)
-        table.notes = t.write_notes(table, options.test, config["illustration"])
     directory = output_dir()
     directory.mkdir(parents=True, exist_ok=True)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]

@@ -11,19 +11,20 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
+from ghgs_lit.cli.inputs import build_data, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, plain, write_config
 from ghgs_lit.config import build
 from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
-from ghgs_lit.evaluation.session import build_data, choices, measure_and_write, overrides
+from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.job import going_on, in_sweep, needs_own_process, work_in_own_process, work_on
 from ghgs_lit.runs.plan import print_single_plan
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import Run
 from ghgs_lit.training import GHGSModule, loggers, start
-from ghgs_lit.training.checkpoints import WholeFiles
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 
 
 def _quiet() -> None:
@@ -61,7 +62,7 @@ def build_trainer(config: dict[str, Any], directory: Path) -> L.Trainer:
     try:
         return partial(
             logger=built or False,
-            plugins=[WholeFiles()],
+            plugins=[AtomicCheckpointIO()],
             callbacks=callbacks,
             default_root_dir=str(directory),
             enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
@@ -104,7 +105,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
     _quiet()
     trainer = build_trainer(config, directory)
     if step is not None:
-        loggers.go_on(trainer.loggers, step)
+        loggers.resume(trainer.loggers, step)
     loggers.log_hyperparameters(trainer.loggers, loggers.hyperparameters(config, choices(), overrides()))
     device = trainer.strategy.root_device
     started = time.perf_counter()
@@ -125,6 +126,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
         directory,
         device,
         verb="train",
+        choices=choices(),
         checkpoint=str(checkpoint.relative_to(directory)),
         parameters={
             "total": sum(p.numel() for p in model.parameters()),

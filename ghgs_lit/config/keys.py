@@ -20,6 +20,35 @@ WITHOUT_INFLUENCE = (
     "trainer.log_every_n_steps",
 )
 
+#: What may change when a run is resumed without being reported: also how far it trains (``trainer.max_*``)
+#: and what is measured after training.
+MAY_CHANGE_ON_RESUME = (
+    *WITHOUT_INFLUENCE,
+    "evaluation",
+    "metrics",
+    "sweep",
+    "trainer.max_steps",
+    "trainer.max_time",
+)
+
+#: What loggers do not list among the hyperparameters of a run: also the name of its sweep and what is
+#: measured after training.
+NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
+
+#: What differs between runs in one table on purpose: also the seed, what the ablation switches, and the
+#: views, targets and metrics, which tables keep apart by themselves.
+EXPECTED_TO_DIFFER = (
+    *WITHOUT_INFLUENCE,
+    "ablation",
+    "evaluation",
+    "metrics._target_",
+    "recalibration.neighborhood",
+    "recalibration.similarity",
+    "seed",
+    "targets",
+    "views",
+)
+
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:
     """Values by dotted key; an empty mapping is a value."""

@@ -20,7 +20,9 @@ TARGETS = {
 }
 
 #: Keys that moved: old dotted key, new one (whole nodes too).
-KEYS: dict[str, str] = {}
+KEYS: dict[str, str] = {
+    "optimizer.hold": "optimizer.freeze_until",
+}
 
 #: Values that changed their name: (key of today, old value) to the new one.
 VALUES: dict[tuple[str, Any], Any] = {}

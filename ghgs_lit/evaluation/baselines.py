@@ -1,4 +1,4 @@
-"""What a model must beat, measured on the same targets."""
+"""Simple methods that a model must beat, measured on the same targets."""
 
 from collections.abc import Callable
 from functools import partial
@@ -16,12 +16,12 @@ BASELINES = ("black", "nearest_view", "body_depth", "true_depth", "untrained")
 
 
 def black(batch: Batch) -> Estimate:
-    """A black image: what the background alone is worth."""
+    """A black image: the score of the background alone."""
     return Estimate(torch.zeros_like(batch.targets.images))
 
 
 def nearest_view(batch: Batch) -> Estimate:
-    """The input photograph whose camera looks in the direction nearest to the target's."""
+    """The input photograph whose viewing direction is nearest to that of the target, at its size."""
     forward = batch.cameras.extrinsics[..., 2, :3]
     wanted = batch.targets.cameras.extrinsics[..., 2, :3]
     choice_of_view = torch.einsum("btk,bvk->btv", wanted, forward).argmax(-1)
@@ -37,7 +37,15 @@ def nearest_view(batch: Batch) -> Estimate:
 def splats_at(
     batch: Batch, depth: Tensor, valid: Tensor, sigma: float = 0.3, opacity: float = 0.9
 ) -> Gaussians:
-    """Round splats of ``sigma`` pixels at ``depth`` [B, V, H, W] for the pixels that are ``valid``."""
+    """Round splats for pixels of the inputs.
+
+    Args:
+        batch: gives cameras and colours.
+        depth: where the splats are [B, V, H, W], metres.
+        valid: pixels that get a splat [B, V, H, W].
+        sigma: standard deviation in pixels of the input.
+        opacity: in (0, 1).
+    """
     points = unproject_maps(depth, batch.cameras)[valid]
     focal = batch.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1)
     scale = (sigma * depth / focal[..., None, None])[valid]
@@ -52,7 +60,7 @@ def splats_at(
 
 
 def _body_depth(batch: Batch) -> Tensor:
-    """Mean z of the body's vertices in each view, as a map."""
+    """Mean depth of the body's vertices in each view, as maps [B, V, H, W] in metres."""
     if batch.body_vertices is None:
         raise InputError("baselines: body_depth expects body vertices in the data; found none")
     means = [
@@ -75,7 +83,14 @@ def splatted(
     sigma: float = 0.3,
     opacity: float = 0.9,
 ) -> Estimate:
-    """The subject's pixels as splats at a depth that is not learned."""
+    """The subject's pixels as splats at a depth that is not learned.
+
+    Args:
+        batch: inputs and targets.
+        depth_of: gives depths of the inputs [B, V, H, W], metres.
+        renderer: draws the splats.
+        sigma, opacity: as for :func:`splats_at`.
+    """
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)
     gaussians = splats_at(batch, depth, valid, sigma, opacity)
@@ -90,7 +105,14 @@ def baseline(
     sigma: float = 0.3,
     opacity: float = 0.9,
 ) -> Method:
-    """The baseline called ``name``; ``untrained`` builds the model that was not trained."""
+    """The baseline called ``name``, one of ``BASELINES``.
+
+    Args:
+        name: which one.
+        renderer: draws its splats.
+        untrained: builds a model with random weights, for the baseline ``untrained``.
+        sigma, opacity: of the splats of ``body_depth`` and ``true_depth``, as for :func:`splats_at`.
+    """
     choice("baselines", name, BASELINES)
     if name == "untrained":
         return ModelMethod(untrained().eval(), renderer)

@@ -1,11 +1,13 @@
 """Measures a method (a model or a baseline) on the targets of an evaluation protocol."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
@@ -19,7 +21,14 @@ Renderer = Callable[[Gaussians, Cameras], Rendering]
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a method says about a batch: target images [B, T, 3, h, w]; depths [B, V, H, W] if it has any."""
+    """What a method predicts for a batch; None where it does not predict it.
+
+    Args:
+        image: renders of the targets [B, T, 3, h, w].
+        depth: depths of the inputs [B, V, H, W], metres.
+        depth_valid: where they are defined [B, V, H, W].
+        gaussians: number of Gaussians of each element [B].
+    """
 
     image: Tensor
     depth: Tensor | None = None
@@ -53,7 +62,7 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
 
 
 def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[list[Row]]:
-    """The numbers of each element's targets, without what the row is about."""
+    """The metrics of each element's targets [B][T], without what the rows describe."""
     b, t = batch.targets.images.shape[:2]
     flat = metrics(
         estimate.image.flatten(0, 1), batch.targets.images.flatten(0, 1), batch.targets.masks.flatten(0, 1)
@@ -79,9 +88,24 @@ def measure(
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """One row for each subject and target of ``loader``; the first subjects' pictures go to ``pictures``.
+    """Measure one method on one protocol.
 
-    ``seconds`` is the time of a subject's prediction and renders, on the device as it is used here.
+    Args:
+        method: what is measured.
+        name: its name in the rows.
+        loader: batches with targets.
+        targets: name of the target protocol in the rows.
+        metrics: what is computed of the renders.
+        device: where the method runs.
+        pictures: folder for pictures (None: none are written).
+        picture_count: the number of subjects, the first ones, that are drawn.
+
+    Returns:
+        One row for each subject and target. ``seconds`` is the time of the prediction and the renders of a
+        subject, in a batch as the loader gives it.
+
+    Raises:
+        InputError: a batch has no targets.
     """
     rows: list[Row] = []
     for batch in loader:
@@ -114,21 +138,33 @@ def measure(
 
 
 def measure_all(
-    methods: dict[str, Method],
-    data,
+    methods: Mapping[str, Method],
+    data: LightningDataModule,
     views: Sequence[int],
-    targets: Sequence[str],
+    targets: Mapping[str, Mapping[str, Any]],
     split: str,
     metrics: ImageMetrics,
     device: torch.device | str = "cpu",
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Every method on every number of views and kind of target, on the same subjects and photographs."""
+    """Measure all methods on the same subjects and photographs.
+
+    Args:
+        methods: what is measured, by name.
+        data: gives the photographs (``evaluation_loader``).
+        views: numbers of input views.
+        targets: target protocols by name.
+        split: subjects of ``train`` or ``val``.
+        metrics, device, pictures, picture_count: as for :func:`measure`; pictures of each protocol.
+
+    Returns:
+        The rows of every number of views, protocol and method, in this order.
+    """
     rows: list[Row] = []
     for count in views:
-        for kind in targets:
-            loader = data.evaluation_loader(views=count, targets=kind, split=split)
+        for kind, protocol in targets.items():
+            loader = data.evaluation_loader(views=count, targets=protocol, split=split)
             for name, method in methods.items():
                 rows += measure(method, name, loader, kind, metrics, device, pictures, picture_count)
     return rows

@@ -1,1 +1,1 @@
-"""Files of Gaussians for other programs: one file a format."""
+"""Gaussians as files for other programs: one module for each format."""

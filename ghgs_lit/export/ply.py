@@ -1,10 +1,9 @@
 """Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
 
-World frame; opacity as logit, standard deviations as logarithm, unit quaternions ``(w, x, y, z)``, colour
-as the constant term of spherical harmonics.
+Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit quaternions
+``(w, x, y, z)``, colour as the constant term of spherical harmonics.
 """
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_atomically
 from ghgs_lit.types import Gaussians
 
 SH_CONSTANT = 0.5 / np.sqrt(np.pi)
@@ -29,7 +29,11 @@ _GROUPS = {
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
-    """Write the Gaussians of one subject (RGB colours), aside and renamed."""
+    """Write the Gaussians of one subject (RGB colours).
+
+    Raises:
+        InputError: several subjects, or other colours.
+    """
     require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
     channels = gaussians.colors.shape[1]
     require(channels == 3, "write_ply", "colours of 3 channels", channels)
@@ -49,14 +53,15 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     for group, names in _GROUPS.items():
         for column, name in enumerate(names):
             vertices[name] = values[group][:, column].numpy()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(aside)
-    aside.replace(path)
+    write_atomically(path, PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write)
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read such a file (its constant colour only) as the Gaussians of one subject."""
+    """Read such a file as the Gaussians of one subject, without colours that depend on the direction.
+
+    Raises:
+        InputError: not such a file.
+    """
     try:
         vertices = PlyData.read(path)["vertex"]
         columns = {

@@ -1,14 +1,13 @@
-"""The paper's tables out of directories of runs."""
+"""The paper's tables from directories of runs."""
 
 from ghgs_lit.tables.assemble import TableOptions, build_tables
-from ghgs_lit.tables.flat import to_csv
+from ghgs_lit.tables.csv_format import to_csv
 from ghgs_lit.tables.latex import PREAMBLE, to_latex
 from ghgs_lit.tables.layouts import LAYOUTS, Table, layout_named
 from ghgs_lit.tables.markdown import to_markdown, to_terminal
 from ghgs_lit.tables.others import read_others
 from ghgs_lit.tables.records import read_sweep
 from ghgs_lit.tables.significance import PairedTest
-from ghgs_lit.tables.text import write_caption, write_notes
 
 __all__ = [
     "LAYOUTS",
@@ -24,6 +23,4 @@ __all__ = [
     "to_latex",
     "to_markdown",
     "to_terminal",
-    "write_caption",
-    "write_notes",
 ]

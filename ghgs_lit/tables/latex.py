@@ -1,4 +1,4 @@
-r"""Tables as LaTeX, laid out as the paper prints its own: booktabs, one bar before each group of columns.
+r"""Tables as LaTeX in the paper's layout: booktabs, one bar before each group of columns.
 
 A table needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 """
@@ -6,7 +6,6 @@ A table needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 import re
 
 from ghgs_lit.tables.layouts import Line, Table, arrow, title
-from ghgs_lit.tables.markdown import block_title
 from ghgs_lit.tables.text import CellText, cell_text
 
 PREAMBLE = r"""% \usepackage{booktabs,multirow,adjustbox,pifont}
@@ -14,7 +13,7 @@ PREAMBLE = r"""% \usepackage{booktabs,multirow,adjustbox,pifont}
 \providecommand{\xmark}{\ding{55}}
 """
 _WIDE = 7
-"""Columns of numbers from which a table spans both columns of the page."""
+"""Minimum number of columns of a table that spans both columns of the page."""
 _ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{",
     "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
@@ -25,12 +24,12 @@ _ARROWS = {"↑": r"($\uparrow$)", "↓": r"($\downarrow$)", "": ""}
 
 
 def escape(text: str) -> str:
-    """Plain text for LaTeX."""
+    """Plain text as LaTeX."""
     return "".join(_ESCAPES.get(c, c) for c in text)
 
 
 def prose(text: str) -> str:
-    """A sentence of Markdown for LaTeX: ``**bold**`` and names in backticks."""
+    """A sentence of Markdown as LaTeX: ``**bold**`` and names in backticks."""
     parts = re.split(r"(`[^`]*`|\*\*[^*]+\*\*)", text)
     marks = {"`": (r"\texttt{", 1), "*": (r"\textbf{", 2)}
     return "".join(
@@ -49,14 +48,14 @@ def _number(text: CellText) -> str:
 
 def _row(table: Table, line: Line) -> str:
     stub = [escape(part) for part in line.stub]
-    if line.variant.kind == "model" and table.layout.rows == "methods":
+    if line.is_ours and table.layout.rows == "methods":
         stub = [rf"\textbf{{{part}}}" for part in stub]
     numbers = [_number(cell_text(line.cells.get(column), line, column[1])) for column in table.columns]
     return " & ".join((*stub, *numbers)) + r" \\"
 
 
 def _column_spec(table: Table) -> str:
-    """``ccccc`` for the ablation, ``l | c c c | c c c`` for methods; for data sets without the first bar."""
+    """``ccccc`` for the ablation, ``l | c c c | c c c`` for methods, without the first bar for data sets."""
     if table.layout.rows == "ablation" and len(table.groups) == 1:
         return "c" * (len(table.stub) + len(table.metrics))
     stub = "c c" if len(table.stub) == 2 else "l"
@@ -65,7 +64,7 @@ def _column_spec(table: Table) -> str:
 
 
 def _header(table: Table) -> list[str]:
-    """Groups with rules below them, then the metrics."""
+    """The groups with rules below them, then the metrics."""
     first, width = len(table.stub), len(table.metrics)
     metrics = [f"{escape(title(m))}{_ARROWS[arrow(m)]}" for _, m in table.columns]
     if table.layout.heading == "none":
@@ -81,16 +80,15 @@ def _header(table: Table) -> list[str]:
     ]
 
 
-def tabular(table: Table) -> str:
+def _tabular(table: Table) -> str:
     """The ``tabular`` environment alone."""
     lines = [rf"\begin{{tabular}}{{{_column_spec(table)}}}", r"\toprule", *_header(table)]
     width = len(table.stub) + len(table.columns)
     for block in table.blocks:
         lines.append(r"\midrule")
         if len(table.blocks) > 1:
-            reported = block[0].variant.kind == "reported"
-            name = block_title(table) if reported else "measured here"
-            lines += [rf"\multicolumn{{{width}}}{{l}}{{\emph{{{escape(name)}}}}} \\", r"\midrule"]
+            name = escape(table.block_title(block))
+            lines += [rf"\multicolumn{{{width}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
         lines += [_row(table, line) for line in block]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
@@ -98,8 +96,8 @@ def tabular(table: Table) -> str:
 def to_latex(table: Table, label: str) -> str:
     """A float with the table, its caption, its notes in small print and its label."""
     name = "table*" if len(table.columns) >= _WIDE else "table"
-    # Deviations, marks and long names make rows wide; the paper fits its tables to the line, too.
-    body = "\\begin{adjustbox}{max width=\\linewidth}\n" + tabular(table) + "\n\\end{adjustbox}"
+    # Deviations, marks and long names make rows wide; the paper scales its tables to the line, too.
+    body = "\\begin{adjustbox}{max width=\\linewidth}\n" + _tabular(table) + "\n\\end{adjustbox}"
     notes = [r"\par\smallskip", r"\parbox{\linewidth}{\footnotesize"]
     notes += [rf"{prose(note)}\par" for note in table.notes] + ["}"]
     return "\n".join(

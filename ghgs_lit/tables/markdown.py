@@ -1,16 +1,18 @@
-"""Tables as Markdown and for a terminal."""
+"""Tables as Markdown and on a terminal."""
 
 from rich.table import Table as RichTable
 
-from ghgs_lit.tables.layouts import Column, Line, Table, arrow, title
+from ghgs_lit.tables.layouts import Line, Table, arrow, title
 from ghgs_lit.tables.text import cell_text
 
 
-def heading(column: Column, table: Table) -> str:
-    """A column's name with its group's, where the layout has one."""
-    group, metric = column
-    name = f"{title(metric)} {arrow(metric)}".strip()
-    return name if table.layout.heading == "none" else f"{group.title} {name}"
+def _headings(table: Table, between: str) -> list[str]:
+    """The name of each column after that of its group, where the layout has one."""
+    named = table.layout.heading != "none"
+    return [
+        (f"{group.title}{between}" if named else "") + f"{title(metric)} {arrow(metric)}".strip()
+        for group, metric in table.columns
+    ]
 
 
 def _entries(table: Table, line: Line) -> list[tuple[str, bool]]:
@@ -21,44 +23,36 @@ def _entries(table: Table, line: Line) -> list[tuple[str, bool]]:
     ]
 
 
-def block_title(table: Table) -> str:
-    """What stands above reported rows."""
-    return f"as reported on {table.reported_on}, not measured here"
-
-
 def to_markdown(table: Table) -> str:
     """The table with its caption above and its notes below."""
-    names = [heading(column, table) for column in table.columns]
+    names = _headings(table, " ")
     aligned = ":-:" if len(table.stub) > 1 else ":--"
     lines = [
         "| " + " | ".join((*table.stub, *names)) + " |",
         f"|{'|'.join([aligned] * len(table.stub) + ['--:'] * len(names))}|",
     ]
     for block in table.blocks:
-        reported = block[0].variant.kind == "reported"
-        if reported:
-            lines.append("| *" + block_title(table) + "* |" + " |" * (len(table.stub) + len(names) - 1))
+        if table.reported_on:
+            empty = " |" * (len(table.stub) + len(names) - 1)
+            lines.append(f"| *{table.block_title(block)}* |{empty}")
         for line in block:
             cells = [f"**{text}**" if best else text for text, best in _entries(table, line)]
             lines.append("| " + " | ".join((*line.stub, *cells)) + " |")
-        if reported and len(table.blocks) > 1:
-            lines.append("| *measured here* |" + " |" * (len(table.stub) + len(names) - 1))
     return "\n\n".join((table.caption, "\n".join(lines), *table.notes)) + "\n"
 
 
 def to_terminal(table: Table) -> RichTable:
-    """The table alone, for a terminal."""
+    """The table for a terminal, without its caption and notes."""
     printed = RichTable(padding=(0, 1, 0, 0))
     short = {"3D Unproj.": "3D\nunp.", "Semantic Cons.": "sem.\ncons."}
     for name in table.stub:
         justify = "center" if name in short else "left"
         printed.add_column(short.get(name, name), justify=justify, no_wrap=True)
-    for group, metric in table.columns:
-        above = "" if table.layout.heading == "none" else f"{group.title}\n"
-        printed.add_column(f"{above}{title(metric)} {arrow(metric)}".strip(), justify="right", no_wrap=True)
+    for name in _headings(table, "\n"):
+        printed.add_column(name, justify="right", no_wrap=True)
     for block in table.blocks:
         for line in block:
-            mark = "† " if line.variant.kind == "reported" else ""
+            mark = "† " if line.is_reported else ""
             cells = [
                 (f"[bold green]{text}[/]" if best else text).replace("\\*", "*")
                 for text, best in _entries(table, line)

@@ -1,4 +1,4 @@
-"""Results of other methods, read from a JSON file, and the figures that the paper reports.
+"""Results of other methods, read from a JSON file.
 
 The file (``docs/tables.md`` describes it, ``docs/example_others.json`` is one)::
 
@@ -7,19 +7,15 @@ The file (``docs/tables.md`` describes it, ``docs/example_others.json`` is one):
        {"data": "thuman2", "split": "val", "targets": "release", "protocol": "release", "views": 4,
         "subject": "0501", "seed": 1, "metrics": {"psnr": 28.9, "ssim": 0.96}}]}
 
-A row with ``subject`` is one subject's value and can be tested; one without is a mean over ``subjects``
-of them (optional). ``seed`` is optional.
+A row with ``subject`` has the values of one subject and can be tested; a row without has means over
+``subjects`` subjects (optional). ``seed`` is optional.
 """
 
 import json
 import math
-import re
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import mean
@@ -52,8 +48,8 @@ def _check_keys(where: str, found: Any, needed: Mapping[str, type], optional: Ma
             raise InputError(f"{where}: expected the key {key!r}; found {', '.join(found) or 'none'}")
 
 
-def validate_others(content: Any, where: str) -> None:
-    """Refuse what is no results file of another method, by the key that is wrong."""
+def _validate(content: Any, where: str) -> None:
+    """Refuse content that the head of this module does not describe; the message names the key."""
     _check_keys(where, content, _TOP, {})
     for key, expected in (("format", FORMAT), ("format_version", FORMAT_VERSION)):
         if content[key] != expected:
@@ -84,7 +80,8 @@ def read_others(path: Path) -> list[Record]:
     """The records of another method's results file.
 
     Raises:
-        FileNotFoundError, InputError: it is missing, or not what the module's head describes.
+        FileNotFoundError: there is no such file.
+        InputError: it is not as the head of this module describes.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
@@ -92,7 +89,7 @@ def read_others(path: Path) -> list[Record]:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected JSON; found {error}") from error
-    validate_others(content, path.name)
+    _validate(content, path.name)
     groups: dict[tuple, list[dict]] = {}
     for row in content["rows"]:
         groups.setdefault(_cell(row), []).append(row)
@@ -111,38 +108,3 @@ def read_others(path: Path) -> list[Record]:
         variant = Variant("other", content["method"])
         records.append(Record(variant, setting, views, seed, means, str(path), count, subjects, None, about))
     return records
-
-
-@cache
-def _reported() -> dict[str, Any]:
-    return yaml.safe_load((Path(__file__).parent / "reported.yaml").read_text())
-
-
-def data_key(name: str) -> str:
-    """A data set's name without signs: ``ZJU-MoCap`` and ``zju_mocap`` are the same."""
-    return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-def data_title(name: str) -> str:
-    """A data set's name as the paper prints it, or as it is."""
-    return _reported()["data"].get(data_key(name), name)
-
-
-def reported_source() -> str:
-    """Where the reported figures are from."""
-    return _reported()["source"]
-
-
-def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, float]]]]:
-    """The data of one of the paper's tables, and its rows: method -> views or data -> metric -> figure."""
-    table, metrics = _reported()["tables"][name], _reported()["metrics"]
-    rows = {
-        method: {group: dict(zip(metrics, figures, strict=True)) for group, figures in groups.items()}
-        for method, groups in table["rows"].items()
-    }
-    return table["data"], rows
-
-
-def reported_data(name: str) -> Sequence[str]:
-    """The data sets that are columns of a reported table."""
-    return list(dict.fromkeys(group for row in reported_table(name)[1].values() for group in row))

@@ -1,6 +1,6 @@
-"""What runs measured, as records: of which method, under which setting, for which subject.
+"""What runs measured, as records: the method, the setting, the values of each subject.
 
-A run is told by what its configuration says, never by the name of its directory.
+A run is identified by its configuration, never by the name of its directory.
 """
 
 import re
@@ -13,6 +13,8 @@ from typing import Any
 import yaml
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.config.keys import lookup
+from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import METHOD, mean, metric_names, read_results
 
@@ -24,16 +26,22 @@ ABLATIONS = {
 }
 """The ablation's name by its switches (3D unprojection, semantic consistency), in the tables' order."""
 
-# What tells an encoder of conf/encoder; models change the rest of it.
+# Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("patch_size", "width", "heads", "depth", "layers", "vit")
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What a row of a table stands for. ``kind``: ``model`` (ours), ``baseline``, ``other`` or ``reported``.
+    """What a row of a table shows.
 
-    ``extra`` are further configuration keys that tell rows apart, with their values. Where an encoder comes
-    from is known when training starts only, and tells no rows apart.
+    Args:
+        kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
+        name: name of the method.
+        model, encoder: options of our model.
+        switches: whether 3D unprojection and semantic consistency are on.
+        has_semantics: whether the encoder has published weights. It is not known before training starts, so
+            rows are not told apart by it.
+        extra: further configuration keys and their values that tell rows apart.
     """
 
     kind: str
@@ -44,10 +52,20 @@ class Variant:
     has_semantics: bool = field(default=True, compare=False)
     extra: tuple[tuple[str, str], ...] = ()
 
+    @property
+    def ablation(self) -> str:
+        """The ablation's name by its switches; empty without switches."""
+        return ABLATIONS[self.switches] if self.switches else ""
+
+    @property
+    def trained(self) -> tuple:
+        """What was trained, without its ablation."""
+        return (self.model, self.encoder, self.extra)
+
 
 @dataclass(frozen=True)
 class Setting:
-    """What measured numbers must share to stand in one column."""
+    """What numbers in one column must have in common."""
 
     data: str
     split: str
@@ -57,10 +75,19 @@ class Setting:
 
 @dataclass(frozen=True)
 class Record:
-    """One run of one method with ``views`` inputs: means over subjects, and each subject's values.
+    """One run of one method with one number of input views.
 
-    ``subjects`` is empty where only means are known; ``count`` says over how many subjects. ``values``
-    hold what subjects (averaged over their targets) reached, by metric.
+    Args:
+        variant: the row that it belongs to.
+        setting: data, split, targets and metrics.
+        views: number of input views.
+        seed: seed of the training.
+        means: means over subjects by metric.
+        source: the file that it was read from.
+        count: number of subjects, where it is known.
+        subjects: values of each subject (averaged over its targets) by metric; empty if only means are known.
+        config: the configuration of our model.
+        about: ``hash`` and ``git`` of our runs; ``source`` of other methods, in words.
     """
 
     variant: Variant
@@ -77,7 +104,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Planned:
-    """A run that was started and has no results (yet), or that has: which cells it fills."""
+    """A training run, finished or not: which cells it fills, and whether it is done."""
 
     variant: Variant
     data: str
@@ -93,21 +120,13 @@ class Sweep:
     planned: list[Planned] = field(default_factory=list)
 
 
-def lookup(config: Mapping[str, Any], key: str) -> Any:
-    """The value at a dotted key; None where there is none."""
-    node: Any = config
-    for part in key.split("."):
-        node = node.get(part) if isinstance(node, Mapping) else None
-    return node
-
-
 @cache
 def _shipped_encoders() -> dict[str, dict]:
     return {path.stem: yaml.safe_load(path.read_text()) for path in (conf_dir() / "encoder").glob("*.yaml")}
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
-    """Which of the shipped encoders a configuration has; ``unnamed`` for another."""
+    """The option of conf/encoder that a configuration has; ``unnamed`` where it is another."""
     encoder = config.get("encoder") or {}
     for name, shipped in sorted(_shipped_encoders().items()):
         if all(key in encoder and encoder[key] == shipped.get(key) for key in _ENCODER_KEYS):
@@ -116,7 +135,16 @@ def encoder_name(config: Mapping[str, Any]) -> str:
 
 
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
-    """The row of a model that was trained with ``config``."""
+    """The row of a model.
+
+    Args:
+        config: the configuration that it was trained with.
+        source: the file of the configuration, for messages.
+        by: keys that tell rows apart beside model, encoder and ablation.
+
+    Raises:
+        InputError: the configuration has no ablation.
+    """
     ablation = config.get("ablation")
     if not isinstance(ablation, Mapping):
         raise InputError(f"{source}: expected a run with ablation=...; found none in its configuration")
@@ -128,7 +156,7 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
         model=model if compat in (None, "none") else f"{model}, compat {compat}",
         encoder=encoder_name(config),
         switches=(bool(ablation["unprojection"]), bool(ablation["semantic"])),
-        # Only an encoder that starts from published weights has seen anything but this data's photographs.
+        # Without published weights an encoder has seen the photographs of this data only.
         has_semantics=bool(lookup(config, "encoder.weights")),
         extra=tuple((key, str(lookup(config, key))) for key in by),
     )
@@ -144,10 +172,10 @@ def _groups(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[tuple, dict[str
 
 
 def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
-    """The records of one ``metrics.json``."""
+    """The records of a ``metrics.json``."""
     content = read_results(path)
     source = content["provenance"]
-    # `ghgs evaluate` has a configuration of its own; what the model is stands in its checkpoint.
+    # The configuration of `ghgs evaluate` does not describe the model; that of its checkpoint does.
     trained = source.get("checkpoint_config") or source["config"]
     measured = {name: source["config"].get(name) for name in ("data", "metrics")}
     names = metric_names(content["rows"])
@@ -182,26 +210,28 @@ def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
 
 
 def _planned(path: Path, by: Sequence[str]) -> Planned | None:
-    """The training run of a ``config.yaml``; None for another file, or one that is being written."""
+    """The training run of a ``config.yaml``; None where it is that of another verb or incomplete."""
     try:
         config = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
         return None
     if not isinstance(config, Mapping) or not all(k in config for k in ("ablation", "trainer", "data")):
         return None
+    config = upgrade(config)
     data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
-    """All runs below ``folders``, finished or not.
+    """All runs below some folders, finished or not.
 
     Args:
-        by: configuration keys that tell rows apart beside the model, its encoder and its ablation.
+        folders: directories of runs.
+        by: configuration keys that tell rows apart beside model, encoder and ablation.
 
     Raises:
         FileNotFoundError: a folder is missing.
-        InputError: there is no finished run, or a ``metrics.json`` that is none.
+        InputError: there is no finished run, or a ``metrics.json`` is damaged.
     """
     sweep = Sweep()
     for folder in folders:
@@ -220,6 +250,6 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:
-    """Whom a subject is of: the first group of ``unit``, where subjects are frames of people."""
+    """The person of a subject: the first group of ``unit`` where it matches, else the subject itself."""
     match = unit.fullmatch(subject) if unit else None
     return match[1] if match else subject

@@ -1,4 +1,4 @@
-"""Paired tests over subjects, corrected for how many of them a table makes."""
+"""Paired tests over subjects, corrected for the number of tests in a table."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,14 +10,20 @@ from scipy import stats
 from ghgs_lit.errors import choice, require
 
 KINDS = {"wilcoxon": "Wilcoxon signed-rank test", "t": "paired t test"}
-_LEAST_FOR_T = 5
-"""Pairs below which nobody can see whether differences are normal."""
+_MIN_PAIRS_FOR_T = 5
+"""With fewer pairs nobody can see whether the differences are normal."""
 
 
 @dataclass(frozen=True)
 class PairedTest:
-    """Which test: ``kind`` (``wilcoxon``, ``t``, ``none``), against which row (``full``: the whole method's
-    where there is exactly one; ``best``: each column's best), at which level ``alpha``."""
+    """Which test is made.
+
+    Args:
+        kind: ``wilcoxon``, ``t`` or ``none``.
+        against: the reference row: ``full``, that of the whole method where there is exactly one; ``best``,
+            the best of each column.
+        alpha: level of significance.
+    """
 
     kind: str = "wilcoxon"
     against: str = "full"
@@ -31,8 +37,14 @@ class PairedTest:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A row against the reference row of its column: ``n`` pairs, mean ``difference`` (row minus
-    reference), two-sided ``p`` and its Holm correction; None where ``n`` is too small to be tested."""
+    """A row compared with the reference row of its column.
+
+    Args:
+        n: number of pairs.
+        difference: mean of row minus reference; None without pairs.
+        p: two-sided p-value; None where ``n`` is too small for a test.
+        corrected: ``p`` after Holm's correction.
+    """
 
     n: int
     difference: float | None
@@ -41,7 +53,12 @@ class Comparison:
 
 
 def compare(row: Mapping[str, float], reference: Mapping[str, float], kind: str) -> Comparison:
-    """The subjects that both have, one pair each. Equal rows have p = 1."""
+    """Compare two rows on the subjects that both have, one pair each; equal rows have p = 1.
+
+    Args:
+        row, reference: value of each subject.
+        kind: ``wilcoxon`` or ``t``.
+    """
     shared = sorted(set(row) & set(reference))
     differences = np.array([row[name] - reference[name] for name in shared], dtype=np.float64)
     if len(shared) < 2:
@@ -59,7 +76,7 @@ def compare(row: Mapping[str, float], reference: Mapping[str, float], kind: str)
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Holm's correction of p-values that are looked at together, in their order."""
+    """Holm's correction of p-values of one table, in their order."""
     order = np.argsort(values, kind="stable")
     scaled = np.asarray(values, dtype=np.float64)[order] * np.arange(len(values), 0, -1)
     corrected = np.empty(len(values))
@@ -68,11 +85,11 @@ def holm(values: Sequence[float]) -> list[float]:
 
 
 def too_few(n: int, comparisons: int, settings: PairedTest) -> str | None:
-    """Why ``n`` pairs cannot show anything among that many comparisons; None where they can."""
+    """Why ``n`` pairs cannot show a difference in a table of ``comparisons`` tests; None where they can."""
     if settings.kind == "t":
-        return f"fewer than {_LEAST_FOR_T} subjects" if n < _LEAST_FOR_T else None
-    # All differences of one sign are the most that signs and ranks can say.
-    least = min(1.0, 2.0 ** (1 - n) * comparisons)
-    if least <= settings.alpha:
+        return f"fewer than {_MIN_PAIRS_FOR_T} subjects" if n < _MIN_PAIRS_FOR_T else None
+    # The smallest p of signs and ranks is that of differences with one sign.
+    smallest = min(1.0, 2.0 ** (1 - n) * comparisons)
+    if smallest <= settings.alpha:
         return None
-    return f"even if every subject agreed, p could not fall below {least:.2g}"
+    return f"even if every subject agreed, p could not fall below {smallest:.2g}"

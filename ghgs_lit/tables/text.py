@@ -1,4 +1,4 @@
-"""What a table says in words: its numbers as printed, its caption, its notes."""
+"""The texts of a table: its numbers as printed, its caption, its notes."""
 
 import math
 from collections.abc import Sequence
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from ghgs_lit.tables.differences import differing, differing_text
 from ghgs_lit.tables.layouts import Cell, Line, Table, decimals
-from ghgs_lit.tables.others import data_title, reported_source
-from ghgs_lit.tables.records import ABLATIONS, Planned, Record
+from ghgs_lit.tables.records import Planned
+from ghgs_lit.tables.reported import data_title, reported_source
 from ghgs_lit.tables.significance import KINDS, PairedTest, too_few
 
 FOOTNOTE = (
@@ -22,7 +22,14 @@ MARK = "*"
 
 @dataclass(frozen=True)
 class CellText:
-    """A number's parts: ``mean`` (or what stands for it), ``spread`` and ``tail`` may be empty."""
+    """The parts of a printed number.
+
+    Args:
+        mean: the number, or the text where there is none.
+        spread: deviation over seeds; may be empty.
+        tail: marks and missing seeds; may be empty.
+        best: whether it is the best of its column.
+    """
 
     mean: str
     spread: str = ""
@@ -39,27 +46,22 @@ def deviation(values: Sequence[float]) -> float | None:
 
 
 def cell_text(cell: Cell | None, line: Line, metric: str) -> CellText:
-    """Mean, deviation over seeds, and whether seeds are lacking or the row differs beyond chance."""
+    """The text of a cell (None: the row has none in this column) in a column of ``metric``."""
     if cell is None:
         return CellText(line.absent)
     digits, spread = decimals(metric), deviation(list(cell.seeds.values()))
     tail = MARK if cell.marked else ""
-    if cell.lacking:
-        tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.lacking)})"
+    if cell.missing_seeds:
+        tail += f" ({len(cell.seeds)}/{len(cell.seeds) + len(cell.missing_seeds)})"
     text = "" if spread is None else f"{spread:.{digits}f}"
     return CellText(f"{cell.mean:.{digits}f}", text, tail, cell.best)
 
 
-def _measured(table: Table) -> list[Cell]:
-    return [cell for line in table.lines if line.variant.kind != "reported" for cell in line.cells.values()]
-
-
 def write_caption(table: Table) -> str:
     """Data, protocol, model and number of runs, in one line."""
-    records: list[Record] = table.about["records"]
-    first, names = records[0], list(dict.fromkeys(r.setting.data for r in records))
-    counts = sorted({cell.count for cell in _measured(table) if cell.count})
-    seeds = max((len(cell.seeds) for cell in _measured(table)), default=0)
+    first, names = table.records[0], dict.fromkeys(r.setting.data for r in table.records)
+    counts = sorted({cell.count for cell in table.measured if cell.count})
+    seeds = max((len(cell.seeds) for cell in table.measured), default=0)
     setting = first.setting
     said = [
         f"Data {' and '.join(f'`{name}`' for name in names)}",
@@ -78,15 +80,14 @@ def write_caption(table: Table) -> str:
 
 
 def write_notes(table: Table, test: PairedTest, illustration: bool = False) -> list[str]:
-    """What has to be said below the table."""
-    own = [line for line in table.lines if line.variant.kind == "model"]
+    """The notes below the table; ``illustration`` adds that the numbers are no result."""
     said = [f"**{ILLUSTRATION}**"] if illustration else []
     if table.layout.rows == "ablation":
         said.append(FOOTNOTE)
-        if not own[0].variant.has_semantics:
+        if not table.ours[0].variant.has_semantics:
             said.append(f"(a) {NO_SEMANTICS}.")
     if "flip" in table.metrics and "lpips" not in table.metrics:
-        said.append("FLIP stands in for the paper's LPIPS, which at least one run could not compute.")
+        said.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
     if table.reported_on:
         said.append(
             f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured by its"
@@ -100,12 +101,12 @@ def write_notes(table: Table, test: PairedTest, illustration: bool = False) -> l
 
 
 def _about_others(table: Table) -> list[str]:
-    """Where other methods' numbers are from, and whether they are of other subjects than ours."""
+    """Where the numbers of other methods are from, and whether their number of subjects differs from ours."""
     said = []
-    own = {r.count for r in table.about["records"] if r.variant.kind == "model"}
+    own = {r.count for r in table.records if r.variant.kind == "model"}
     for line in table.lines:
         if line.variant.kind == "other":
-            records = [r for r in table.about["records"] if r.variant == line.variant]
+            records = [r for r in table.records if r.variant == line.variant]
             untested = "" if all(r.subjects for r in records) else "; means only where untested"
             counts = sorted({r.count for r in records if r.count} - own)
             fewer = f"; of {' or '.join(map(str, counts))} subjects" if counts else ""
@@ -114,8 +115,8 @@ def _about_others(table: Table) -> list[str]:
 
 
 def _about_test(table: Table, test: PairedTest) -> list[str]:
-    """Which test, over how many subjects; or why there is none."""
-    tested = [c for c in _measured(table) if c.test is not None]
+    """Which test was made with how many subjects, or why nothing is marked."""
+    tested = [c for c in table.measured if c.test is not None]
     if not tested:
         return []
     known = [c for c in tested if c.test.p is not None]
@@ -123,8 +124,7 @@ def _about_test(table: Table, test: PairedTest) -> list[str]:
     n = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
     against = "its column's best row"
     if test.against == "full":
-        full = [line for line in table.lines if line.variant.kind == "model"]
-        full = [line for line in full if line.variant.switches == (True, True)]
+        full = [line for line in table.ours if line.variant.ablation == "full"]
         against = "the row of the whole method" if len(full) == 1 and full[0].cells else against
     few = too_few(counts[-1], len(known), test)
     about = f"{KINDS[test.kind]} against {against}, n = {n} subjects (each averaged over seeds)"
@@ -135,43 +135,33 @@ def _about_test(table: Table, test: PairedTest) -> list[str]:
 
 
 def _run_name(planned: Planned) -> str:
-    ablation = ABLATIONS[planned.variant.switches]
-    return f"{data_title(planned.data)} {planned.variant.model} {ablation} seed {planned.seed}"
+    variant = planned.variant
+    return f"{data_title(planned.data)} {variant.model} {variant.ablation} seed {planned.seed}"
 
 
 def _about_runs(table: Table) -> list[str]:
-    """What a reader has to know about the runs behind the numbers: unfinished, unequal, of other code."""
+    """Runs that are unfinished, that differ in settings, or that are of different states of the code."""
     said = []
-    if any(cell.lacking for cell in _measured(table)):
+    if any(cell.missing_seeds for cell in table.measured):
         said.append("(2/3): from 2 of 3 seeds; the others have no results yet.")
-    planned: list[Planned] = table.about["planned"]
-    unfinished = list(dict.fromkeys(_run_name(p) for p in planned if not p.done))
+    unfinished = list(dict.fromkeys(_run_name(p) for p in table.planned if not p.done))
     if unfinished:
         more = f" and {len(unfinished) - 4} more" if len(unfinished) > 4 else ""
         said.append(f"No results yet (in progress or cut off): {'; '.join(unfinished[:4])}{more}.")
-    records = [r for r in table.about["records"] if r.config]
-    compared = _comparable(table, records)
-    keys = {key: values for group in compared for key, values in differing(group).items()}
+    groups: dict[tuple, list] = {}
+    for record in table.records:
+        if record.config:
+            variant = record.variant
+            row = (variant.model, variant.encoder, variant.switches, record.setting.data)
+            row = () if table.layout.rows == "ablation" else row
+            groups.setdefault(row, []).append(record.config)
+    keys = {key: values for group in groups.values() for key, values in differing(group).items()}
     if keys:
         said.append(f"Runs side by side differ also in {differing_text(keys)}.")
-    states = {_git_text(r.about.get("git")) for r in table.about["records"] if r.about.get("git")}
+    states = {_git_text(git) for r in table.records if (git := r.about.get("git"))}
     if len(states) > 1:
         said.append(f"The runs are of {len(states)} states of the code: {', '.join(sorted(states))}.")
     return said
-
-
-def _comparable(table: Table, records: list[Record]) -> list[list]:
-    """Configurations that should be equal but for the expected keys."""
-    if table.layout.rows == "ablation":
-        return [[r.config for r in records]]
-    groups: dict[tuple, list] = {}
-    for record in records:
-        switched = record.variant.switches
-        groups.setdefault((record.variant.model, record.variant.encoder, switched, record.setting.data), [])
-        groups[record.variant.model, record.variant.encoder, switched, record.setting.data].append(
-            {k: v for k, v in record.config.items()}
-        )
-    return list(groups.values())
 
 
 def _git_text(git: dict) -> str:

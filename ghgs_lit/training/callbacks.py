@@ -1,4 +1,4 @@
-"""Numbers beside the training step: progress, times, memory."""
+"""What runs beside the training step: a progress bar, times and memory."""
 
 import resource
 import sys
@@ -11,12 +11,12 @@ from lightning.pytorch.callbacks import Callback, ProgressBar
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torch import nn
 
-from ghgs_lit.training.clock import PARTS, StepClock
+from ghgs_lit.training.clock import PARTS
 from ghgs_lit.types import Batch
 
 
 class RunProgress(ProgressBar):
-    """One bar for the whole run, over its budget of steps or of time; epochs mean little here."""
+    """One bar for the whole run, over its budget of steps or of time, not of epochs."""
 
     def __init__(self):
         super().__init__()
@@ -71,13 +71,13 @@ def _logs_now(trainer: L.Trainer) -> bool:
 
 
 class StepTime(Callback):
-    """Logs the milliseconds of a step and of each part of it, as means since the last log.
+    """Logs the milliseconds of a step and of each of its parts, as means since the last log.
 
-    ``time_ms/01_data`` is the wait for data, ``time_ms/step`` the sum of all parts; validation, the
-    writing of checkpoints and of logs are in none of them. Parts that a model does not have are left out.
+    ``time_ms/01_data`` is the wait for data, ``time_ms/step`` the sum of all parts. Validation and the
+    writing of checkpoints and logs are not counted; parts that a model does not have are left out.
     """
 
-    #: A stage of the model: the part that ends where it begins, and the part that it is.
+    #: Stages of the model: name, the part that ends where the stage begins, the part that the stage is.
     STAGES = (
         ("encoder", "interval", "encode"),
         ("depth_head", None, "depth"),
@@ -89,37 +89,37 @@ class StepTime(Callback):
         self._hooks: list = []
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        pl_module.clock = StepClock(pl_module.device)
+        clock = pl_module.clock
         for name, before, part in self.STAGES:
             stage = getattr(pl_module.model, name, None)
             if isinstance(stage, nn.Module):
                 if before is not None:
-                    hook = stage.register_forward_pre_hook(lambda *_, part=before: pl_module.mark(part))
+                    hook = stage.register_forward_pre_hook(lambda *_, part=before: clock.mark(part))
                     self._hooks.append(hook)
-                self._hooks.append(stage.register_forward_hook(lambda *_, part=part: pl_module.mark(part)))
-        pl_module.clock.start()
+                self._hooks.append(stage.register_forward_hook(lambda *_, part=part: clock.mark(part)))
+        clock.start(pl_module.device)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        pl_module.mark("data")
+        pl_module.clock.mark("data")
 
     def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        pl_module.mark("backward")
+        pl_module.clock.mark("backward")
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        pl_module.clock.end()
+        pl_module.clock.end_step()
         if _logs_now(trainer):
             names = {part: f"{place:02d}_{part}" for place, part in enumerate(PARTS, start=1)}
             means = pl_module.clock.means()
             pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
 
     def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        pl_module.clock = None
+        pl_module.clock.stop()
         while self._hooks:
             self._hooks.pop().remove()
 
 
 def resident_mb() -> float:
-    """Memory of this process: what it holds now on Linux, the most it ever held elsewhere."""
+    """Memory of this process in MiB: now on Linux, the maximum so far on other systems."""
     pages = Path("/proc/self/statm")
     if pages.exists():
         return int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20
@@ -128,7 +128,7 @@ def resident_mb() -> float:
 
 
 class Memory(Callback):
-    """Logs the process's memory and, on CUDA, the most that tensors took since the last log, in MiB."""
+    """Logs the memory of the process and, on CUDA, the peak of all tensors since the last log, in MiB."""
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         if not _logs_now(trainer):

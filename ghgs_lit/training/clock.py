@@ -1,8 +1,7 @@
 """How long each part of a training step takes, on the CPU or on the device."""
 
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -23,54 +22,61 @@ PARTS = (
 )
 
 
-@dataclass
 class StepClock:
-    """Marks where each part of a step ends; what lies between two marks belongs to the second.
+    """Measures the parts of a step: the time between two marks belongs to the part of the second.
 
-    On CUDA the marks are events, read when the next step ends: nothing waits for the device.
+    It does nothing before :meth:`start` and after :meth:`stop`. On CUDA the marks are events that are read
+    when the next step ends, so that nothing waits for the device.
     """
 
-    device: torch.device
-    totals: dict[str, float] = field(default_factory=dict)
-    steps: int = 0
-    _marks: list[tuple[str | None, object]] = field(default_factory=list)
-    _pending: list[tuple[str | None, object]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.device = torch.device("cpu")
+        self.stop()
 
-    def start(self) -> None:
-        """Begin to wait for the data of a step; marks since the last :meth:`end` are forgotten."""
-        self._marks = [(None, self._now())]
+    def start(self, device: torch.device) -> None:
+        """Begin to measure on ``device``, with the wait for the data of a step."""
+        self.device, self.running = device, True
+        self.restart()
+
+    def stop(self) -> None:
+        """Measure nothing from now on and forget everything."""
+        self.running = False
+        self._totals: dict[str, float] = {}
+        self._steps = 0
+        self._marks: list[tuple[str | None, object]] = []
+        self._pending: list[tuple[str | None, object]] = []
+
+    def restart(self) -> None:
+        """Begin a step again here; marks since the last :meth:`end_step` are forgotten."""
+        if self.running:
+            self._marks = [(None, self._now())]
 
     def mark(self, part: str) -> None:
         """``part`` ends here."""
-        if self._marks:
+        if self.running:
             self._marks.append((part, self._now()))
 
-    def end(self) -> None:
-        """The step has ended, with its last part, the optimizer; the next one begins."""
+    def end_step(self) -> None:
+        """The step ends here, with its last part, the optimizer; the next one begins."""
         self.mark("optimizer")
         if self.device.type == "cuda":
             self._pending, self._marks = self._marks, self._pending
-            self._add(self._marks)
-        else:
-            self._add(self._marks)
-        self.start()
+        self._add(self._marks)
+        self.restart()
 
     def means(self) -> dict[str, float]:
         """Milliseconds of each part in a step since the last call, in order, and of the whole ``step``."""
-        found = {part: 1e3 * self.totals[part] / self.steps for part in PARTS if part in self.totals}
+        found = {part: 1e3 * self._totals[part] / self._steps for part in PARTS if part in self._totals}
         if found:
             found["step"] = sum(found.values())
-        self.totals, self.steps = {}, 0
+        self._totals, self._steps = {}, 0
         return found
 
-    def _add(self, marks: Iterable[tuple[str | None, object]]) -> None:
-        marks = list(marks)
-        if not marks:
-            return
-        self.steps += 1
+    def _add(self, marks: Sequence[tuple[str | None, object]]) -> None:
+        self._steps += bool(marks)
         for (_, begin), (part, stop) in pairwise(marks):
             seconds = begin.elapsed_time(stop) / 1e3 if self.device.type == "cuda" else stop - begin
-            self.totals[part] = self.totals.get(part, 0.0) + seconds
+            self._totals[part] = self._totals.get(part, 0.0) + seconds
 
     def _now(self) -> object:
         if self.device.type != "cuda":

@@ -13,10 +13,10 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import PSNR, depth_error_mm
 from ghgs_lit.metrics.functional import ssim
-from ghgs_lit.model import FORMAT_VERSION
 from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
 
 class DivergedError(InputError):
@@ -24,9 +24,18 @@ class DivergedError(InputError):
 
 
 class GHGSModule(L.LightningModule):
-    """Trains ``model`` (``Batch -> Prediction``) through ``renderer`` (``Gaussians, Cameras -> Rendering``).
+    """Trains a model through a renderer.
 
-    ``config`` is the run's full configuration as plain data; every checkpoint carries it.
+    Args:
+        model: gives the Gaussians and depths of a batch.
+        renderer: draws Gaussians from cameras.
+        losses: the terms that are trained on.
+        optimization: optimizer, schedule and gradient clipping.
+        config: the run's full configuration as plain data; every checkpoint contains it.
+
+    Attributes:
+        clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
+        used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
     """
 
     def __init__(
@@ -45,26 +54,22 @@ class GHGSModule(L.LightningModule):
         self.config = config
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
         self.used_budget = 0.0
-        self.clock: StepClock | None = None
-
-    def mark(self, part: str) -> None:
-        """A part of the step ends here; says so to the clock, where one listens."""
-        if self.clock is not None:
-            self.clock.mark(part)
+        self.clock = StepClock()
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
+        """The prediction for a batch, and its Gaussians as the batch's target cameras see them."""
         prediction = self.model(batch)
-        self.mark("gaussians")
+        self.clock.mark("gaussians")
         rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
-        self.mark("render")
+        self.clock.mark("render")
         return prediction, rendering
 
     def on_train_start(self) -> None:
-        # The scheduler does not ask again before the first step after a restart is taken.
+        # After a restart the scheduler asks for the first time when a step has been taken.
         self.used_budget = self.progress()
 
     def step_seed(self, batch_idx: int) -> int:
-        """Seed of the random numbers of this step: the same whether the run was interrupted or not."""
+        """Seed of the random numbers of this step; it does not depend on interruptions of the run."""
         part = batch_idx % self.trainer.accumulate_grad_batches
         numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
         return int(np.random.SeedSequence(numbers).generate_state(1)[0])
@@ -79,7 +84,7 @@ class GHGSModule(L.LightningModule):
             raise DivergedError(
                 f"step {self.global_step}: expected finite losses; found {broken} (subjects {subjects})"
             )
-        self.mark("loss")
+        self.clock.mark("loss")
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
@@ -105,14 +110,14 @@ class GHGSModule(L.LightningModule):
         return {"prediction": prediction, "rendering": rendering}
 
     def progress(self) -> float:
-        """Share of the budget that is used up: of the steps or of the time, whichever is further."""
+        """Share of the budget in [0, 1] that is used: of steps or of time, whichever is larger."""
         trainer = self.trainer
         shares = [self.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
         for timer in (c for c in trainer.callbacks if isinstance(c, Timer)):
             used, left = timer.time_elapsed(), timer.time_remaining()
             if left is not None:
                 share = torch.tensor(used / max(used + left, 1e-9), device=self.device)
-                # The processes' clocks differ, their learning rates must not.
+                # Clocks differ between processes; learning rates must not.
                 together = trainer.world_size > 1 and used > 0
                 shares.append(float(trainer.strategy.reduce(share, reduce_op="max") if together else share))
         if not shares:
@@ -130,8 +135,12 @@ class GHGSModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip``, log the norm before it, refuse one that is not a number."""
-        self.optimization.drop_held(self.model, self.used_budget)
+        """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
+
+        Raises:
+            DivergedError: the norm is not finite (names a parameter).
+        """
+        self.optimization.drop_frozen_gradients(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip)
         if not torch.isfinite(norm):
             broken = [
@@ -146,14 +155,13 @@ class GHGSModule(L.LightningModule):
         self.log("train/gradient_norm", norm)
 
     def on_train_batch_end(self, *args: Any) -> None:
-        # Called after all callbacks: the clock does not count what they did since the step ended.
-        if self.clock is not None:
-            self.clock.start()
+        # Called after all callbacks: what they did since the step ended is not counted.
+        self.clock.restart()
 
     def on_validation_end(self) -> None:
         self.on_train_batch_end()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Plain data only: such a file loads with ``torch.load(weights_only=True)``."""
+        """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = dict(self.config)

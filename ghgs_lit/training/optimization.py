@@ -1,4 +1,4 @@
-"""How the weights move: AdamW, a linear schedule over the run's budget, a bound on the gradient."""
+"""How the weights are trained: AdamW, a linear schedule over the run's budget, gradient clipping."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,11 +13,21 @@ from ghgs_lit.errors import require
 class Optimization:
     """AdamW whose learning rate rises linearly to ``lr`` and then falls linearly.
 
-    ``warmup`` is the rise's share of the run; ``start_factor`` and ``end_factor`` are the first and the
-    last learning rate as parts of ``lr``; ``clip`` bounds the norm of the gradient. The schedule runs on
-    the share of the budget that is used up, in steps or in time, whichever is further. ``hold`` maps the
-    beginning of parameters' names to the share of the run in which they stay as they are: splats whose
-    depth is still wrong are worth most when they are transparent, and do not come back from there.
+    The schedule depends on the share of the run's budget that is used: of steps or of time, whichever is
+    larger.
+
+    Args:
+        lr: highest learning rate.
+        betas, eps, weight_decay: of AdamW.
+        warmup: share of the run in which the learning rate rises.
+        start_factor, end_factor: first and last learning rate as fractions of ``lr``.
+        clip: maximum norm of the gradient.
+        freeze_until: prefix of parameter names to the share of the run in which these parameters stay
+            unchanged. Splats whose depth is still wrong reduce the loss most by becoming transparent, and
+            do not recover from that.
+
+    Raises:
+        InputError: a value that cannot work (names its key).
     """
 
     lr: float
@@ -28,7 +38,7 @@ class Optimization:
     start_factor: float = 0.04
     end_factor: float = 0.0
     clip: float = 1.0
-    hold: Mapping[str, float] = field(default_factory=dict)
+    freeze_until: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
         require(self.lr > 0, "optimizer.lr", "a positive number", self.lr)
@@ -41,15 +51,19 @@ class Optimization:
             value = getattr(self, name)
             require(0 <= value <= 1, f"optimizer.{name}", "a share in [0, 1]", value)
         require(self.clip > 0, "optimizer.clip", "a positive gradient norm", self.clip)
-        for prefix, share in self.hold.items():
-            require(0 <= share <= 1, f"optimizer.hold.{prefix}", "a share in [0, 1]", share)
+        for prefix, share in self.freeze_until.items():
+            require(0 <= share <= 1, f"optimizer.freeze_until.{prefix}", "a share in [0, 1]", share)
 
     def build(self, model: nn.Module) -> torch.optim.AdamW:
-        """The optimizer of those parameters of ``model`` that are trained."""
+        """The optimizer of the parameters of ``model`` that are trained.
+
+        Raises:
+            InputError: ``freeze_until`` names no parameter.
+        """
         names = [name for name, _ in model.named_parameters()]
-        for prefix in self.hold:
+        for prefix in self.freeze_until:
             known = any(name.startswith(prefix) for name in names)
-            require(known, f"optimizer.hold.{prefix}", "the beginning of a parameter's name", prefix)
+            require(known, f"optimizer.freeze_until.{prefix}", "the beginning of a parameter's name", prefix)
         return torch.optim.AdamW(
             [p for p in model.parameters() if p.requires_grad],
             lr=self.lr,
@@ -59,15 +73,18 @@ class Optimization:
             fused=True,
         )
 
-    def drop_held(self, model: nn.Module, progress: float) -> None:
-        """Take away the gradients of what is held at this share of the run; the optimizer skips those."""
-        held = tuple(prefix for prefix, share in self.hold.items() if progress < share)
+    def drop_frozen_gradients(self, model: nn.Module, progress: float) -> None:
+        """Remove the gradients of the parameters that are frozen at the share ``progress`` of the run.
+
+        AdamW then leaves these parameters unchanged, without weight decay.
+        """
+        frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
         for name, parameter in model.named_parameters():
-            if held and name.startswith(held):
+            if name.startswith(frozen):
                 parameter.grad = None
 
     def factor(self, progress: float) -> float:
-        """Learning rate as a part of ``lr`` when the share ``progress`` in [0, 1] of the budget is used."""
+        """Learning rate as a fraction of ``lr`` when the share ``progress`` of the budget is used."""
         if progress < self.warmup:
             return self.start_factor + (1 - self.start_factor) * progress / self.warmup
         fall = (progress - self.warmup) / (1 - self.warmup)

@@ -1,4 +1,4 @@
-"""Where training starts from: nothing, the weights of another run, or a run that was cut off."""
+"""What training starts from: nothing, the weights of another run, or an interrupted run."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,28 +6,17 @@ from typing import Any
 
 from torch import nn
 
+from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.model import load_strictly, read_checkpoint
-from ghgs_lit.weights.checkpoint import model_state
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 from ghgs_lit.weights.switches import differences as differing_switches
-
-#: What may differ between a run and the one that it goes on from: where it writes, how far it goes.
-FREE = (
-    "resume",
-    "encoder.weights",
-    "dry_run",
-    "sweep",
-    "trainer.max_steps",
-    "trainer.max_time",
-    "logger",
-    "callbacks",
-    "evaluation",
-    "metrics",
-)
 
 
 def check_start(config: Mapping[str, Any], directory: Path) -> None:
-    """Refuse two ways to start; a run that goes on in its own ``directory`` began with its ``init_from``."""
+    """Refuse ``init_from`` beside ``resume``, unless the run resumes in its own ``directory``.
+
+    Such a run began with its ``init_from``, and its configuration still says so.
+    """
     if config["resume"] is None or config["init_from"] is None:
         return
     own = Path(config["resume"]).resolve().is_relative_to(directory.resolve())
@@ -35,10 +24,18 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
 
 
 def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """The step of the checkpoint at ``path``, and what of its configuration this run changes.
+    """Check that a run can resume from a checkpoint.
+
+    Args:
+        path: the checkpoint.
+        model: the model of this run; it gets the weights of the checkpoint.
+        config: the configuration of this run.
+
+    Returns:
+        The step of the checkpoint, and one line for each setting that this run changes.
 
     Raises:
-        InputError: no checkpoint of a training run, or one of another model (names the tensor).
+        InputError: not a checkpoint of a training run, or of another model (names the tensor).
     """
     checkpoint = read_checkpoint(path)
     for key in ("global_step", "optimizer_states"):
@@ -52,33 +49,30 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """``key: value before -> value now`` of all that matters to the weights."""
-    old, new = _flat(before), _flat(now)
+    """``key: old value -> new value`` of everything that the weights depend on."""
+    old, new = flatten(before), flatten(now)
     return [
         f"{key}: {old.get(key)} -> {new.get(key)}"
         for key in sorted(old.keys() | new.keys())
-        if old.get(key) != new.get(key)
-        and not any(key == name or key.startswith(f"{name}.") for name in FREE)
+        if old.get(key) != new.get(key) and not is_below(key, MAY_CHANGE_ON_RESUME)
     ]
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat = {}
-    for name, value in config.items():
-        key = f"{prefix}{name}"
-        flat |= _flat(value, f"{key}.") if isinstance(value, Mapping) and value else {key: value}
-    return flat
-
-
 def initialize(model: nn.Module, path: str | Path, strict: bool = False) -> list[str]:
-    """Load what fits of the weights at ``path`` into ``model``; says what became of each tensor.
+    """Load the weights at ``path`` that fit into ``model``.
 
-    One line each: ``loaded``, ``wrong shape`` and ``missing`` (both stay as initialised), ``ignored`` (the
-    model has no such tensor).
+    Args:
+        model: gets the weights.
+        path: a checkpoint of this project.
+        strict: every tensor must fit.
+
+    Returns:
+        One line for each tensor: ``loaded``, ``wrong shape`` and ``missing`` (both stay as initialised) or
+        ``ignored`` (the model has no such tensor).
 
     Raises:
-        InputError: no checkpoint of this project; nothing fits; with ``strict``, a tensor that does not fit
-            or is missing on either side (names it).
+        InputError: not a checkpoint of this project; nothing fits; with ``strict``, a tensor that does not
+            fit or is missing on either side (names it).
     """
     state, own = model_state(read_checkpoint(path)), model.state_dict()
     if strict:
@@ -102,9 +96,9 @@ def initialize(model: nn.Module, path: str | Path, strict: bool = False) -> list
 
 
 def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any]:
-    """``config`` that says where the encoder's weights come from, if those of the start do and all fit.
+    """``config`` with the origin of the encoder's weights, where the start has one and all of them fit.
 
-    Tables then know that semantic features carry semantics (``encoder.weights``).
+    Tables read ``encoder.weights`` to know whether the features carry semantics.
     """
     path = config["resume"] or config["init_from"]
     if path is None:
@@ -120,12 +114,18 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
 
 
 def switched(config: Mapping[str, Any]) -> list[str]:
-    """The switches (:mod:`ghgs_lit.weights.switches`) in which this model differs from ``init_from``'s."""
+    """Switches (:mod:`ghgs_lit.weights.switches`) in which this model differs from that of ``init_from``."""
     return differing_switches(config, read_checkpoint(config["init_from"])["config"])
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """All but the loaded tensors, and how many those are; ``written`` has the lines of all."""
+    """A text of at most 22 lines: the number of loaded tensors and the lines of the others.
+
+    Args:
+        lines: what :func:`initialize` returned.
+        path: where the weights are from.
+        written: file that gets all lines.
+    """
     written.write_text("\n".join(lines) + "\n")
     others = [line for line in lines if not line.startswith("loaded")]
     loaded = len(lines) - len(others)

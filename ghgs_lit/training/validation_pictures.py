@@ -1,4 +1,4 @@
-"""What to look at while a run trains: pictures, attention and point clouds of its validation subjects."""
+"""Pictures, attention and point clouds of the first validation subjects, while a run trains."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import save_png, sheet
 
-#: How TensorBoard shows clouds: points of two centimetres, a lens that does not distort.
+#: How TensorBoard shows clouds: points of two centimetres through a perspective camera.
 CLOUD_VIEW = {
     "camera": {"cls": "PerspectiveCamera", "fov": 40},
     "material": {"cls": "PointsMaterial", "size": 0.02},
@@ -26,7 +26,7 @@ CLOUD_VIEW = {
 
 
 class _FirstSubjects(Callback):
-    """Calls :meth:`show` for the first ``subjects`` subjects of each validation, in the first process."""
+    """Calls :meth:`show` for the first ``subjects`` subjects of each validation, in one process."""
 
     name = ""
 
@@ -55,11 +55,12 @@ class _FirstSubjects(Callback):
     def show(
         self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
     ) -> None:
+        """Draw subject ``element`` of ``batch``; ``outputs`` are those of the validation step."""
         raise NotImplementedError
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
-    """To ``<run>/pictures/step_<step>/<file>.png`` and to the loggers that take pictures."""
+    """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` where loggers take pictures."""
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
     for logger in trainer.loggers:
@@ -88,8 +89,10 @@ class Pictures(_FirstSubjects):
 class Attention(_FirstSubjects):
     """What one token attends to, drawn on the views: ``attention/<subject>``.
 
-    ``token`` is ``[view, row, column]`` on the grid of tokens that the recalibration sees (of the crop,
-    where the model crops); null: in the middle of the subject in its first view.
+    Args:
+        subjects: number of subjects.
+        token: ``[view, row, column]`` on the grid of tokens that the recalibration gets (of the crop, where
+            the model crops); None: the middle of the subject in its first view.
     """
 
     name = "attention"
@@ -133,9 +136,11 @@ class Attention(_FirstSubjects):
 
 
 class PointClouds(_FirstSubjects):
-    """Predicted points and the body as clouds: ``<subject>/points`` and so on.
+    """Predicted points and the body's vertices in TensorBoard's mesh tab: ``<subject>/points`` and so on.
 
-    To TensorBoard's mesh tab only; ``points`` bounds each cloud.
+    Args:
+        subjects: number of subjects.
+        points: maximum number of points of each cloud.
     """
 
     name = "point_clouds"

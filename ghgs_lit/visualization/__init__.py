@@ -1,1 +1,1 @@
-"""Pictures, attention and point clouds to look at."""
+"""Pictures of predictions, of attention, and point clouds."""

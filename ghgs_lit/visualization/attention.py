@@ -10,17 +10,26 @@ from ghgs_lit.recalibration.inspection import TokenAttention
 from ghgs_lit.types import Batch, Points, Tokens
 from ghgs_lit.visualization.pictures import grid, palette, row, to_uint8
 
-_SIDE = 224  # least height of a tile in pixels
+_SIDE = 224  # minimum height of a tile in pixels
 _QUERY = (255, 60, 220)
 
 
 def chosen_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
-    """Index of the packed token at ``(view, row, column)`` of the token grid.
+    """Index of a packed token that has a point.
 
-    Without ``at``, or where no token with a point lies there, the nearest in that view to it or to the
-    middle of the subject; None where that view has no token with a point.
+    Args:
+        tokens: packed tokens of a batch.
+        points: their points.
+        element: index of the subject in the batch.
+        at: ``(view, row, column)`` on the grid of tokens (None: the middle of the subject in its first view).
+
+    Returns:
+        The token of that view that is nearest to the place; None where no token of the view has a point.
+
+    Raises:
+        InputError: ``at`` is outside the grid.
     """
     views, height, width = tokens.grid[1:]
     if at is not None:
@@ -37,10 +46,16 @@ def chosen_token(
 
 
 def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:
-    """The query (outlined) and its neighbours on the views of its element.
+    """Draw the query (outlined) and its neighbours on the views of its subject.
 
-    First the neighbours, the nearest brightest; captions say how many of them a view has. Then for each
-    layer the weights, mean over the heads, the largest brightest; captions give each view's share.
+    The first row shows the neighbours, the nearest brightest; captions give their number in each view. One
+    row for each layer follows with the weights, averaged over heads, the largest brightest; captions give
+    the share of each view.
+
+    Args:
+        batch: gives the photographs, as the recalibration gets them.
+        tokens: packed tokens of the batch.
+        attention: the query, its neighbours and their weights.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views
@@ -61,7 +76,7 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 def _tiles(
     images: list[np.ndarray], tokens: Tokens, attention: TokenAttention, strengths: Tensor
 ) -> list[np.ndarray]:
-    """Each view, darkened, with its neighbours in colours of their strength in [0, 1]."""
+    """Each view, darker, with its neighbours in the colours of their ``strengths`` in [0, 1]."""
     scale = max(1, -(-_SIDE // images[0].shape[0]))
     side, views = tokens.patch_size * scale, tokens.grid[1]
 

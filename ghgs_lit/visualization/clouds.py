@@ -1,4 +1,4 @@
-"""Predicted points and bodies as coloured point clouds, to turn round in a viewer."""
+"""Predicted points and bodies as coloured point clouds, for a viewer in 3D."""
 
 import torch
 from jaxtyping import Float
@@ -12,11 +12,18 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 
 
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
-    """Positions in metres and colours in [0, 1] of one subject, at most ``limit`` points each.
+    """Point clouds of one subject.
 
-    ``points``: unprojected pixels in their colours; ``body``: vertices of the body, where the data has
-    them; ``points_and_body``: both, which the Chamfer term pulls together.
-    Clouds without a point are left out.
+    Args:
+        batch: colours, masks and bodies.
+        prediction: the predicted points.
+        element: index of the subject in the batch.
+        limit: maximum number of points and of vertices.
+
+    Returns:
+        Positions in metres and colours in [0, 1] by name: ``points``, unprojected pixels in their colours;
+        ``body``, vertices of the body where the data has them; ``points_and_body``, both, whose distance the
+        Chamfer term measures. Clouds without points are left out.
     """
     valid = prediction.points.valid[element] & batch.masks[element]
     found = {
@@ -33,7 +40,7 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
 
 
 def _thinned(cloud: Cloud, limit: int) -> Cloud:
-    """Evenly spaced in memory, always the same; points that are not finite left out."""
+    """At most ``limit`` of the finite points, evenly spaced in memory."""
     positions, colors = (part.detach().float().cpu() for part in cloud)
     finite = positions.isfinite().all(-1)
     positions, colors = positions[finite], colors[finite].nan_to_num(0).clamp(0, 1)

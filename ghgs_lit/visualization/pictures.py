@@ -1,6 +1,5 @@
-"""Pictures to look at: photographs, renders, errors and depths side by side, as RGB uint8 arrays."""
+"""Photographs, renders, errors and depths side by side, as pictures [h, w, 3] RGB uint8."""
 
-import os
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -9,29 +8,38 @@ import numpy as np
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from ghgs_lit.files import write_atomically
 from ghgs_lit.types import Batch
 
 _CAPTION = 14  # height of a caption in pixels
 _GAP = 2
 ERROR_GAIN = 4.0
-"""Mean absolute error of the colours is multiplied by this before it is shown."""
+"""Factor of the mean absolute error of the colours before it is shown."""
 
 
 @cache
 def palette(name: str) -> np.ndarray:
+    """256 RGB colours [256, 3] uint8 of a colour map of matplotlib."""
     import matplotlib
 
     return (matplotlib.colormaps[name](np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """[3, h, w] in [0, 1] as [h, w, 3]; what lies outside is clamped."""
+    """A picture of an image [3, h, w]; values outside [0, 1] are clamped."""
     image = image.detach().float().cpu().nan_to_num(0).clamp(0, 1)
     return (image * 255).round().byte().permute(1, 2, 0).numpy()
 
 
 def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor | None = None) -> np.ndarray:
-    """[h, w] numbers as colours between ``low`` and ``high``; black where not ``valid``."""
+    """A picture of values [h, w] in the colours of a palette.
+
+    Args:
+        values: what is shown [h, w].
+        low, high: values of the first and the last colour.
+        name: the palette.
+        valid: pixels [h, w] that are not black (None: all).
+    """
     values = values.detach().float().cpu()
     scaled = ((values - low) / max(high - low, 1e-9)).nan_to_num(0).clamp(0, 1)
     picture = palette(name)[(scaled * 255).round().long().numpy()]
@@ -41,24 +49,24 @@ def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor |
 
 
 def error_map(image: Tensor, target: Tensor) -> np.ndarray:
-    """Mean absolute error over the channels, ``ERROR_GAIN`` times brighter."""
+    """Mean absolute error over the channels of images [3, h, w], times ``ERROR_GAIN``."""
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
 def depth_range(depth: Tensor, valid: Tensor) -> tuple[float, float]:
-    """1st and 99th percentile of the valid depths; (0, 1) without any."""
+    """1st and 99th percentile of the valid depths in metres; (0, 1) where none is valid."""
     known = depth[valid].detach().float().cpu().numpy()
     low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
     return float(low), float(high)
 
 
 def depth_map(depth: Tensor, valid: Tensor, limits: tuple[float, float]) -> np.ndarray:
-    """A depth map in colours between ``limits`` in metres; near is red, black where not ``valid``."""
+    """Depths [h, w] in colours between ``limits`` in metres: near is red, not ``valid`` is black."""
     return colorize(-depth, -limits[1], -limits[0], "turbo", valid)
 
 
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
-    """Tiles side by side, each under its caption."""
+    """Tiles side by side, each below its caption."""
     height = max(tile.shape[0] for tile in tiles) + _CAPTION
     width = sum(tile.shape[1] for tile in tiles) + _GAP * (len(tiles) - 1)
     canvas = Image.new("RGB", (width, height), (24, 24, 24))
@@ -71,13 +79,13 @@ def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
 
 
 def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows below one another, filled up on the right."""
+    """Rows below one another, padded on the right."""
     width = max(r.shape[1] for r in rows)
     return np.concatenate([np.pad(r, ((0, _GAP), (0, width - r.shape[1]), (0, 0))) for r in rows])
 
 
 def grid(tiles: Sequence[np.ndarray], aspect: float = 1.5) -> np.ndarray:
-    """Pictures of one size in rows and columns; the whole is about ``aspect`` times as wide as high."""
+    """Pictures of one size in rows and columns, about ``aspect`` times as wide as high."""
     height, width = tiles[0].shape[:2]
 
     def mismatch(columns: int) -> float:
@@ -96,7 +104,7 @@ def grid(tiles: Sequence[np.ndarray], aspect: float = 1.5) -> np.ndarray:
 def _depth_rows(
     batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
 ) -> list[np.ndarray]:
-    """Predicted and true depths of one subject's views, in the same colours."""
+    """A row of predicted and a row of true depths of one subject, in the same colours."""
     masks, maps = batch.masks[element], {}
     if depth is not None:
         maps["depth"] = (depth[element], masks if depth_valid is None else masks & depth_valid[element])
@@ -104,7 +112,7 @@ def _depth_rows(
         maps["true depth"] = (batch.depths[element], masks & (batch.depths[element] > 0))
     if not maps:
         return []
-    # The truth, where it is known, sets the range.
+    # The true depths set the range where they are known.
     limits = [depth_range(d, v) for d, v in zip(*list(maps.values())[-1], strict=True)]
     return [
         row([depth_map(*tile) for tile in zip(*values, limits, strict=True)], [name] * len(limits))
@@ -119,9 +127,14 @@ def sheet(
     depth: Tensor | None = None,
     depth_valid: Tensor | None = None,
 ) -> np.ndarray:
-    """One subject: inputs; their depths, where predicted and where known; target, render and error.
+    """Pictures of one subject: inputs, their depths, then target, render and error of each target.
 
-    ``image`` is [B, T, 3, h, w]; ``depth`` and ``depth_valid`` are [B, V, H, W].
+    Args:
+        batch: inputs and targets.
+        image: renders [B, T, 3, h, w].
+        element: index of the subject in the batch.
+        depth: predicted depths [B, V, H, W], metres (None: no row of them).
+        depth_valid: where they are defined [B, V, H, W] (None: in the masks).
     """
     views = batch.views[element] if batch.views else tuple(map(str, range(batch.images.shape[1])))
     rows = [row([to_uint8(i) for i in batch.images[element]], [f"input {name}" for name in views])]
@@ -134,8 +147,5 @@ def sheet(
 
 
 def save_png(picture: np.ndarray, path: Path) -> None:
-    """Write a PNG aside and rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    Image.fromarray(picture).save(aside, format="PNG")
-    aside.replace(path)
+    """Write a picture [h, w, 3] uint8 as a PNG."""
+    write_atomically(path, lambda temporary: Image.fromarray(picture).save(temporary, format="PNG"))

@@ -1,4 +1,4 @@
-"""Cameras on a circle around what the given cameras look at."""
+"""Cameras on a circle around the subject of given cameras."""
 
 import math
 
@@ -9,9 +9,9 @@ from ghgs_lit.types import Cameras
 
 
 def look_at_point(cameras: Cameras) -> Tensor:
-    """The world point nearest to all optical axes (least squares); cameras are [V].
+    """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64.
 
-    Where axes are parallel, the one of those points that is nearest to the cameras' mean position.
+    Where the axes are parallel, the one of these points nearest to the mean position of the cameras.
     """
     forward, centers = cameras.extrinsics[:, 2, :3].double(), cameras.centers.double()
     middle = centers.mean(0)
@@ -21,9 +21,13 @@ def look_at_point(cameras: Cameras) -> Tensor:
 
 
 def turntable(cameras: Cameras, frames: int) -> Cameras:
-    """[frames] cameras: once around the subject at the mean distance and height of ``cameras`` [V].
+    """Cameras on one turn around the subject, at the mean distance and height of the given ones.
 
-    Starts at the first camera's side; its intrinsics are used throughout. Up is the cameras' mean up.
+    They begin at the side of the first camera and have its intrinsics; up is the mean of all cameras.
+
+    Args:
+        cameras: the given cameras [V].
+        frames: the number of cameras.
     """
     center = look_at_point(cameras)
     up = torch.nn.functional.normalize(-cameras.extrinsics[:, 1, :3].double().mean(0), dim=0)

@@ -23,6 +23,7 @@ def nothing(gaussians, cameras):
 
 @pytest.mark.parametrize("views", [3, 5])
 def test_the_nearest_view_is_the_one_beside_the_target(views):
+    """The baseline copies the nearest camera on either side, also across the start of the ring."""
     batch = example_batch(subjects=2, views=views, targets=2)
     step = 2 * math.pi / views
     # the first target stands beside view 2 on the far side, the second beside view 0
@@ -36,6 +37,7 @@ def test_the_nearest_view_is_the_one_beside_the_target(views):
 
 
 def test_the_nearest_view_is_resized_to_the_target():
+    """Targets of another size are still comparable."""
     batch = example_batch(size=16)
     masks = torch.zeros(2, 1, 32, 24, dtype=torch.bool)
     large = dataclasses.replace(batch.targets, images=torch.zeros(2, 1, 3, 32, 24), masks=masks)
@@ -44,6 +46,7 @@ def test_the_nearest_view_is_resized_to_the_target():
 
 
 def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
+    """Splats project back onto the centres of their own pixels, with the configured width."""
     batch = example_batch(views=2)
     depth = torch.full(batch.masks.shape, 1.7)
     gaussians = splats_at(batch, depth, batch.masks, sigma=0.5, opacity=0.8)
@@ -60,6 +63,7 @@ def test_splats_lie_on_their_pixels_with_their_width_in_pixels():
 
 
 def test_true_depth_renders_the_input_again():
+    """With the true depth the input view is reproduced: cameras, depths and renderer agree."""
     batch = example_batch(subjects=1, views=2, size=32)
     own = dataclasses.replace(
         batch.targets, images=batch.images[:, :1], masks=batch.masks[:, :1], cameras=batch.cameras[:, :1]
@@ -77,6 +81,7 @@ def test_true_depth_renders_the_input_again():
 
 
 def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
+    """The depth is measured along the axis of each camera, not as a distance."""
     batch = example_batch(subjects=1, views=3)
     estimate = baseline("body_depth", nothing, untrained=None)(batch)
     for v in range(3):
@@ -85,6 +90,7 @@ def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
 
 
 def test_black_and_untrained():
+    """The two baselines without geometry have the shapes of the targets."""
     batch = example_batch()
     assert baseline("black", nothing, None)(batch).image.abs().max() == 0
     estimate = baseline("untrained", flat_renderer, Standin)(batch)
@@ -94,6 +100,7 @@ def test_black_and_untrained():
 
 @pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])
 def test_what_the_data_lacks_is_an_error(name, field):
+    """A baseline that the data cannot support is refused, as is an unknown name."""
     batch = dataclasses.replace(example_batch(), **{field: None})
     with pytest.raises(InputError, match=name):
         baseline(name, nothing, None)(batch)

@@ -1,4 +1,4 @@
-"""Measuring, splats on disk, turntables, and the verbs from end to end on rendered boxes."""
+"""Measuring methods, target protocols, and the verbs from end to end on rendered boxes."""
 
 import json
 import os
@@ -8,20 +8,20 @@ import sys
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 from ghgs_lit.cli.main import main
+from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure
-from ghgs_lit.export.ply import read_ply, write_ply
+from ghgs_lit.evaluation.report import target_protocols
+from ghgs_lit.export.ply import read_ply
 from ghgs_lit.metrics import ImageMetrics, psnr
 from ghgs_lit.model import GHGS
-from ghgs_lit.rendering import render
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.types import Gaussians
-from ghgs_lit.visualization.turntable import look_at_point, turntable
 from tests.helpers.people import render_boxes
-from tests.helpers.training import Standin, example_batch, flat_renderer, ring
+from tests.helpers.training import Standin, example_batch, flat_renderer
 
 OFF = ImageMetrics(lpips="off")
 
@@ -36,6 +36,7 @@ def one_thread():
 
 
 def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
+    """Every number is found under its subject, target and inputs, with the value of the metric."""
     batch = example_batch(subjects=2, views=3, targets=2)
     rows = measure(ModelMethod(Standin(), flat_renderer), "model", [batch], "midway", OFF, "cpu", tmp_path, 1)
     assert [(r["subject"], r["target"]) for r in rows] == [
@@ -53,6 +54,7 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
 
 
 def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
+    """A perfect render has the capped PSNR, and a method without depth has no depth error."""
     batch = example_batch()
     rows = measure(lambda b: Estimate(b.targets.images), "perfect", [batch], "release", OFF)
     assert rows[0]["psnr"] == pytest.approx(100)
@@ -60,69 +62,8 @@ def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
     assert rows[0]["depth_error_mm"] is None
 
 
-def gaussians(n=50, seed=0) -> Gaussians:
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g) * 0.3,
-        quaternions=torch.randn(n, 4, generator=g) * 3,
-        scales=torch.rand(n, 3, generator=g) * 0.05 + 0.01,
-        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
-        colors=torch.rand(n, 3, generator=g),
-        splits=(n,),
-    )
-
-
-def test_a_ply_renders_as_what_was_written(tmp_path):
-    written = gaussians()
-    write_ply(written, tmp_path / "a.ply")
-    read = read_ply(tmp_path / "a.ply")
-    for name in ("means", "scales", "opacities", "colors"):
-        assert torch.allclose(getattr(read, name), getattr(written, name), atol=1e-5)
-    assert torch.allclose(read.quaternions.norm(dim=-1), torch.ones(50), atol=1e-6)
-    cameras = ring(2, 24)[None]
-    a, b = (render(g, cameras, backend="reference").image for g in (written, read))
-    assert a.max() > 0.2
-    assert torch.allclose(a, b, atol=1e-4)
-
-
-def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
-    plyfile = pytest.importorskip("plyfile")
-    one = Gaussians(
-        torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[2.0, 0, 0, 0]]), torch.tensor([[0.1, 1.0, 0.0]]),
-        torch.tensor([0.5]), torch.tensor([[0.5, 1.0, 0.0]]), (1,),
-    )  # fmt: skip
-    write_ply(one, tmp_path / "one.ply")
-    vertex = plyfile.PlyData.read(tmp_path / "one.ply")["vertex"]
-    value = {p.name: float(vertex[p.name][0]) for p in vertex.properties}
-    assert [value[n] for n in ("x", "y", "z", "rot_0", "rot_1")] == [1, 2, 3, 1, 0]
-    assert value["opacity"] == pytest.approx(0, abs=1e-6)
-    assert value["scale_0"] == pytest.approx(np.log(0.1), rel=1e-6)
-    assert np.isfinite(value["scale_2"])
-    assert value["f_dc_0"] == pytest.approx(0, abs=1e-6)
-    assert value["f_dc_1"] == pytest.approx(0.5 / 0.28209479177387814, rel=1e-6)
-    nothing = one.select(slice(0, 0), (0,))
-    write_ply(nothing, tmp_path / "none.ply")
-    assert len(read_ply(tmp_path / "none.ply")) == 0
-    with pytest.raises(InputError, match="one subject"):
-        write_ply(one.select(slice(0, 1), (1, 0)), tmp_path / "two.ply")
-    (tmp_path / "no.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
-    )
-    with pytest.raises(InputError, match=r"no\.ply"):
-        read_ply(tmp_path / "no.ply")
-
-
-def test_a_turntable_of_a_ring_is_the_ring():
-    cameras = ring(4, 20)
-    assert torch.allclose(look_at_point(cameras), torch.zeros(3, dtype=torch.float64), atol=1e-6)
-    orbit = turntable(cameras[torch.tensor([0, 2])], 4)
-    assert torch.allclose(orbit.extrinsics[0], cameras.extrinsics[0], atol=1e-5)
-    assert torch.allclose(orbit.extrinsics[2], cameras.extrinsics[2], atol=1e-5)
-    assert torch.allclose(torch.linalg.det(orbit.extrinsics[:, :3, :3]), torch.ones(4), atol=1e-5)
-    assert torch.allclose(orbit.centers.norm(dim=-1), torch.full((4,), 2.0), atol=1e-5)
-
-
 def test_the_hash_of_a_configuration_ignores_the_order_of_keys():
+    """Runs of a sweep are found again by the hash of their configuration."""
     assert config_hash({"a": 1, "b": {"c": [1, 2]}}) == config_hash({"b": {"c": [1, 2]}, "a": 1})
     assert config_hash({"a": 1}) != config_hash({"a": 2})
 
@@ -165,6 +106,7 @@ def data_of(root) -> list[str]:
 
 
 def test_train_writes_everything_that_it_promises(trained):
+    """The files of a run are those of the documentation, with the provenance of the numbers."""
     files = {p.relative_to(trained).as_posix() for p in trained.rglob("*") if p.is_file()}
     expected = {
         "metrics.json", "metrics.csv", "config.yaml", "checkpoints/last.ckpt", "checkpoints/best.ckpt",
@@ -185,6 +127,7 @@ def test_train_writes_everything_that_it_promises(trained):
 
 
 def test_a_checkpoint_measures_the_same_again_beside_the_baselines(trained, boxes, tmp_path):
+    """`ghgs evaluate` gives the numbers of the end of training."""
     path = trained / "checkpoints" / "last.ckpt"
     code = ghgs(
         "evaluate", *data_of(boxes), f"checkpoint={path}", "baselines=all", "evaluation.views=[3]",
@@ -203,7 +146,49 @@ def test_a_checkpoint_measures_the_same_again_beside_the_baselines(trained, boxe
     assert value["true_depth", "s3", "midway"]["psnr"] > value["black", "s3", "midway"]["psnr"] + 3
 
 
+def test_each_target_protocol_has_the_values_of_its_own_file():
+    """Only the selected protocol has overrides; the others are read from conf/targets."""
+    release = {"name": "release", "kind": "release", "per_subject": "all"}
+    config = {"targets": release, "evaluation": {"targets": ["midway", "release", "ghg"]}}
+    found = target_protocols(config)
+    assert list(found) == ["midway", "release", "ghg"]
+    assert found["release"] == release
+    for name in ("midway", "ghg"):
+        assert found[name] == yaml.safe_load((conf_dir() / "targets" / f"{name}.yaml").read_text())
+    config["evaluation"]["targets"] = ["release", "midwy"]
+    said = r"evaluation\.targets: expected one of cameras, ghg, .*; found 'midwy' \(did you mean midway\?\)"
+    with pytest.raises(InputError, match=said):
+        target_protocols(config)
+
+
+def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_path):
+    """One evaluation of shipped protocols and one of the user's, none of which is selected by targets=."""
+    mine = tmp_path / "conf" / "targets" / "mine.yaml"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("defaults: [rogsplat, _self_]\nname: mine\npositions: [1, 4]\n")
+    code = ghgs(
+        "evaluate", f"--config-dir={tmp_path / 'conf'}", *data_of(boxes), "baselines=[black]",
+        "evaluation.views=[3]", "evaluation.targets=[ghg,mine,release]", "targets.per_subject=2",
+        "evaluation.pictures=0", f"hydra.run.dir={tmp_path / 'run'}",
+    )  # fmt: skip
+    assert code == 0
+    content = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    seen = {}
+    for row in content["rows"]:
+        seen.setdefault(row["targets"], []).append(row["target"])
+    assert seen == {
+        "ghg": ["003/0", "008/0", "013/0"] * 2,
+        "mine": ["001/3", "004/3"] * 2,
+        "release": ["000/3", "005/3"] * 2,
+    }
+    protocols = content["provenance"]["protocol"]["target_protocols"]
+    assert list(protocols) == content["provenance"]["protocol"]["targets"] == ["ghg", "mine", "release"]
+    assert (protocols["mine"]["kind"], protocols["mine"]["positions"]) == ("cameras", [1, 4])
+    assert protocols["release"]["per_subject"] == 2
+
+
 def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp_path):
+    """A subject becomes a PLY and pictures; an unknown subject is refused."""
     path = trained / "checkpoints" / "last.ckpt"
     arguments = [
         *data_of(boxes),
@@ -219,6 +204,7 @@ def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp
 
 
 def test_a_sweep_becomes_a_table(boxes, tmp_path):
+    """The directory of a sweep is all that a table needs, and wrong options are refused."""
     quick = ["callbacks=none", "logger=none", "trainer.max_steps=1", "evaluation.pictures=0"]
     code = ghgs(
         "train", "-m", *data_of(boxes), *quick, "ablation=full,neither", "model=paper",
@@ -243,6 +229,7 @@ def test_a_sweep_becomes_a_table(boxes, tmp_path):
 
 
 def test_bad_input_of_the_verbs_is_one_line(boxes, tmp_path, capsys):
+    """Mistakes of the user give exit code 1 and their key, and no results."""
     where = f"hydra.run.dir={tmp_path / 'run'}"
     assert ghgs("evaluate", *data_of(boxes), where) == 1
     assert "checkpoint: expected" in capsys.readouterr().err
@@ -254,6 +241,7 @@ def test_bad_input_of_the_verbs_is_one_line(boxes, tmp_path, capsys):
 
 
 def test_two_processes_train_together_and_write_once(boxes, tmp_path):
+    """With several processes one of them writes, and the checkpoint loads."""
     directory = tmp_path / "run"
     command = [
         sys.executable, "-m", "ghgs_lit", "train", *data_of(boxes), "trainer=ddp_cpu", "trainer.max_steps=2",

@@ -1,4 +1,4 @@
-"""Reads a ``tabular`` environment back: columns, headings, rules, rows."""
+"""Reads columns, headings, rules and rows of a LaTeX ``tabular``."""
 
 import re
 
@@ -52,7 +52,7 @@ def read_tabular(text: str) -> dict:
 
 
 def check_balance(text: str) -> None:
-    """Braces and environments are closed in order; no sign stands unescaped."""
+    """Assert that braces and environments are closed in order and special characters are escaped."""
     assert text.count("{") - text.count("\\{") == text.count("}") - text.count("\\}")
     opened = []
     for kind, name in re.findall(r"\\(begin|end)\{([^}]*)\}", text):

@@ -1,4 +1,4 @@
-"""Fabricated runs for the tests of tables."""
+"""Invented runs for the tests of tables."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def write_run(
     folder: Path, ablation, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None,
     shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train", **changes,
 ):  # fmt: skip
-    """A run whose mean PSNR at n views is ``psnr + n``, of subjects that lie ``shifts`` beside it."""
+    """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift."""
     config = config_of(ablation, seed, data, weights, **changes)
     rows = [
         {
@@ -67,18 +67,14 @@ def start_run(folder: Path, ablation, seed=1, **changes) -> None:
 
 
 def tables_of(folder: Path, layout="ablation", by=(), others=(), illustration=False, **options):
-    """The tables of a sweep with their words."""
+    """The tables of the runs below a folder."""
     test = t.PairedTest(**options.pop("test", {}))
-    chosen = t.TableOptions(t.layout_named(layout), test=test, **options)
-    tables = t.build_tables(t.read_sweep([folder], by), others, chosen)
-    for table in tables:
-        table.caption = t.write_caption(table)
-        table.notes = t.write_notes(table, test, illustration)
-    return tables
+    chosen = t.TableOptions(t.layout_named(layout), test=test, illustration=illustration, **options)
+    return t.build_tables(t.read_sweep([folder], by), others, chosen)
 
 
 def body(markdown: str):
-    """The rows of a Markdown table by the cells of the stub, without marks for notes, and its header."""
+    """The rows of a Markdown table by their first cells, without marks of notes, and its header."""
     lines = [
         [c.strip() for c in line.strip("|").split("|")] for line in markdown.splitlines() if line[:1] == "|"
     ]

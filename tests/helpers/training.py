@@ -34,6 +34,7 @@ def ring(count: int, size: int, radius: float = 2.0, start: float = 0.0) -> Came
 
 
 def batched(cameras: Cameras, count: int) -> Cameras:
+    """``count`` copies of the same cameras [count, V]."""
     return cameras[None][torch.zeros(count, dtype=torch.long)]
 
 
@@ -88,7 +89,7 @@ class Standin(nn.Module):
 
 
 def flat_renderer(gaussians: Gaussians, cameras: Cameras) -> Rendering:
-    """Every image is the mean colour of its Gaussians: differentiable, and nothing else."""
+    """Every image is the mean colour of its Gaussians, which is differentiable."""
     b, t = cameras.shape
     colors = torch.stack([gaussians[i].colors.mean(0) for i in range(b)])
     image = colors[:, None, :, None, None].expand(b, t, 3, cameras.height, cameras.width)

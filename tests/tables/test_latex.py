@@ -34,6 +34,7 @@ def of_layout(folder, layout, ablations=("full",), seeds=(1,), **options):
 
 @pytest.mark.parametrize("layout", ["table1", "table2", "table3", "table4"])
 def test_the_layout_and_the_reported_figures_are_the_papers(tmp_path, layout):
+    """Columns, headings, rules, digits and reported figures are those of the paper's tables."""
     latex = to_latex(of_layout(tmp_path, layout), "table:x")
     check_balance(latex)
     ours, paper = read_tabular(latex), PAPER[layout]
@@ -59,6 +60,7 @@ def test_the_layout_and_the_reported_figures_are_the_papers(tmp_path, layout):
 
 
 def test_bold_deviation_marks_and_seeds_in_latex(tmp_path):
+    """Everything that a cell can show is valid LaTeX."""
     shifts = {f"s{i:02d}": 0.01 * i - 0.095 for i in range(20)}
     for seed in (1, 2):
         write_run(tmp_path / f"f{seed}", "full", 20.0 + seed, seed, shifts=shifts, views=(4,))
@@ -72,6 +74,7 @@ def test_bold_deviation_marks_and_seeds_in_latex(tmp_path):
 
 
 def test_text_of_all_kinds_is_escaped():
+    """No name of a run or file can break the LaTeX."""
     assert escape("a_b & 50% #1 {x} ^~\\ $") == (
         r"a\_b \& 50\% \#1 \{x\} \textasciicircum{}\textasciitilde{}\textbackslash{} \$"
     )
@@ -81,6 +84,7 @@ def test_text_of_all_kinds_is_escaped():
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no TeX engine")
 def test_every_layout_compiles(tmp_path):
+    """A TeX engine accepts every layout, and no table is wider than the page."""
     parts = [PREAMBLE]
     for layout in ("ablation", "table1", "table2", "table3", "table4"):
         table = of_layout(tmp_path / layout, layout, tuple(SWITCHES), (1, 2), illustration=True)

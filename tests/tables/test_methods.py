@@ -26,6 +26,7 @@ def a_row(views=4, psnr=25.0, **changes) -> dict:
 
 
 def test_reported_figures_stand_apart_and_are_never_the_best(tmp_path):
+    """The paper's figures are never taken for measured ones."""
     write_run(tmp_path / "0", "full", 10.0, lpips=0.5)
     (table,) = tables_of(tmp_path, "table2")
     text = to_markdown(table)
@@ -58,6 +59,7 @@ def test_a_data_set_is_a_column_group_of_its_own(tmp_path):
 
 
 def test_our_variants_are_told_apart_by_what_differs(tmp_path):
+    """Several models of ours have names with what differs, and nothing else."""
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 21.0, model={"name": "hull"})
     write_run(tmp_path / "2", "full", 22.0, model={"name": "hull"}, compat={"name": "release"})
@@ -71,6 +73,7 @@ def test_our_variants_are_told_apart_by_what_differs(tmp_path):
 
 
 def test_baselines_are_rows_that_do_not_compete(tmp_path):
+    """A baseline that knows the truth is never the best."""
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 30.0, method="true_depth")
     write_run(tmp_path / "2", "neither", 19.0)
@@ -81,6 +84,7 @@ def test_baselines_are_rows_that_do_not_compete(tmp_path):
 
 
 def test_other_methods_join_the_table_that_they_fit(tmp_path):
+    """Another method's results appear only beside runs on the same data and protocol."""
     write_run(tmp_path / "runs" / "0", "full", 20.0)
     write_run(tmp_path / "runs" / "1", "full", 20.0, targets="midway")
     rows = [a_row(subject="a", psnr=24.0), a_row(subject="b", psnr=26.5)]
@@ -97,6 +101,7 @@ def test_other_methods_join_the_table_that_they_fit(tmp_path):
 
 
 def test_the_example_of_the_documentation_is_read(tmp_path):
+    """The documented file is valid, with subjects and with means."""
     shutil.copy(EXAMPLE, tmp_path)
     by_subject, mean = read_others(tmp_path / EXAMPLE.name)
     assert by_subject.subjects["p1000001"]["psnr"] == 26.85
@@ -125,11 +130,13 @@ def test_the_example_of_the_documentation_is_read(tmp_path):
     ],
 )
 def test_a_file_that_is_wrong_says_where(tmp_path, rows, changes, said):
+    """A wrong entry is found by the place in the message."""
     with pytest.raises(InputError, match=said):
         read_others(others_file(tmp_path, rows, **changes))
 
 
 def test_others_that_fit_nowhere_are_refused(tmp_path):
+    """Results that no table can show are an error, not silence."""
     write_run(tmp_path / "runs", "full", 20.0)
     others = read_others(others_file(tmp_path, [a_row(protocol="release")]))
     with pytest.raises(InputError, match=r"protocol=correct'\]; found .*protocol=release"):
@@ -144,7 +151,7 @@ def test_others_that_fit_nowhere_are_refused(tmp_path):
 
 
 def test_where_an_encoder_comes_from_makes_no_second_row(tmp_path):
-    """It stands in a run's results, and not yet in its plan."""
+    """The results of a run name it; its configuration before training does not."""
     path = write_run(tmp_path / "0", "full", 20.0, weights="vggt.safetensors").with_name("config.yaml")
     path.write_text(path.read_text().replace("vggt.safetensors", "null"))
     (table,) = tables_of(tmp_path, "table3", reported=False)

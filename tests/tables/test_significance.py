@@ -21,6 +21,7 @@ def rows_of(values):
 
 @pytest.mark.parametrize("n", [2, 7, 20])
 def test_p_values_are_scipys(n):
+    """The p-values are those of SciPy on the same pairs."""
     a, b = RNG.normal(size=n), RNG.normal(size=n) + 0.3
     w, t = (compare(rows_of(a), rows_of(b), kind) for kind in ("wilcoxon", "t"))
     assert w.p == pytest.approx(stats.wilcoxon(a, b).pvalue, rel=1e-9)
@@ -30,6 +31,7 @@ def test_p_values_are_scipys(n):
 
 
 def test_pairs_are_the_subjects_that_both_have():
+    """Rows with different subjects are compared on the common ones only."""
     a, b = {"x": 1.0, "y": 2.0, "z": 9.0}, {"y": 1.0, "x": 0.5, "w": 3.0}
     assert compare(a, b, "t").n == 2
     assert compare(a, b, "t").difference == pytest.approx(0.75)
@@ -39,12 +41,14 @@ def test_pairs_are_the_subjects_that_both_have():
 
 @pytest.mark.parametrize("kind", ["wilcoxon", "t"])
 def test_equal_rows_and_constant_differences_are_defined(kind):
+    """No division by zero where all differences are equal."""
     assert compare(SUBJECTS, SUBJECTS, kind).p == 1
     shifted = {name: value + 1.0 for name, value in SUBJECTS.items()}
     assert compare(shifted, SUBJECTS, kind).p < 1e-4
 
 
 def test_holm_is_the_textbooks():
+    """Holm's correction of known p-values, in their order."""
     assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
     assert holm([0.5, 0.9, 0.001]) == pytest.approx([1.0, 1.0, 0.003])
     assert holm([]) == []
@@ -72,6 +76,7 @@ def table_of(folder, shift, noise=0.01, shifts=SUBJECTS, seeds=(1,), **options):
 
 
 def test_a_clear_difference_is_marked_and_noise_is_not(tmp_path):
+    """Marks and the note say what was tested, corrected over all comparisons."""
     table = table_of(tmp_path / "clear", 1.0)
     rows, _ = body(to_markdown(table))
     assert rows["✗", "✗"][0] == "**25.00\\***"
@@ -87,6 +92,7 @@ def test_a_clear_difference_is_marked_and_noise_is_not(tmp_path):
 
 
 def test_the_reference_can_be_the_best_and_the_test_another_or_none(tmp_path):
+    """Every option of the test changes what is marked; others are refused."""
     table = table_of(tmp_path / "a", 1.0, test={"against": "best", "kind": "t"})
     rows, _ = body(to_markdown(table))
     assert rows["✗", "✗"][0] == "**25.00**"
@@ -100,6 +106,7 @@ def test_the_reference_can_be_the_best_and_the_test_another_or_none(tmp_path):
 
 
 def test_few_subjects_are_said_and_not_marked(tmp_path):
+    """Too few subjects give a note in place of marks that could never appear."""
     few = dict(list(SUBJECTS.items())[:6])
     table = table_of(tmp_path, 5.0, shifts=few)
     assert "\\*" not in to_markdown(table)
@@ -107,6 +114,7 @@ def test_few_subjects_are_said_and_not_marked(tmp_path):
 
 
 def test_a_t_test_of_four_subjects_marks_nothing_however_small_its_p(tmp_path):
+    """With so few pairs normality cannot be seen, so a small p means nothing."""
     table = table_of(tmp_path, 5.0, shifts=dict(list(SUBJECTS.items())[:4]), test={"kind": "t"})
     assert table.lines[0].cells[table.columns[0]].test.corrected < 1e-4
     assert "\\*" not in to_markdown(table)
@@ -114,12 +122,13 @@ def test_a_t_test_of_four_subjects_marks_nothing_however_small_its_p(tmp_path):
 
 
 def test_subjects_are_averaged_over_seeds_before_the_test(tmp_path):
-    """More seeds are no more subjects."""
+    """More seeds do not give more subjects."""
     table = table_of(tmp_path, 1.0, seeds=(1, 2, 3))
     assert table.lines[0].cells[table.columns[0]].test.n == 20
 
 
 def test_frames_of_one_person_are_one_pair(tmp_path):
+    """Frames of one person are not independent and must not count as subjects."""
     frames = {f"p{i // 5}_{i % 5:03d}": float(v) for i, v in enumerate(RNG.normal(size=20))}
     table = table_of(tmp_path, 1.0, shifts=frames, unit=re.compile(r"(.+)_\d+"))
     assert table.lines[0].cells[table.columns[0]].test.n == 4

@@ -1,4 +1,4 @@
-"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that go on."""
+"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that continue."""
 
 import csv
 import importlib.util
@@ -19,10 +19,10 @@ from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
     final_numbers,
-    go_on,
     hyperparameters,
     log_hyperparameters,
     log_results,
+    resume,
 )
 from ghgs_lit.training.validation_pictures import Attention, Pictures, PointClouds
 from tests.helpers.training import Standin, StepData, flat_renderer
@@ -46,7 +46,7 @@ def loggers(folder):
 
 
 class Staged(Standin):
-    """A stand-in with some stages to time."""
+    """The simple model with some stages to time."""
 
     def __init__(self):
         super().__init__()
@@ -81,6 +81,7 @@ def run(tmp_path_factory):
 
 
 def test_tags_are_grouped_by_what_they_are(run):
+    """The tags are those that the documentation lists, no more and no fewer."""
     tags = set(events(run[0] / "tensorboard").Tags()["scalars"])
     stages = ("01_data", "02_interval", "03_encode", "04_depth", "07_gaussians", "08_render", "09_loss")
     times = {f"time_ms/{part}" for part in (*stages, "10_backward", "11_optimizer", "step")}
@@ -92,6 +93,7 @@ def test_tags_are_grouped_by_what_they_are(run):
 
 
 def test_the_numbers_are_those_of_the_steps(run):
+    """Values are logged at their own steps, and the parts of a step add up to its time."""
     found = events(run[0] / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
     assert sorted(rates) == [1, 3, 5, 7]
@@ -104,6 +106,7 @@ def test_the_numbers_are_those_of_the_steps(run):
 
 
 def test_pictures_and_clouds(run):
+    """Pictures and point clouds are logged at every validation, with all points of the body."""
     folder, _ = run
     found = events(folder / "tensorboard")
     assert [e.step for e in found.Images("sheet/p0")] == [4, 8]
@@ -116,6 +119,7 @@ def test_pictures_and_clouds(run):
 
 
 def test_the_session_says_what_the_run_is_and_that_it_ended(run):
+    """The HParams tab shows a run with its settings, its final number and its success."""
     folder = run[0] / "tensorboard"
     start = hparams(folder, "_hparams_/session_start_info").session_start_info
     assert start.hparams["ablation"].string_value == "full"
@@ -125,13 +129,15 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
 
 
 def test_nothing_of_the_clock_stays(run):
+    """After training the model has no hooks and the clock does not run: evaluation is not slowed down."""
     _, subject = run
-    assert subject.clock is None
+    assert not subject.clock.running
     assert not subject.model.encoder._forward_hooks
     assert not subject.model.encoder._forward_pre_hooks
 
 
-def test_logs_go_on_where_the_checkpoint_was(tmp_path):
+def test_logs_resume_where_the_checkpoint_was(tmp_path):
+    """Logs of a resumed run have each step once, also after a kill while writing."""
     for logger in (first := loggers(tmp_path)):
         for step in range(10):
             logger.log_metrics({"a": step, **({"b": 1} if step % 2 else {})}, step)
@@ -140,7 +146,7 @@ def test_logs_go_on_where_the_checkpoint_was(tmp_path):
         file.write("7")  # killed while it wrote
     first[0].experiment.close()
     second = loggers(tmp_path)
-    go_on(second, 6)
+    resume(second, 6)
     for logger in second:
         for step in range(6, 8):
             logger.log_metrics({"a": 100 + step, "c": 2}, step)
@@ -155,6 +161,7 @@ def test_logs_go_on_where_the_checkpoint_was(tmp_path):
 
 
 def test_hyperparameters_are_choices_and_changes():
+    """Runs are compared by what changes numbers, not by folders or logging."""
     data = {"size": 140, "people": {"train": 3}}
     config = {"seed": 2, "data": data, "optimizer": {"lr": 0.1, "betas": [0, 1]}}
     choices = {
@@ -172,6 +179,7 @@ def test_hyperparameters_are_choices_and_changes():
 
 
 def test_final_numbers_name_their_protocol():
+    """Numbers of different protocols never share a tag."""
     summary = [
         {"method": "model", "views": 4, "targets": "release", "subjects": 2, "psnr": 30, "seconds": 1.0},
         {"method": "model", "views": 4, "targets": "midway", "subjects": 2, "psnr": 28, "lpips": None},
@@ -180,18 +188,19 @@ def test_final_numbers_name_their_protocol():
 
 
 def test_a_clock_gives_each_span_to_the_part_that_ends_it(monkeypatch):
+    """Times belong to the right part, and validations are not counted."""
     now = iter([0.0, 1.0, 3.0, 3.5, 10.0, 10.0, 11.0, 11.0, 12.0, 20.0, 20.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(now))
-    clock = StepClock(torch.device("cpu"))
-    clock.mark("render")  # before the first start: nothing to measure from
-    clock.start()
+    clock = StepClock()
+    clock.mark("render")  # does not run yet: nothing to measure from
+    clock.start(torch.device("cpu"))
     for part in ("data", "encode", "data"):
         clock.mark(part)
-    clock.end()  # at 10.0
+    clock.end_step()  # at 10.0
     clock.mark("data")
-    clock.start()  # a validation: forgotten
+    clock.restart()  # a validation: not counted
     clock.mark("data")
-    clock.end()
+    clock.end_step()
     means = clock.means()
     assert means == {"data": 1250.0, "encode": 1000.0, "optimizer": 7250.0, "step": 9500.0}
     assert clock.means() == {}
@@ -199,6 +208,7 @@ def test_a_clock_gives_each_span_to_the_part_that_ends_it(monkeypatch):
 
 
 def test_memory_is_that_of_this_process():
+    """The unit is MiB and the value follows what is allocated."""
     before = resident_mb()
     block = torch.ones(64 * 2**20 // 4)
     assert resident_mb() - before > 40
@@ -206,6 +216,7 @@ def test_memory_is_that_of_this_process():
 
 
 def test_wandb_is_built_where_it_is_installed(tmp_path):
+    """Without the package the error names the extra; with it a run is written."""
     node = {"_target_": "ghgs_lit.training.loggers.WandbLog", "project": "ghgs_lit", "offline": True}
     if importlib.util.find_spec("wandb") is None:
         with pytest.raises(InputError, match=r"logger\.wandb.*ghgs-lit\[wandb\]"):

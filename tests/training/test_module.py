@@ -53,15 +53,18 @@ def loader(count=3) -> DataLoader:
 
 @pytest.mark.parametrize(("step", "rate"), [(0, 4e-6), (2000, 1e-4), (100_000, 5.05e-5), (200_000, 5.0e-8)])
 def test_the_release_schedule_is_the_authors(step, rate):
+    """The learning rates of the published training: first, highest, in the middle, last."""
     assert RELEASE.lr * RELEASE.factor(step / 200_000) == pytest.approx(rate, rel=2e-3)
 
 
 def test_the_schedule_stays_at_its_end():
+    """A budget that is exceeded by one step must not give a negative learning rate."""
     assert RELEASE.factor(1.5) == pytest.approx(RELEASE.end_factor)
     assert Optimization(lr=1.0, warmup=0.0, end_factor=0.0).factor(0.0) == 1
 
 
 def test_progress_is_the_further_of_steps_and_time(monkeypatch):
+    """The schedule ends when the first budget ends, whichever kind it is."""
     timer = Timer(duration=timedelta(seconds=100))
     used = {"seconds": 0.0}
     monkeypatch.setattr(timer, "time_elapsed", lambda *_: used["seconds"])
@@ -82,6 +85,7 @@ def test_progress_is_the_further_of_steps_and_time(monkeypatch):
 
 
 def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
+    """The gradient reaches the model through renderer and losses, and the schedule reaches its end."""
     torch.manual_seed(0)
     subject, batch = module(), example_batch()
     before = subject.losses(*subject(batch), batch)[0].item()
@@ -93,6 +97,7 @@ def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
 
 
 def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
+    """Checkpoints load with weights_only=True, hold the configuration, and continue the same run."""
     last = Checkpoints(filename="last", every_n_train_steps=3)
     best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
     whole = module()
@@ -123,6 +128,8 @@ def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
 
 
 def test_a_loss_that_is_no_number_names_its_step_term_and_subjects(tmp_path):
+    """A diverged run stops with what is needed to find the cause."""
+
     def broken(gaussians, cameras):
         rendering = flat_renderer(gaussians, cameras)
         return type(rendering)(rendering.image * torch.nan, rendering.alpha, rendering.depth)
@@ -132,6 +139,8 @@ def test_a_loss_that_is_no_number_names_its_step_term_and_subjects(tmp_path):
 
 
 def test_a_gradient_that_is_no_number_names_a_parameter(tmp_path):
+    """A finite loss with an infinite gradient must not reach the weights."""
+
     def broken(gaussians, cameras):
         rendering = flat_renderer(gaussians, cameras)
         zero = (rendering.image - rendering.image.detach()).abs()
@@ -142,6 +151,7 @@ def test_a_gradient_that_is_no_number_names_a_parameter(tmp_path):
 
 
 def test_the_gradient_is_clipped(tmp_path):
+    """One bad batch moves the weights by a bounded gradient."""
     subject = GHGSModule(
         Standin(), flat_renderer, Losses({"depth": 100.0}), Optimization(lr=0.1, clip=0.5), CONFIG
     )
@@ -159,7 +169,8 @@ def test_the_gradient_is_clipped(tmp_path):
     assert subject.model.depth.grad.item() == pytest.approx(0.5, rel=1e-4)
 
 
-def test_held_parameters_stay_for_their_share_of_the_run(tmp_path):
+def test_frozen_parameters_stay_for_their_share_of_the_run(tmp_path):
+    """Neither gradient nor weight decay moves frozen parameters; an unknown prefix is an error."""
     seen = []
 
     class Look(L.Callback):
@@ -167,16 +178,17 @@ def test_held_parameters_stay_for_their_share_of_the_run(tmp_path):
             seen.append((pl_module.model.depth.item(), pl_module.model.shift.detach().clone()))
 
     subject = module()
-    subject.optimization = Optimization(lr=0.05, weight_decay=0.1, hold={"shift": 0.5})
+    subject.optimization = Optimization(lr=0.05, weight_decay=0.1, freeze_until={"shift": 0.5})
     trainer(tmp_path, steps=6, callbacks=[Look()]).fit(subject, loader(1))
     assert [bool(shift.abs().max() > 0) for _, shift in seen] == [False] * 3 + [True] * 3
     assert seen[0][0] != seen[1][0]
-    subject.optimization = Optimization(lr=0.05, hold={"nothing": 0.5})
-    with pytest.raises(InputError, match=r"optimizer\.hold\.nothing"):
+    subject.optimization = Optimization(lr=0.05, freeze_until={"nothing": 0.5})
+    with pytest.raises(InputError, match=r"optimizer\.freeze_until\.nothing"):
         trainer(tmp_path, steps=6).fit(subject, loader(1))
 
 
 def test_callbacks_write_pictures_and_numbers(tmp_path):
+    """Pictures and logged values appear under the names that the documentation lists."""
     run = trainer(
         tmp_path, steps=4, callbacks=[Pictures(subjects=1), StepTime(), RunProgress()],
         logger=CSVLogger(tmp_path, name="csv", version=""), log_every_n_steps=1, val_check_interval=2,
@@ -206,9 +218,10 @@ def test_callbacks_write_pictures_and_numbers(tmp_path):
         ({"lr": 1.0, "warmup": 1.0}, r"optimizer\.warmup"),
         ({"lr": 1.0, "clip": 0.0}, r"optimizer\.clip"),
         ({"lr": 1.0, "end_factor": 2.0}, r"optimizer\.end_factor"),
-        ({"lr": 1.0, "hold": {"head": 2.0}}, r"optimizer\.hold\.head"),
+        ({"lr": 1.0, "freeze_until": {"head": 2.0}}, r"optimizer\.freeze_until\.head"),
     ],
 )
 def test_impossible_values_name_their_key(values, key):
+    """A value that cannot work fails when it is read, with its key."""
     with pytest.raises(InputError, match=key):
         Optimization(**values)

@@ -1,4 +1,4 @@
-"""A run that is cut off goes on to the same weights, logs and best checkpoint; its files stay whole."""
+"""An interrupted run resumes to the same weights, logs and best checkpoint; its files stay complete."""
 
 import csv
 import os
@@ -12,8 +12,9 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.checkpoints import Checkpoints, WholeFiles
-from ghgs_lit.training.loggers import CsvLog, TensorBoardLog, go_on
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO, Checkpoints
+from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
+from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
 from tests.helpers.training import Standin, StepData, flat_renderer
 
@@ -43,11 +44,10 @@ class Cut(L.Callback):
 
 
 def module() -> GHGSModule:
-    # Held parameters and points drawn at random: both must know where the run stands.
+    # Frozen parameters and points drawn at random: both must know where the run stands.
     losses = Losses({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
-    return GHGSModule(
-        Standin(), flat_renderer, losses, Optimization(lr=0.05, warmup=0.1, hold={"shift": 0.4}), CONFIG
-    )
+    optimization = Optimization(lr=0.05, warmup=0.1, freeze_until={"shift": 0.4})
+    return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
 
 def fit(folder, cut: Cut, resume=None, every=3, **options):
@@ -55,7 +55,8 @@ def fit(folder, cut: Cut, resume=None, every=3, **options):
     best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
     last = Checkpoints(filename="last", every_n_train_steps=every)
     trainer = L.Trainer(
-        accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder, plugins=[WholeFiles()],
+        accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder,
+        plugins=[AtomicCheckpointIO()],
         logger=[CsvLog(folder, name="csv", version="", flush_logs_every_n_steps=1),
                 TensorBoardLog(folder, name="tensorboard", version="")],
         callbacks=[cut, best, last], enable_model_summary=False, enable_progress_bar=False,
@@ -63,7 +64,7 @@ def fit(folder, cut: Cut, resume=None, every=3, **options):
         **options,
     )  # fmt: skip
     if resume is not None:
-        go_on(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
+        resume_logs(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
     subject = module()
     trainer.fit(subject, StepData(), ckpt_path=resume)
     return subject
@@ -121,6 +122,7 @@ def test_a_checkpoint_that_is_due_at_a_validation_comes_after_it(tmp_path):
 
 
 def test_accumulated_steps_are_saved_whole(whole, tmp_path):
+    """No checkpoint is written between two batches of one step, where gradients would be lost."""
     expected = fit(tmp_path / "whole", Cut(), accumulate_grad_batches=2)
     with pytest.raises(PowerCut):
         fit(tmp_path / "cut", Cut(10), accumulate_grad_batches=2)
@@ -130,7 +132,8 @@ def test_accumulated_steps_are_saved_whole(whole, tmp_path):
         assert torch.equal(a, b)
 
 
-def test_a_run_that_goes_on_elsewhere_takes_its_best_along(whole, tmp_path):
+def test_a_run_that_resumes_elsewhere_takes_its_best_along(whole, tmp_path):
+    """A run that resumes in another folder keeps its best checkpoint and score."""
     folder, _, _ = whole
     with pytest.raises(PowerCut):
         fit(tmp_path / "a", Cut(13))
@@ -139,7 +142,7 @@ def test_a_run_that_goes_on_elsewhere_takes_its_best_along(whole, tmp_path):
 
 
 def test_time_that_was_used_stays_used(tmp_path):
-    """With a budget of time the learning rate goes on where it was."""
+    """With a budget of time the learning rate continues where it was."""
     seen = []
 
     class Look(Cut):
@@ -162,14 +165,14 @@ def test_time_that_was_used_stays_used(tmp_path):
 
 
 def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
-    path, files = tmp_path / "last.ckpt", WholeFiles()
+    """A kill in the middle of writing costs neither the previous checkpoint nor disk space."""
+    path, files = tmp_path / "last.ckpt", AtomicCheckpointIO()
     files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
     child = os.fork()
     if child == 0:
 
-        def half(content, file):
-            file.write(b"half a checkpoint")
-            file.flush()
+        def half(content, path):
+            path.write_bytes(b"half a checkpoint")
             os.kill(os.getpid(), signal.SIGKILL)
 
         monkeypatch.setattr(torch, "save", half)
@@ -186,15 +189,18 @@ def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
 
 
 def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
+    """After a power cut the file has its content: it is synced before it gets its name."""
     calls = []
     for name in ("fsync", "replace"):
         real = getattr(os, name)
         monkeypatch.setattr(os, name, lambda *a, _n=name, _r=real: (calls.append(_n), _r(*a)))
-    WholeFiles().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
+    AtomicCheckpointIO().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
     assert calls == ["fsync", "replace", "fsync"]
 
 
 def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
+    """Resuming needs the same model and the state of the optimizer; changed settings are reported."""
+
     class Other(Standin):
         def __init__(self):
             super().__init__()
@@ -215,12 +221,14 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
 
 
 def test_a_longer_budget_is_no_difference():
+    """Only settings that the weights depend on are reported when a run resumes."""
     before = {"trainer": {"max_steps": 10, "precision": 32}, "logger": {"csv": {"name": "a"}}}
     now = {"trainer": {"max_steps": 20, "precision": 16}, "logger": {}}
     assert differences(before, now) == ["trainer.precision: 32 -> 16"]
 
 
 def test_one_way_to_start(tmp_path):
+    """init_from beside resume is ambiguous, except for a run that began with init_from."""
     both = {"resume": "elsewhere/last.ckpt", "init_from": "a.ckpt"}
     with pytest.raises(InputError, match="init_from"):
         check_start(both, tmp_path)
@@ -230,10 +238,12 @@ def test_one_way_to_start(tmp_path):
 
 @pytest.mark.parametrize("minutes", [0, -1.0])
 def test_minutes_are_positive(minutes):
+    """An impossible interval is refused with its key."""
     with pytest.raises(InputError, match="minutes"):
         Checkpoints(filename="last", minutes=minutes)
 
 
 def test_minutes_and_steps_exclude_one_another():
+    """One callback saves by steps or by time; both would silently mean one of them."""
     with pytest.raises(MisconfigurationException):
         Checkpoints(filename="last", minutes=1, every_n_train_steps=3)

@@ -26,6 +26,7 @@ def checkpoint(path, model, **changes):
 
 
 def test_each_tensor_has_its_line(tmp_path):
+    """Tensors that do not fit stay as initialised and are reported: a partial load is never silent."""
     path, model = checkpoint(tmp_path / "a.ckpt", Other()), Standin()
     model.bias = torch.nn.Parameter(torch.full((2,), 5.0))
     lines = initialize(model, path)
@@ -46,6 +47,7 @@ def test_each_tensor_has_its_line(tmp_path):
 
 
 def test_strict_takes_all_or_nothing(tmp_path):
+    """A refused checkpoint changes no tensor of the model."""
     model = Standin()
     with pytest.raises(InputError, match=r"a\.ckpt: shift.*\(3,\).*\(4,\)|a\.ckpt: more"):
         initialize(model, checkpoint(tmp_path / "a.ckpt", Other()), strict=True)
@@ -59,6 +61,7 @@ def test_strict_takes_all_or_nothing(tmp_path):
 
 
 def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
+    """Weights of something else, or a mistyped path, must not start a training from scratch unnoticed."""
     path = checkpoint(tmp_path / "a.ckpt", torch.nn.Linear(2, 2))
     with pytest.raises(InputError, match=r"init_from.*a\.ckpt"):
         initialize(Standin(), path)
@@ -67,6 +70,7 @@ def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
 
 
 def test_a_long_report_ends(tmp_path):
+    """A model of a thousand tensors must not flood the terminal; the file has all lines."""
     lines = [f"missing      layer.{n} (3,): left as initialised" for n in range(50)]
     text = report(lines, "a.ckpt", tmp_path / "all.txt")
     assert text.splitlines()[-1] == "... and 30 more"

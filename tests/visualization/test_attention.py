@@ -37,6 +37,7 @@ def seen(model, batch):
     ids=lambda o: o[0].split("=")[1],
 )
 def test_the_weights_are_those_of_the_forward(overrides):
+    """The drawn weights reproduce the output of the recalibration."""
     model, batch = make_model("skip=none", *overrides).eval(), make_batch(2, 3)
     (tokens, points, own), output, _ = seen(model, batch)
     block = model.recalibration.block
@@ -52,6 +53,7 @@ def test_the_weights_are_those_of_the_forward(overrides):
 
 
 def test_the_chosen_token_is_of_its_element_and_has_a_point():
+    """The query belongs to its subject, and a place outside the grid is refused."""
     model, batch = make_model("skip=none").eval(), make_batch(2, 3)
     (tokens, points, own), _, _ = seen(model, batch)
     for element in range(2):
@@ -67,6 +69,7 @@ def test_the_chosen_token_is_of_its_element_and_has_a_point():
 
 
 def test_attention_is_drawn_on_the_tokens_it_names():
+    """Coloured patches are at the rows and columns of the neighbours."""
     model, batch = make_model("skip=none").eval(), make_batch(1, 3, height=56, width=70)
     (tokens, points, own), _, _ = seen(model, batch)
     attention = attention_of(model.recalibration, tokens, points, own, chosen_token(tokens, points, 0))
@@ -88,14 +91,23 @@ def test_attention_is_drawn_on_the_tokens_it_names():
 
 
 def test_attention_of_cropped_views_lies_on_the_crop():
+    """With a crop the picture has the size of the crop and shows its neighbours."""
     model, batch = make_model("skip=balanced").eval(), make_batch(1, 3, height=84, width=112)
     (tokens, points, own), _, _ = seen(model, batch)
     attention = attention_of(model.recalibration, tokens, points, own, chosen_token(tokens, points, 0))
-    assert attention_sheet(own, tokens, attention).dtype == np.uint8
     assert own.images.shape[-2:] == tuple(14 * n for n in tokens.grid[2:])
+    assert own.images.shape[-2:] < batch.images.shape[-2:]
+    picture = attention_sheet(own, tokens, attention)
+    black = type(own)(**{**vars(own), "images": torch.zeros_like(own.images)})
+    dark = attention_sheet(black, tokens, attention)
+    assert picture.dtype == np.uint8
+    assert picture.shape == dark.shape
+    assert picture.shape[1] >= 3 * own.images.shape[-1]
+    assert not np.array_equal(picture, dark)
 
 
 def test_clouds_are_the_subjects_points_and_its_body():
+    """Clouds belong to one subject, keep their colours and respect the limit."""
     model, batch = make_model().eval(), make_batch(2, 3)
     body = [torch.rand(9, 3), torch.rand(4, 3)]
     batch = type(batch)(**{**vars(batch), "body_vertices": body})
@@ -115,6 +127,7 @@ def test_clouds_are_the_subjects_points_and_its_body():
 
 
 def test_a_grid_is_as_wide_as_asked():
+    """Tiles are in reading order and none is lost."""
     tiles = [np.full((100, 40, 3), n, np.uint8) for n in range(5)]
     wide, square = grid(tiles), grid(tiles, aspect=0.6)
     assert wide.shape[:2] == (102, 5 * 40 + 4 * 8)

@@ -1,0 +1,111 @@
+"""A whole evaluation as configured: measures methods, prints means, writes the results of the run."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rich
+import torch
+from lightning.pytorch import LightningDataModule
+from rich.table import Table
+
+from ghgs_lit.config import build
+from ghgs_lit.config.groups import read_option
+from ghgs_lit.errors import require
+from ghgs_lit.evaluation.measure import Method, measure_all
+from ghgs_lit.runs.provenance import provenance
+from ghgs_lit.runs.results import Row, metric_names, summarize, write_results
+
+#: Metrics that are printed, with their decimals.
+PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}
+#: What readers must know about the subjects of a split.
+SPLITS = {
+    "train": "the subjects that were trained on",
+    "val": "unseen in training; validation shares them: it chooses best.ckpt, and never last.ckpt",
+}
+
+
+def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The protocols that ``evaluation.targets`` lists, by name.
+
+    Each has the values of its own file in ``conf/targets``; the one that ``targets=`` selects has the
+    configured values, overrides included.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    configured = config["targets"]
+    return {
+        name: configured if name == configured["name"] else read_option("targets", name, "evaluation.targets")
+        for name in config["evaluation"]["targets"]
+    }
+
+
+def measure_and_write(
+    methods: Mapping[str, Method],
+    data: LightningDataModule,
+    config: Mapping[str, Any],
+    directory: Path,
+    device: torch.device,
+    **facts: Any,
+) -> Path:
+    """Measure methods as configured; print the means and write the results.
+
+    Args:
+        methods: what is measured, by name.
+        data: gives the photographs.
+        config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used).
+        directory: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
+        device: where the methods run.
+        facts: further entries of the provenance.
+
+    Returns:
+        The path of ``metrics.json``.
+    """
+    evaluation = config["evaluation"]
+    for key in ("views", "targets"):
+        found = evaluation[key]
+        require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
+    targets = target_protocols(config)
+    metrics = build(config["metrics"], "metrics").to(device)
+    for name, reason in metrics.left_out.items():
+        print(f"{name} is left out: {reason}", flush=True)
+    rows = measure_all(
+        methods,
+        data,
+        views=evaluation["views"],
+        targets=targets,
+        split=evaluation["split"],
+        metrics=metrics,
+        device=device,
+        pictures=directory / "pictures",
+        picture_count=evaluation["pictures"],
+    )
+    source = provenance(
+        config,
+        seed=config["seed"],
+        data={"name": config["data"].get("name"), "split": evaluation["split"]},
+        protocol={
+            "metrics": metrics.protocol,
+            "views": evaluation["views"],
+            "targets": list(targets),
+            "target_protocols": targets,
+            "reported": list(metrics.metrics),
+            "left_out": metrics.left_out,
+            "definitions": metrics.definitions,
+            "split": SPLITS.get(evaluation["split"], "unseen in training"),
+        },
+        **facts,
+    )
+    print_summary(rows)
+    return write_results(directory, rows, source)
+
+
+def print_summary(rows: list[Row]) -> None:
+    """Print means over subjects as a table; the files have all numbers."""
+    names = [name for name in PRINTED if name in metric_names(rows)]
+    table = Table("method", "views", "targets", *names)
+    for mean in summarize(rows):
+        numbers = ("-" if mean[n] is None else f"{mean[n]:.{PRINTED[n]}f}" for n in names)
+        table.add_row(mean["method"], str(mean["views"]), mean["targets"], *numbers)
+    rich.print(table)
