@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -28,7 +27,7 @@ from literal_recalibration import literal_recalibration
 from stage_scenes import make_batch
 
 from ghgs_lit import encoder, recalibration
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Points, Tokens
@@ -56,8 +55,7 @@ def merged(name: str, stages: list[Stage]) -> Stage:
 def configuration(size: str, options: list[str]) -> dict:
     """The paper's model around an encoder of ``size``, every token and pixel taking part."""
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = compose("train", overrides=overrides)
+    config = compose("train", overrides)
     keys = ["encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points"]
     return OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
 

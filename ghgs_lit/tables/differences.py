@@ -3,11 +3,11 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ghgs_lit.runs.provenance import UNHASHED
+from ghgs_lit.config.keys import WITHOUT_INFLUENCE
 
 # What may differ: how often it was drawn, what the ablation switches, what no number depends on.
 _EXPECTED = (
-    *UNHASHED,
+    *WITHOUT_INFLUENCE,
     "seed",
     "ablation",
     "recalibration.neighborhood",

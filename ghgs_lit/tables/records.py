@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import METHOD, mean, metric_names, read_results
 
@@ -189,6 +190,7 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
         return None
     if not isinstance(config, Mapping) or not all(k in config for k in ("ablation", "trainer", "data")):
         return None
+    config = upgrade(config)
     data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
 

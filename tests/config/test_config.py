@@ -5,11 +5,10 @@ import itertools
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli.main import VERBS
-from ghgs_lit.config import build, conf_dir
+from ghgs_lit.config import build, compose, conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 
@@ -19,8 +18,7 @@ MEMBERS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / gro
 
 
 def composed(verb: str, *overrides: str):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(verb, overrides=list(overrides))
+    return compose(verb, overrides)
 
 
 def nodes_with_target(node, key=""):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from ghgs_lit.runs.run import Run, State
+from ghgs_lit.runs.run import RunDirectory, State
 from tests.helpers.jobs import executed, hydra_app
 
 SETTINGS = {
@@ -36,7 +36,7 @@ def test_launchers_run_a_sweep_of_four_once(launcher, monkeypatch, capsys, tmp_p
     hydra_app(monkeypatch, *chosen, "seed=1,2", "ablation=full,neither")
     names = executed(tmp_path)
     assert len(names) == len(set(names)) == 4
-    assert all(Run(tmp_path / name).state == State.DONE for name in names)
+    assert all(RunDirectory(tmp_path / name).state == State.DONE for name in names)
     assert "4 runs: 4 done" in capsys.readouterr().out
     hydra_app(monkeypatch, *chosen, "seed=1,2", "ablation=full,neither")
     assert len(executed(tmp_path)) == 4

@@ -7,20 +7,26 @@ import signal
 import time
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 
 from ghgs_lit.cli import train as train_verb
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job, plan
-from ghgs_lit.runs.grid import carry_out, combinations
+from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
-from ghgs_lit.runs.run import Run, State
+from ghgs_lit.runs.run import RunDirectory, State
 from tests.cli.test_main import call
-from tests.helpers.jobs import executed, finish, hold, noting, planned_by_hand, work_through
+from tests.helpers.jobs import (
+    executed,
+    hold_run,
+    plan_seeds,
+    record_execution,
+    work_through,
+    write_finished_run,
+)
 
 SPAWN = multiprocessing.get_context("spawn")
 
@@ -28,7 +34,7 @@ SPAWN = multiprocessing.get_context("spawn")
 @pytest.fixture
 def sweep(monkeypatch, capsys, tmp_path):
     """``sweep("seed=1,2")`` runs the verb as a sweep in ``tmp_path / "sweep"`` without training."""
-    monkeypatch.setattr(train_verb, "train", noting)
+    monkeypatch.setattr(train_verb, "train", record_execution)
 
     def run(*overrides: str):
         return call(monkeypatch, capsys, "train", "-m", f"hydra.sweep.dir={tmp_path / 'sweep'}", *overrides)
@@ -64,20 +70,20 @@ def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
     assert executed(sweep.directory) == names
     assert names[0] in out
     assert "3 runs: 1 done, 2 missing" in out
-    assert "0:01:40 (0.5 s a step, measured in 1 runs that are done)" in out  # 2 x 100 x 0.5 s
+    assert "0:01:40 (0.5 s a step, measured in 1 finished runs)" in out  # 2 x 100 x 0.5 s
     code, out, _ = sweep("seed=2,3", "dry_run=true", "trainer.max_time=00:00:00:10")
     assert ": 0:00:20 (trainer.max_time; 0.5 s a step" in out  # the budget ends before 5000 x 0.5 s
 
 
 def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, monkeypatch):
-    def bad(config, directory, notes):
+    def bad(config, directory, stats):
         if config["seed"] == 1:
             raise InputError("step 3: expected finite losses; found nan")
         if config["seed"] == 2:
             (directory / "checkpoints").mkdir()
             (directory / "checkpoints" / "last.ckpt").touch()
             raise KeyboardInterrupt
-        return noting(config, directory, notes)
+        return record_execution(config, directory, stats)
 
     monkeypatch.setattr(train_verb, "train", bad)
     code, _, _ = sweep("seed=3,1,2,4")
@@ -86,7 +92,7 @@ def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, 
     assert len(list(sweep.directory.glob("*/config.yaml"))) == 4  # tables show what is planned as missing
     _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
     assert "4 runs: 1 done, 1 partial, 1 failed, 1 missing" in out
-    monkeypatch.setattr(train_verb, "train", noting)
+    monkeypatch.setattr(train_verb, "train", record_execution)
     code, out, _ = sweep("seed=1,2,3,4")
     assert code == 0
     assert "4 runs: 4 done" in out
@@ -96,15 +102,15 @@ def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, 
     cut = [name for name, resume in resumed.items() if resume != "None"]
     assert len(cut) == 1
     assert resumed[cut[0]] == str(sweep.directory / cut[0] / "checkpoints" / "last.ckpt")
-    outcomes = [s.get("outcome") for s in Run(sweep.directory / cut[0]).sessions()]
+    outcomes = [s.get("outcome") for s in RunDirectory(sweep.directory / cut[0]).sessions()]
     assert outcomes == ["interrupted", "done"]
 
 
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
-    def bad(config, directory, notes):
+    def bad(config, directory, stats):
         if config["seed"] == 1:
             raise InputError("step 3: expected finite losses; found nan")
-        return noting(config, directory, notes)
+        return record_execution(config, directory, stats)
 
     monkeypatch.setattr(train_verb, "train", bad)
     code, out, err = sweep("seed=1,2")
@@ -125,24 +131,24 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
 
 
 def test_results_that_are_not_whole_are_no_results(tmp_path):
-    run = Run(tmp_path / "run")
+    run = RunDirectory(tmp_path / "run")
     assert run.state == State.MISSING
-    run.directory.mkdir()
-    (run.directory / "metrics.json").write_text('{"format_version": 1, "summ')
+    run.path.mkdir()
+    (run.path / "metrics.json").write_text('{"format_version": 1, "summ')
     assert run.state == State.MISSING
-    finish(run.directory, {"seed": 1})
+    write_finished_run(run.path, {"seed": 1})
     assert run.state == State.DONE
     assert run.metric == 20.0
 
 
 def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
-    run = Run(tmp_path)
+    run = RunDirectory(tmp_path)
     with run.session():
         pass
     with open(tmp_path / "sessions.jsonl", "a") as file:
         file.write('{"started": "2026-')
-    with run.session(resumed="x") as notes:
-        notes["steps"] = 3
+    with run.session(resumed="x") as stats:
+        stats["steps"] = 3
     first, second = run.sessions()
     assert first["outcome"] == second["outcome"] == "done"
     assert (second["resumed"], second["steps"]) == ("x", 3)
@@ -150,10 +156,10 @@ def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
 
 def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
     ready = SPAWN.Event()
-    holder = SPAWN.Process(target=hold, args=(tmp_path, ready))
+    holder = SPAWN.Process(target=hold_run, args=(tmp_path, ready))
     holder.start()
     assert ready.wait(30)
-    run = Run(tmp_path)
+    run = RunDirectory(tmp_path)
     assert run.state == State.RUNNING
     assert str(holder.pid) in run.owner
     with run.claim() as mine:
@@ -162,7 +168,7 @@ def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
     with run.claim(wait=True) as mine:
         assert mine
         assert run.state == State.RUNNING
-        with Run(tmp_path).claim() as again:
+        with RunDirectory(tmp_path).claim() as again:
             assert not again
         child = os.fork()
         if child == 0:  # such as a worker that reads data, left over after a kill
@@ -184,32 +190,32 @@ def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
     for process in processes:
         process.join()
         assert process.exitcode == 0
-    assert sorted(executed(tmp_path)) == sorted(item.name for item in planned_by_hand(tmp_path, count))
+    assert sorted(executed(tmp_path)) == sorted(item.name for item in plan_seeds(tmp_path, count))
     assert [p.read_text() for p in tmp_path.glob("seen_*")] == ["8", "8"]
     pids = {line.split()[1] for line in (tmp_path / "executed").read_text().splitlines()}
     assert len(pids) == 2
 
 
 def test_a_sweep_comes_back_to_what_others_worked_on(tmp_path):
-    items, launched = planned_by_hand(tmp_path, 2), []
+    items, launched = plan_seeds(tmp_path, 2), []
 
     def launch(jobs, first):
         launched.append([overrides[0] for overrides in jobs])
         values = [job.BUSY if len(launched) == 1 and name == "0" else 20.0 for (name,) in jobs]
         return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
 
-    assert [result.return_value for result in carry_out(items, launch)] == [20.0, 20.0]
+    assert [result.return_value for result in run_all(items, launch)] == [20.0, 20.0]
     assert launched == [["0", "1"], ["0"]]
 
 
 def test_a_directory_of_a_single_run_is_not_shared_either(tmp_path):
     ready = SPAWN.Event()
-    holder = SPAWN.Process(target=hold, args=(tmp_path, ready))
+    holder = SPAWN.Process(target=hold_run, args=(tmp_path, ready))
     holder.start()
     try:
         assert ready.wait(30)
         with pytest.raises(InputError, match=f"that no process works in; found process {holder.pid} on"):
-            job.work_on(Run(tmp_path), {"resume": None}, noting)
+            job.train_once(RunDirectory(tmp_path), {"resume": None}, record_execution)
     finally:
         holder.kill()
         holder.join()
@@ -232,8 +238,7 @@ def test_a_bad_time_budget_names_its_key():
 
 
 def composed(*overrides: str):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("train", overrides=list(overrides), return_hydra_config=True)
+    return compose("train", overrides, with_hydra=True)
 
 
 @pytest.mark.parametrize(
@@ -276,7 +281,7 @@ def test_tables_share_runs_and_take_other_data(sweep):
 def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tmp_path):
     """Lightning starts the command line again for its other processes: it must be this job's."""
     started = {}
-    finish(tmp_path, {"seed": 1}, 31.0)
+    write_finished_run(tmp_path, {"seed": 1}, 31.0)
 
     def fake(command, env, check):
         started.update(command=command, env=env)
@@ -287,7 +292,7 @@ def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tm
     monkeypatch.setattr(HydraConfig.instance(), "cfg", cfg)
     monkeypatch.setattr(job.subprocess, "run", fake)
     assert job.needs_own_process({"trainer": {"devices": 2}})
-    assert job.work_in_own_process(Run(tmp_path)) == 31.0
+    assert job.train_in_own_process(RunDirectory(tmp_path)) == 31.0
     assert started["command"][2:] == [
         "ghgs_lit",
         "train",

@@ -10,8 +10,9 @@ import torch
 from safetensors.torch import save_file
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import FORMAT_VERSION, GHGS
+from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import make_batch
 

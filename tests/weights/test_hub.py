@@ -95,7 +95,7 @@ def test_without_a_network_it_says_at_once_what_to_fetch(monkeypatch, error, off
     with pytest.raises(InputError, match=reason) as caught:
         hub.fetch("facebook/VGGT-1B")
     text = str(caught.value)
-    assert f"Fetch {ADDRESS} by hand and say vggt=<that file>" in text
+    assert f"Download {ADDRESS} by hand and set vggt=<that file>" in text
     assert "\n" not in text
 
 

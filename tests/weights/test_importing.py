@@ -9,16 +9,25 @@ from safetensors.torch import load_file, save_file
 
 from ghgs_lit.cli import main as cli
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS, STAGES, read_checkpoint
+from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.training import start
 from ghgs_lit.weights import importing, names
+from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.exporting import export_weights
-from ghgs_lit.weights.importing import Source, assign, import_weights
+from ghgs_lit.weights.importing import Source, match_files
 from ghgs_lit.weights.reading import cast
 from ghgs_lit.weights.switches import differences
 from tests.helpers.models import close
 from tests.helpers.scenes import make_batch
-from tests.helpers.weights import OTHER_HEADS, PUBLISHED, TINY, config, published_tensors, write_published
+from tests.helpers.weights import (
+    OTHER_HEADS,
+    PUBLISHED,
+    TINY,
+    config,
+    import_weights,
+    published_tensors,
+    write_published,
+)
 
 
 @pytest.fixture
@@ -45,7 +54,7 @@ def test_the_published_names_and_shapes_are_exactly_the_models(monkeypatch, pref
     ]
     own = GHGS.from_config(config(tiny=False), empty=STAGES).state_dict()
     assert all(tensor.is_meta for tensor in own.values())
-    assert assign(own, files, fresh=()) == []
+    assert match_files(own, files) == []
     assert [len(source.used) for source in files] == [1210, 164]
     assert sum(own[name].numel() for name in files[0].used) == 909_112_320
     assert sum(own[name].numel() for name in files[1].used) == 77_942_669
@@ -99,7 +108,7 @@ def test_without_the_release_heads_start_afresh(tmp_path, files):
     settings = config("compat=none")
     torch.manual_seed(5)
     report = import_weights(settings, out, vggt)
-    assert "start afresh" in report[-1]
+    assert "start with initial values" in report[-1]
     model = GHGS.from_checkpoint(out)
     torch.manual_seed(5)
     again = import_weights(settings, tmp_path / "again.ckpt", vggt)
@@ -256,7 +265,7 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
         monkeypatch, capsys, "import", "vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY
     )
     assert code == 0
-    assert "not as the release computes" not in out
+    assert "differs from the release" not in out
     assert out.splitlines()[-1] == "wrote a/out.ckpt"
     code, out, _ = command(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
     assert code == 0
