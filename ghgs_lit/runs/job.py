@@ -54,7 +54,7 @@ def _sqlite(path: str) -> str:
 
 
 def register_resolvers() -> None:
-    """Register ``${config_hash:}``, a run's directory in its sweep, and ``${sqlite:path}``, a database's URL."""
+    """Register ``${config_hash:}``, a run's directory, and ``${sqlite:path}``, a database's URL."""
     OmegaConf.register_new_resolver("config_hash", _hash_of_run, replace=True)
     OmegaConf.register_new_resolver("sqlite", _sqlite, replace=True)
 

@@ -1,4 +1,4 @@
-"""Sweeps whose runs only note that they were executed: for tests, here and in other processes."""
+"""Sweeps without training, whose runs only record that they were executed, in this process or others."""
 
 import os
 import time
@@ -27,7 +27,7 @@ def write_finished_run(directory: Path, config: dict[str, Any], psnr: float = 20
 
 
 def record_execution(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float:
-    """In place of training: one line in the sweep's ``executed``."""
+    """Replaces training: writes one line to the sweep's file ``executed``."""
     with open(directory.parent / "executed", "a") as file:
         file.write(f"{directory.name} {os.getpid()} {config['resume']}\n")
     stats |= {"steps": 10, "seconds": 5.0}
@@ -41,7 +41,7 @@ def executed(sweep: Path) -> list[str]:
 
 
 def job(cfg) -> float | str | None:
-    """What a launcher starts: the verb without its training."""
+    """The job of a launcher: the verb without its training."""
     return train_once(RunDirectory(output_dir()), resolve(cfg), record_execution)
 
 
@@ -53,6 +53,7 @@ def hydra_app(monkeypatch, *overrides: str) -> None:
 
 
 def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
+    """A grid of ``count`` seeds."""
     configs = [{"seed": s, "resume": None, "optimizer": {"lr": 0.0}} for s in range(count)]
     names = [config_hash(config) for config in configs]
     return [
@@ -83,7 +84,7 @@ def work_through(sweep: Path, count: int, barrier) -> None:
 
 
 def hold_run(directory: Path, ready, release=None) -> None:
-    """Take a run and keep it until told, or killed."""
+    """Lock a run until ``release`` is set or the process is killed."""
     with RunDirectory(directory).claim() as mine:
         assert mine
         ready.set()
