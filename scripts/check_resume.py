@@ -18,7 +18,7 @@ import torch
 
 
 def command(directory: Path, arguments: argparse.Namespace, *more: str) -> list[str]:
-    """``ghgs train`` with frequent checkpoints; its schedule depends on steps, since time is not repeatable."""
+    """``ghgs train`` with frequent checkpoints; schedules count steps, as time is not repeatable."""
     return [
         *(sys.executable, "-m", "ghgs_lit.cli.main", "train"),
         *(f"trainer.max_steps={arguments.steps}", "trainer.max_time=null"),

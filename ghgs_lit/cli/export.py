@@ -13,8 +13,7 @@ def run(cfg: DictConfig) -> None:
     config = save_config(cfg, output_dir())
     report = export_weights(config["checkpoint"], config["vggt"], config["release"])
     print("\n".join(report), flush=True)
-    if config["release"] is not None and (
-        differing := differences(read_checkpoint(config["checkpoint"])["config"])
-    ):
-        print(f"the release's code differs: {', '.join(differing)}", flush=True)
+    differing = differences(read_checkpoint(config["checkpoint"])["config"])
+    if config["release"] is not None and differing:
+        print(f"differs from the release: {', '.join(differing)}", flush=True)
     announce(config["release"] or config["vggt"])

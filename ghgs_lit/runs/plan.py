@@ -2,7 +2,6 @@
 
 import datetime
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,11 +116,10 @@ def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
 def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
     """Print the plan of one training run; refused in a sweep whose runs are not known in advance."""
     if is_multirun():
-        print(
-            "dry_run: expected hydra/sweeper=grid, which knows its runs in advance; found another",
-            file=sys.stderr,
+        # Any other error would count as one failed job, and the sweep would continue.
+        raise SystemExit(
+            "dry_run: expected hydra/sweeper=grid, which knows its runs in advance; found another"
         )
-        raise SystemExit(1)  # an error would count as one failed job, and the sweep would continue
     budget = _budget(config, expected_seconds(config, None))
     _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [budget]})
     print(f"nothing was run; outputs: {run.path}/ with {OUTPUTS}", flush=True)

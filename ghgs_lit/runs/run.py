@@ -35,6 +35,7 @@ class RunDirectory:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path).resolve()
+        self._lock = self.path / ".lock"
 
     @property
     def results(self) -> dict[str, Any] | None:
@@ -76,10 +77,6 @@ class RunDirectory:
     def owner(self) -> str:
         """The process that worked on the run last, for messages."""
         return lock_owner(self._lock)
-
-    @property
-    def _lock(self) -> Path:
-        return self.path / ".lock"
 
     def claim(self, wait: bool = False) -> contextlib.AbstractContextManager[bool]:
         """Lock the run for this process; gives whether that succeeded (:func:`ghgs_lit.files.lock`)."""
