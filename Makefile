@@ -1,8 +1,8 @@
-# `make help` lists the targets. The virtual environment is made on first use.
+# `make help` lists the targets. The virtual environment is created on first use.
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-# Two test processes: the suite is bound by the CPU, and small machines have two cores.
+# Test processes: the suite is limited by the CPU, and small machines have two cores.
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
@@ -17,19 +17,20 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $@
 
-setup: $(BIN)/.installed ## Make the virtual environment with pinned versions
+setup: $(BIN)/.installed ## Create the virtual environment with pinned versions
 
-demo: setup ## Make people, train the four ablations, evaluate at 3, 4, 5 views, print the table
+demo: setup ## Generate people, train the four ablations, evaluate with 3, 4, 5 views, print the table
 	PATH="$(abspath $(BIN)):$$PATH" bash scripts/demo.sh
 
 test: setup ## Run the whole test suite (CPU)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
-lint: setup ## Check style
+lint: setup ## Check style, and which part imports which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
 
-format: setup ## Mend style
+format: setup ## Correct style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

@@ -16,7 +16,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -25,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 
 from ghgs_lit import encoder, recalibration
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Points, Tokens
@@ -38,8 +37,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 def configuration(size: str, options: list[str]) -> dict:
     """The paper's model with an encoder of ``size``, without skipping any token or pixel."""
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = compose("train", overrides=overrides)
+    config = compose("train", overrides)
     keys = ["encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points"]
     return OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
 

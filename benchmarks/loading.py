@@ -14,20 +14,18 @@ import tempfile
 import time
 from pathlib import Path
 
-import hydra
 import torch
 from rich.console import Console
 from rich.table import Table
 
-from ghgs_lit.config import build, conf_dir
+from ghgs_lit.config import build, compose
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.synthesis.miniatures import thuman2
 
 
 def build_data(overrides: list[str]) -> PhotographsDataModule:
     """The data that ``overrides`` choose, endless and without a cache."""
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = hydra.compose("prepare", [*overrides, "data.cache_images_mb=0", "data.steps_per_epoch=1000000"])
+    cfg = compose("prepare", [*overrides, "data.cache_images_mb=0", "data.steps_per_epoch=1000000"])
     return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
 
 

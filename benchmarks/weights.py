@@ -17,11 +17,10 @@ import time
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from ghgs_lit.config import conf_dir
-from ghgs_lit.files import write_atomically
+from ghgs_lit.cli.import_ import initial_state
+from ghgs_lit.config import compose
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
@@ -36,8 +35,7 @@ OTHERS = {"camera_head.x": (2048, 9), "point_head.x": (256, 2048), "track_head.x
 
 
 def config(tiny: bool) -> dict:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        composed = compose("import", overrides=["out=x", *(TINY if tiny else ())])
+    composed = compose("import", ["out=x", *(TINY if tiny else ())])
     return OmegaConf.to_container(composed, resolve=True)
 
 
@@ -53,14 +51,14 @@ def make(folder: Path, tiny: bool) -> None:
         shapes.pop(None)
         shapes |= OTHERS if entry is None else {}
         tensors = {name: torch.randn(shape).mul_(0.02) for name, shape in shapes.items()}
-        write_atomically(
-            folder / file, lambda path, f=file, t=tensors, e=entry: write_tensors(Path(f).suffix, path, t, e)
-        )
+        write_tensors(folder / file, tensors, entry)
 
 
 def import_(folder: Path, tiny: bool, dtype: str = "float32") -> None:
     files = str(folder / "vggt.safetensors"), str(folder / "release.pth")
-    print("\n".join(import_weights(config(tiny), folder / f"{dtype}.ckpt", *files, dtype)))
+    settings = config(tiny)
+    state = initial_state(settings, files[1])
+    print("\n".join(import_weights(state, settings, folder / f"{dtype}.ckpt", *files, dtype)))
 
 
 def load(folder: Path, dtype: torch.dtype | None = None) -> None:

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Gaussians
 
-_HOMES = {
+_MODULES = {
     "GHGS": "ghgs_lit.model",
     "Batch": "ghgs_lit.types",
     "Gaussians": "ghgs_lit.types",
@@ -18,10 +18,10 @@ __all__ = ["GHGS", "Batch", "Gaussians", "render"]
 
 
 def __getattr__(name: str):
-    """Public names, imported on first use: ``ghgs --help`` must not wait for PyTorch."""
-    if name not in _HOMES:
+    """Import public names on first use: ``ghgs --help`` must not wait for PyTorch."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:

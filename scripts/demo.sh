@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The demo: built-in people, the four ablations trained for a short time, one table.
-# Run it through `make demo`. GHGS_DEMO_DIR chooses where it writes.
+# The demo: built-in people, the four ablations after a short training, one table.
+# Run it with `make demo`. GHGS_DEMO_DIR is the directory that it writes to.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out="${GHGS_DEMO_DIR:-runs/demo_$(date +%Y-%m-%d_%H-%M-%S)}"

@@ -1,15 +1,14 @@
-"""Kill a sweep with -9, twice, resume it, let it grow: every run must end exactly once.
+"""Kill a sweep with -9 twice, resume it, extend it: every run must end exactly once.
 
     python scripts/kill_sweep.py --directory runs/kill_sweep
 
-Eight short runs (four ablations, two seeds; photographs of 56 x 56 pixels). The first process dies in the
-middle of writing a checkpoint of the third run, the second one in the training of the sixth; the third
-finishes the sweep; then one seed is added and two processes at once work on what that adds. In the end the
-runs that were cut off are trained again without interruption, and their weights are compared. A few minutes.
+Eight short runs (four ablations, two seeds; photographs of 56 x 56 pixels). The first process dies
+while it writes a checkpoint of the third run, the second while it trains the sixth; the third finishes the
+sweep. Then a seed is added, and two processes share the new runs. At the end the interrupted runs are trained
+again without interruption, and their weights are compared. Takes a few minutes.
 """
 
 import argparse
-import json
 import os
 import shutil
 import signal
@@ -19,6 +18,8 @@ import time
 from pathlib import Path
 
 import torch
+
+from ghgs_lit.runs.run import RunDirectory
 
 STEPS, EVERY = 12, 4
 TINY = (
@@ -35,19 +36,19 @@ TINY = (
     "recalibration.k=4",
 )
 GRID = ("ablation=full,no_unprojection,no_semantic,neither",)
-# Runs the command line, but dies half-way through a write of the last checkpoint of the third run.
+# Runs the command line, but dies in the middle of a write of the third run's last checkpoint.
 DYING = """
 import io, os, signal, sys, torch
 save, folders = torch.save, []
 def dying(content, file, *more, **named):
-    path = str(getattr(file, "name", file))
+    path = str(file if isinstance(file, os.PathLike) else getattr(file, "name", file))
     if "last" in os.path.basename(path):
         folders.append(os.path.dirname(path))
     if len(set(folders)) == 3 and folders.count(folders[-1]) == 2:
         whole = io.BytesIO()
         save(content, whole)
-        file.write(whole.getvalue()[: whole.tell() // 2])
-        file.flush()
+        with open(path, "wb") as half:
+            half.write(whole.getvalue()[: whole.tell() // 2])
         os.kill(os.getpid(), signal.SIGKILL)
     save(content, file, *more, **named)
 torch.save = dying
@@ -82,36 +83,25 @@ def kill_in_sixth(process: subprocess.Popen, sweep: Path) -> None:
             process.send_signal(signal.SIGKILL)
             return
         time.sleep(0.005)
-    sys.exit("the sweep ended before it was killed: raise STEPS")
-
-
-def sessions(run: Path) -> list[dict]:
-    found: list[dict] = []
-    for line in (run / "sessions.jsonl").read_text().splitlines():
-        entry = json.loads(line)
-        if "started" in entry:
-            found.append(entry)
-        else:
-            found[-1] |= entry
-    return found
+    sys.exit("the sweep ended before it was killed: increase STEPS")
 
 
 def report(sweep: Path) -> list[Path]:
-    """Print what happened to each run; gives those that were cut off."""
-    cut = []
-    print(f"{'run':<14}{'sessions':>9}{'ended well':>12}  steps of each session (? killed)")
+    """Print the sessions of each run; returns the runs that were interrupted."""
+    interrupted = []
+    print(f"{'run':<14}{'sessions':>9}{'ended well':>12}  steps of each session (?: killed)")
     for run in sorted(
         (p.parent for p in sweep.glob("*/metrics.json")), key=lambda r: (r / "config.yaml").name
     ):
-        each = sessions(run)
+        each = RunDirectory(run).sessions()
         ends = sum(s.get("outcome") == "done" for s in each)
         steps = ", ".join(str(s.get("steps", "?")) for s in each)
         print(f"{run.name:<14}{len(each):>9}{ends:>12}  {steps}")
         if ends != 1:
             sys.exit(f"{run}: expected to end once; found {ends}")
         if len(each) > 1:
-            cut.append(run)
-    return cut
+            interrupted.append(run)
+    return interrupted
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -143,7 +133,7 @@ def main() -> None:
 
     finish(start(sweep, seeds, dying=True), -signal.SIGKILL)
     half = next(sweep.glob("*/checkpoints/.last.ckpt*"))
-    print(f"killed while {half.relative_to(root)} was written: {half.stat().st_size} bytes of it are there")
+    print(f"killed while {half.relative_to(root)} was written: {half.stat().st_size} bytes are there")
     second = start(sweep, seeds)
     kill_in_sixth(second, sweep)
     finish(second, -signal.SIGKILL)
@@ -158,21 +148,26 @@ def main() -> None:
     for process in both:
         finish(process, 0)
     if any(path.stat().st_mtime_ns != time_before for path, time_before in before.items()):
-        sys.exit("a run that was done was written again")
+        sys.exit("a finished run was written again")
     print(
         f"one seed more: {len(list(sweep.glob('*/metrics.json'))) - len(before)} runs added by two processes"
     )
-    cut = report(sweep)
-    pids = {s["pid"] for p in sweep.glob("*/metrics.json") if p not in before for s in sessions(p.parent)}
+    interrupted = report(sweep)
+    pids = {
+        s["pid"]
+        for p in sweep.glob("*/metrics.json")
+        if p not in before
+        for s in RunDirectory(p.parent).sessions()
+    }
     print(f"{len(pids)} processes shared them")
     table(sweep, "table of the grown sweep")
 
     whole = root / "uninterrupted"
     finish(start(whole, seeds), 0)
-    for run in cut:
+    for run in interrupted:
         ours, theirs = weights(run), weights(whole / run.name)
         equal = all(torch.equal(ours[key], theirs[key]) for key in theirs)
-        print(f"{run.name}: cut off, then resumed; weights equal to those without interruption: {equal}")
+        print(f"{run.name}: interrupted, then resumed; weights equal to those without interruption: {equal}")
         if not equal:
             sys.exit(1)
 

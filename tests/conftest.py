@@ -1,4 +1,4 @@
-"""Shape checks (jaxtyping with beartype) for the modules that annotate shapes; one thread a worker."""
+"""Checks annotated shapes (jaxtyping with beartype), and limits the threads of each test process."""
 
 import os
 from pathlib import Path
@@ -7,12 +7,12 @@ from jaxtyping import install_import_hook
 
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
 _CHECKED = ["types", "bounds", "geometry", "heads", "losses", "metrics"]
-# Of these not the folders of kernels: a function that was wrapped cannot be compiled.
+# Without their folders of kernels: a wrapped function cannot be compiled.
 for name in ("encoder", "recalibration"):
     _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]
 install_import_hook([f"ghgs_lit.{name}" for name in _CHECKED], "beartype.beartype")
 
 import torch  # noqa: E402
 
-# Several test processes share the cores; more threads than cores only slow one another down.
+# Test processes share the cores; more threads than cores slow each other down.
 torch.set_num_threads(max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))

@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import BOUNDED, DepthHead
@@ -60,9 +59,8 @@ def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_releases_protocol_of_measuring_comes_with_it(verb):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = OmegaConf.to_container(compose(verb, overrides=["compat=release"]))
-        chosen = OmegaConf.to_container(compose(verb, overrides=["compat=release", "metrics=correct"]))
+    cfg = OmegaConf.to_container(compose(verb, ["compat=release"]))
+    chosen = OmegaConf.to_container(compose(verb, ["compat=release", "metrics=correct"]))
     assert cfg["metrics"]["protocol"] == "release"
     assert cfg["metrics"]["regions"] == ["image"]
     assert (cfg["metrics"]["clamp"], cfg["metrics"]["ssim_padding"]) == (False, "zeros")

@@ -1,4 +1,4 @@
-"""The configuration is found in a wheel, in an editable install and in a bare checkout."""
+"""The configuration is found in a wheel, in an editable install and in a checkout."""
 
 import os
 import shutil
@@ -28,6 +28,7 @@ def groups(conf: Path) -> set[str]:
 
 
 def test_wheel_carries_the_configuration_and_assets(tmp_path):
+    """A wheel without ``conf`` or the body model would fail on first use."""
     pytest.importorskip("hatchling")
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path / "dist")],
@@ -51,10 +52,12 @@ def test_wheel_carries_the_configuration_and_assets(tmp_path):
 
 
 def test_editable_install(tmp_path):
+    """Developers must get the checkout's ``conf``, not an installed copy."""
     assert found_conf(tmp_path, None) == REPOSITORY / "conf"
 
 
 def test_checkout(tmp_path):
+    """The package must run from a copy of the repository that is not installed."""
     for name in ("ghgs_lit", "conf"):
         shutil.copytree(REPOSITORY / name, tmp_path / "copy" / name)
     assert found_conf(tmp_path, tmp_path / "copy") == (tmp_path / "copy" / "conf").resolve()

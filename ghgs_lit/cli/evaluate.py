@@ -13,11 +13,12 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.model import GHGS, read_checkpoint
+from ghgs_lit.model import GHGS
+from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
-    """What is measured, by name, and what is known about it."""
+    """The methods to measure by name, and facts about them for the results."""
     names = config["baselines"]
     names = list(BASELINES) if names == "all" else [names] if isinstance(names, str) else names
     path, renderer = config["checkpoint"], build(config["renderer"], "renderer")
@@ -42,6 +43,7 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
 
 
 def run(cfg: DictConfig) -> None:
+    """The verb; prints the path of the results last."""
     directory = output_dir()
     config = save_config(with_trained_data(cfg), directory)
     L.seed_everything(config["seed"], workers=True, verbose=False)

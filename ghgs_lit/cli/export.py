@@ -9,11 +9,11 @@ from ghgs_lit.weights.switches import differences
 
 
 def run(cfg: DictConfig) -> None:
+    """The verb; prints the path of the written weights last."""
     config = save_config(cfg, output_dir())
     report = export_weights(config["checkpoint"], config["vggt"], config["release"])
     print("\n".join(report), flush=True)
-    if config["release"] is not None:
-        found = differences(read_checkpoint(config["checkpoint"])["config"])
-        if found:
-            print(f"the release's code computes otherwise: {', '.join(found)}", flush=True)
+    differing = differences(read_checkpoint(config["checkpoint"])["config"])
+    if config["release"] is not None and differing:
+        print(f"differs from the release: {', '.join(differing)}", flush=True)
     announce(config["release"] or config["vggt"])

@@ -1,33 +1,44 @@
 """``ghgs import``: published weights to a checkpoint of this package."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import lightning.pytorch as L
 from omegaconf import DictConfig
+from torch import Tensor
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import require
-from ghgs_lit.model import STAGES
+from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
 
-#: What a checkpoint says about its model; the rest is about this run.
+#: Nodes of the configuration that describe the model; a checkpoint stores these.
 MODEL_NODES = (*STAGES, "points", "skip", "model", "compat", "ablation")
 
 
+def initial_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
+    """The tensors of a new model; stages that published weights fill are on the meta device.
+
+    Args:
+        config: the configuration that builds the model.
+        release: the authors' checkpoint; with None the heads get initial values.
+    """
+    filled = STAGES if release is not None else ("encoder",)
+    return GHGS.from_config(config, empty=filled).state_dict()
+
+
 def run(cfg: DictConfig) -> None:
+    """The verb; prints the path of the checkpoint last."""
     config = save_config(cfg, output_dir())
-    # Fresh heads in the release's parameterisation look behind the camera as often as not.
+    # New heads in the release's parameterization predict points behind the camera half of the time.
     safe = config["release"] is not None or config["compat"]["name"] != "release"
     require(safe, "compat", "none where there is no release=<file>", config["compat"]["name"])
     L.seed_everything(config["seed"], workers=True, verbose=False)
-    report = import_weights(
-        {key: config[key] for key in MODEL_NODES},
-        config["out"],
-        config["vggt"],
-        config["release"],
-        config["dtype"],
-        config["depth_head_start"],
-    )
+    model = {key: config[key] for key in MODEL_NODES}
+    options = (config[key] for key in ("out", "vggt", "release", "dtype", "depth_head_start"))
+    report = import_weights(initial_state(model, config["release"]), model, *options)
     print("\n".join(report), flush=True)
-    if config["release"] is not None and differences(config):
-        print(f"not as the release computes: {', '.join(differences(config))}", flush=True)
+    if config["release"] is not None and (differing := differences(config)):
+        print(f"differs from the release: {', '.join(differing)}", flush=True)
     announce(config["out"])

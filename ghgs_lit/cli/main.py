@@ -19,7 +19,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.runs.job import register_resolvers
 
 BAD_INPUT = (InputError, FileNotFoundError)
-register_resolvers()  # wherever a launcher brings a job
+register_resolvers()  # on import, so that the processes of a launcher have them too
 
 # verb: (what it does, an example)
 VERBS = {
@@ -52,11 +52,12 @@ VERBS = {
 
 
 def module_of(verb: str) -> str:
-    """The module that a verb lies in; a word of Python's own gets an underscore."""
+    """The module of a verb; a keyword of Python gets an underscore."""
     return f"ghgs_lit.cli.{verb}" + "_" * keyword.iskeyword(verb)
 
 
 def usage() -> str:
+    """The text of ``ghgs --help``."""
     lines = ["usage: ghgs <verb> [key=value ...] [group=option ...] [-m]", ""]
     for verb, (summary, example) in VERBS.items():
         lines += [f"  {verb:<10}{summary}", f"  {'':<10}  {example}"]
@@ -69,19 +70,19 @@ def usage() -> str:
 
 @dataclass(frozen=True)
 class Verb:
-    """The task of one verb: what Hydra calls, here or in the processes of a launcher."""
+    """The function of one verb that Hydra calls, here or in the processes of a launcher."""
 
     name: str
     argv: tuple[str, ...]
     wants_trace: bool = False
 
     def __call__(self, cfg: DictConfig) -> object:
-        # Lightning starts the other processes of a DDP job by running sys.argv again: it needs the verb.
+        # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
         sys.argv = list(self.argv)
         try:
             return importlib.import_module(module_of(self.name)).run(cfg)
         except BAD_INPUT as error:
-            # Hydra would add a line of its own; in a sweep that line says which run it was.
+            # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
             if self.wants_trace or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             print(f"ghgs {self.name}: {_one_line(error)}", file=sys.stderr)
@@ -89,10 +90,10 @@ class Verb:
 
 
 def _completion_argv(argv: list[str]) -> list[str] | None:
-    """Arguments of a shell-completion call (``ghgs -sc ...``) for the verb that is being typed.
+    """Arguments of a shell-completion call (``ghgs -sc ...``) for the verb on the shell's line.
 
-    The shell's line is handed to Hydra without the verb. While the verb itself is being typed, the
-    verbs are printed and ``None`` comes back.
+    Hydra completes that line without the verb. While the verb itself is being typed, the verbs are printed
+    and None is returned.
     """
     if "query" not in argv[2]:
         return [argv[0], "train", *argv[1:]]
@@ -106,23 +107,23 @@ def _completion_argv(argv: list[str]) -> list[str] | None:
 
 
 def _one_line(error: Exception) -> str:
-    """A configuration error's own words and those of its cause, on one line."""
+    """The messages of a configuration error and of its cause, on one line."""
     texts = [str(error)]
     if error.__cause__ is not None and not isinstance(error, BAD_INPUT):
         texts.append(str(error.__cause__))
     words = " ".join(" ".join(texts).split())
     if "Could not find 'hydra/" in words:
         words += " (launchers and sweepers come with the extras cluster, ray and optuna)"
-    return words.replace("To append to your config use +", "it is no key of this verb; to add it: +")
+    return words.replace("To append to your config use +", "this verb has no such key; to add it: +")
 
 
 def _renamed(verb: str, argument: str) -> str:
-    """``sweep=`` is a group (of ``train``) to Hydra: as the directory that ``table`` reads it is ``runs``."""
+    """``argument`` with the key ``runs`` for ``table sweep=<directory>``: to Hydra ``sweep`` is a group."""
     return argument.replace("sweep=", "runs=", 1) if (verb, argument[:6]) == ("table", "sweep=") else argument
 
 
 def _run(verb: str, argv: list[str]) -> int:
-    # Hydra's own handler would shorten and print errors; with this it raises them, and one place answers.
+    # With this variable Hydra raises errors, which are handled below, instead of printing them.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = [argv[0], *(_renamed(verb, argument) for argument in argv[2:])]
@@ -143,7 +144,7 @@ def _run(verb: str, argv: list[str]) -> int:
 def main() -> int:
     """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 when interrupted."""
     argv = list(sys.argv)
-    # Threads of OpenMP that spin while they wait slow one another down tenfold on cores that are shared.
+    # OpenMP threads that spin while they wait slow down other processes on the same cores tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
         completed = _completion_argv(argv)

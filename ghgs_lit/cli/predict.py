@@ -18,7 +18,7 @@ from ghgs_lit.visualization.turntable import turntable
 
 
 def subject_batch(data: LightningDataModule, subject: str | int, split: str) -> Batch:
-    """The evaluation sample of a subject, by name or by its number in the split."""
+    """The evaluation sample of a subject, given by name or by its number in the split."""
     loader = data.evaluation_loader(split=split, batch_size=1)
     names = list(data.subjects(split))
     if isinstance(subject, int) and 0 <= subject < len(names):
@@ -32,6 +32,7 @@ def subject_batch(data: LightningDataModule, subject: str | int, split: str) -> 
 
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
+    """The verb; prints the path of the splat last."""
     directory = output_dir()
     config = save_config(with_trained_data(cfg), directory)
     frames = config["turntable"]["frames"]

@@ -1,46 +1,40 @@
-"""What the verbs share: their directory, their configuration on disk and in print."""
+"""What all verbs share: their directory, their saved configuration, and the path that they print last."""
 
 from pathlib import Path
+from typing import Any
 
 import rich
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.syntax import Syntax
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.config import resolve
+from ghgs_lit.files import write_text_atomically
 
 
 def output_dir() -> Path:
-    """The directory of this run (absolute), made by Hydra."""
+    """The absolute path of this run's directory, which Hydra makes."""
     return Path(HydraConfig.get().runtime.output_dir).resolve()
 
 
-def plain(cfg: DictConfig) -> dict:
-    """The configuration as plain data, interpolations resolved; a missing value or a bad seed is refused."""
-    missing = OmegaConf.missing_keys(cfg)
-    if missing:
-        raise InputError(f"{sorted(missing)[0]}: expected a value ({sorted(missing)[0]}=...); found none")
-    data = OmegaConf.to_container(cfg, resolve=True)
-    seed = data.get("seed", 0)
-    require(isinstance(seed, int) and 0 <= seed < 2**32, "seed", "an integer from 0 to 4294967295", seed)
-    return data
+def write_config(config: dict[str, Any], directory: Path) -> None:
+    """Write ``directory/config.yaml``; print its path, with ``print_config`` also its content."""
+    text = OmegaConf.to_yaml(OmegaConf.create(config))
+    path = directory / "config.yaml"
+    write_text_atomically(path, text)
+    if config["print_config"]:
+        rich.print(Syntax(text, "yaml", theme="ansi_dark", background_color="default"))
+    overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else ""
+    print(f"config: {path} ({overrides or 'no overrides'})", flush=True)
 
 
-def write_config(data: dict, directory: Path) -> None:
-    """Print the full configuration and write it to ``directory/config.yaml``."""
-    text = OmegaConf.to_yaml(OmegaConf.create(data))
-    rich.print(Syntax(text, "yaml", theme="ansi_dark", background_color="default"))
-    directory.mkdir(parents=True, exist_ok=True)
-    (directory / "config.yaml").write_text(text)
-
-
-def save_config(cfg: DictConfig, directory: Path) -> dict:
-    """Print and write the full configuration, give it back as plain data."""
-    data = plain(cfg)
-    write_config(data, directory)
-    return data
+def save_config(cfg: DictConfig, directory: Path) -> dict[str, Any]:
+    """Write and print the configuration; returns it as plain data."""
+    config = resolve(cfg)
+    write_config(config, directory)
+    return config
 
 
 def announce(path: Path | str) -> None:
-    """Print where the results lie; a verb's last line."""
+    """Print where the results are, as the last line of a verb."""
     print(f"wrote {path}", flush=True)

@@ -9,13 +9,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from ghgs_lit import tables as t
-from ghgs_lit.cli.runtime import announce, output_dir, plain
+from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_text_atomically
 
 
 def _listed(key: str, value: Any, kind: type) -> tuple | None:
-    """A value, a list of them, or None for null and an empty list."""
+    """A value or a list of values as a tuple; None for null and an empty list."""
     values = [value] if isinstance(value, kind) else value or ()
     valid = isinstance(values, Sequence) and all(isinstance(v, kind) for v in values)
     require(valid, key, f"one or more of type {kind.__name__}, or null", value)
@@ -42,7 +43,9 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    config = plain(cfg)
+    """The verb; prints the tables, and the path of the Markdown file last."""
+    directory = output_dir()
+    config = save_config(cfg, directory)
     options = _options(config)
     folders = [Path(p).expanduser() for p in _listed("runs", config["runs"], str) or ()]
     others = [
@@ -50,13 +53,11 @@ def run(cfg: DictConfig) -> None:
     ]
     sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
     tables = t.build_tables(sweep, others, options)
-    directory = output_dir()
-    directory.mkdir(parents=True, exist_ok=True)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))
-    (directory / "table.csv").write_text(t.to_csv(tables))
-    (directory / "table.tex").write_text(t.PREAMBLE + latex)
-    (directory / "table.md").write_text("\n".join(t.to_markdown(table) for table in tables))
+    write_text_atomically(directory / "table.csv", t.to_csv(tables))
+    write_text_atomically(directory / "table.tex", t.PREAMBLE + latex)
+    write_text_atomically(directory / "table.md", "\n".join(t.to_markdown(table) for table in tables))
     for table in tables:
         _print(table)
     announce(directory / "table.md")
@@ -64,7 +65,7 @@ def run(cfg: DictConfig) -> None:
 
 def _print(table: t.Table) -> None:
     printed = t.to_terminal(table)
-    # A number cut short is worse than a line that wraps.
+    # A line that wraps is better than a number that is cut.
     needed = Console(width=1000).measure(printed).maximum
     console = Console(width=max(Console().width, needed))
     console.print(table.caption.replace("`", ""), highlight=False)

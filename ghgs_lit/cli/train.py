@@ -12,23 +12,23 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import build_data, choices, overrides
-from ghgs_lit.cli.runtime import announce, output_dir, plain, write_config
-from ghgs_lit.config import build
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
+from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder import attach_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
-from ghgs_lit.runs.job import going_on, in_sweep, needs_own_process, work_in_own_process, work_on
+from ghgs_lit.runs.job import in_sweep, needs_own_process, train_in_own_process, train_once, with_resume
 from ghgs_lit.runs.plan import print_single_plan
 from ghgs_lit.runs.results import read_results
-from ghgs_lit.runs.run import Run
+from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import GHGSModule, loggers, start
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 
 
 def _quiet() -> None:
-    """Lightning's own lines come twice under Hydra; these warnings do not hold here."""
+    """Silence Lightning's own lines, which Hydra would print twice, and warnings that do not apply here."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
     for message in (*messages, "The dirpath has changed"):
@@ -36,14 +36,14 @@ def _quiet() -> None:
 
 
 def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int | None:
-    """Load ``init_from``, check ``resume``; gives the step to resume at, if any."""
+    """Load ``init_from``, check ``resume``; returns the step to resume at, None for a new run."""
     start.check_start(config, directory)
     if config["init_from"] is not None and config["resume"] is None:
         lines = start.initialize(model, config["init_from"], config["init_strict"])
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
-            if start.switched(config):
-                print(f"the weights knew another model: {', '.join(start.switched(config))}", flush=True)
+            if differing := start.switched(config):
+                print(f"the weights were trained in a different model: {', '.join(differing)}", flush=True)
     if config["resume"] is None:
         return None
     step, changed = start.check_resume(config["resume"], model, config)
@@ -53,7 +53,7 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
 
 
 def build_trainer(config: dict[str, Any], directory: Path) -> L.Trainer:
-    """The Trainer with its loggers and callbacks, all writing below ``directory``."""
+    """The Trainer with its loggers and callbacks, which all write below ``directory``."""
     built = [
         build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()
     ]
@@ -73,22 +73,27 @@ def build_trainer(config: dict[str, Any], directory: Path) -> L.Trainer:
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """Train and measure, or in a sweep whatever its run still lacks; gives the mean PSNR."""
-    config, mine = plain(cfg), Run(output_dir())
+    """The verb: train and measure, in a sweep only what its run still lacks; returns the mean PSNR."""
+    config, run_directory = resolve(cfg), RunDirectory(output_dir())
     if config["dry_run"]:
-        return print_single_plan(config, mine)
+        return print_single_plan(config, run_directory)
     if needs_own_process(config):
-        return work_in_own_process(mine)
+        return train_in_own_process(run_directory)
     if rank_zero_only.rank == 0:
-        return work_on(mine, config, train)
-    # The first process has taken the run for all.
-    return None if in_sweep() and mine.done else train(going_on(config, mine), mine.directory, {})
+        return train_once(run_directory, config, train)
+    # The first process has locked the run for all of them.
+    if in_sweep() and run_directory.done:
+        return None
+    return train(with_resume(config, run_directory), run_directory.path, {})
 
 
-def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> float | None:
-    """Train, keep the last weights, measure them; gives the mean PSNR of the first protocol.
+def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+    """Train, save the last weights, measure them; returns the mean PSNR of the first protocol.
 
-    ``notes`` gets the steps and seconds that were trained here.
+    Args:
+        config: the resolved configuration.
+        directory: the run's directory.
+        stats: gets the ``steps`` and ``seconds`` that are trained here.
     """
     if rank_zero_only.rank == 0:
         write_config(config, directory)
@@ -113,7 +118,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
     seconds = time.perf_counter() - started
     if trainer.interrupted:
         raise KeyboardInterrupt
-    notes |= {"steps": trainer.global_step - (step or 0), "seconds": seconds}
+    stats |= {"steps": trainer.global_step - (step or 0), "seconds": seconds}
     checkpoint = directory / "checkpoints" / "last.ckpt"
     trainer.save_checkpoint(checkpoint)
     if not trainer.is_global_zero:
@@ -133,7 +138,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
             "trained": sum(p.numel() for p in model.parameters() if p.requires_grad),
         },
         training={"steps": trainer.global_step, "seconds": seconds, "processes": trainer.world_size},
-        sessions=Run(directory).sessions(),
+        sessions=RunDirectory(directory).sessions(),
     )
     summary = read_results(path)["summary"]
     loggers.log_results(trainer.loggers, summary, trainer.global_step)

@@ -1,7 +1,7 @@
 """Builds objects from configuration nodes, through a whitelist.
 
-A configuration can come out of somebody else's checkpoint, and Hydra's ``instantiate`` calls whatever
-``_target_`` names. Only this package, the names below and what the user has admitted
+A configuration can come from somebody else's checkpoint, and Hydra's ``instantiate`` calls whatever
+``_target_`` names. Only this package, the names below and the classes that the user allows
 (:mod:`ghgs_lit.config.plugins`) are ever called.
 """
 
@@ -12,7 +12,7 @@ import hydra.utils
 from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 
-from ghgs_lit.config.plugins import VARIABLE, admits
+from ghgs_lit.config.plugins import VARIABLE, is_allowed
 from ghgs_lit.errors import InputError
 
 _OUTSIDE = frozenset(
@@ -36,7 +36,7 @@ _OUTSIDE = frozenset(
 
 
 def _targets(node: Any, key: str = "") -> Iterator[tuple[str, object]]:
-    """Every ``_target_`` below ``node`` with the key that it stands under."""
+    """Every ``_target_`` below ``node`` with its dotted key."""
     if isinstance(node, Mapping):
         for name, value in node.items():
             path = f"{key}.{name}" if key else str(name)
@@ -50,11 +50,11 @@ def _targets(node: Any, key: str = "") -> Iterator[tuple[str, object]]:
 
 
 def _is_allowed(target: str) -> bool:
-    return target in _OUTSIDE or target.startswith("ghgs_lit.") or admits(target)
+    return target in _OUTSIDE or target.startswith("ghgs_lit.") or is_allowed(target)
 
 
 def _reason(error: InstantiationException, key: str) -> InputError:
-    """What the constructor had to say, as one line that starts with the key."""
+    """The constructor's own message, as one line that starts with the key."""
     cause = error.__cause__
     while isinstance(cause, InstantiationException) and cause.__cause__ is not None:
         cause = cause.__cause__
@@ -69,12 +69,12 @@ def build(node: Mapping | DictConfig, _key: str = "", **extra: Any) -> Any:
 
     Args:
         node: a configuration node or a plain mapping; interpolations are resolved.
-        _key: where the node stands in the configuration, for messages.
-        extra: further arguments; they win over the node's.
+        _key: the node's dotted key in the configuration, for messages.
+        extra: further arguments; they replace the node's.
 
     Raises:
-        InputError: a ``_target_`` outside the whitelist, an argument that the target does not take or
-            refuses; an error inside the target that is not about its input keeps its own type.
+        InputError: a ``_target_`` is not in the whitelist, or the target refuses an argument. Other errors
+            inside the target keep their own type.
     """
     if not isinstance(node, Mapping | DictConfig) or "_target_" not in node:
         raise InputError(f"{_key or 'configuration'}: expected a mapping with _target_; found {node!r}")
@@ -83,7 +83,7 @@ def build(node: Mapping | DictConfig, _key: str = "", **extra: Any) -> Any:
         if not (isinstance(target, str) and _is_allowed(target)):
             raise InputError(
                 f"{path}: expected a class of ghgs_lit or a whitelisted one; found {target!r}"
-                f" ({VARIABLE}=file.py admits classes of your own)"
+                f" ({VARIABLE}=file.py allows classes of your own)"
             )
     try:
         return hydra.utils.instantiate(plain, _convert_="all", **extra)

@@ -7,6 +7,7 @@ from typing import Any
 WITHOUT_INFLUENCE = (
     "hydra",
     "dry_run",
+    "print_config",
     "resume",
     "logger",
     "callbacks",

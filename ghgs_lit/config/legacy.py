@@ -1,7 +1,7 @@
-"""Configurations that earlier versions wrote, in today's keys and class names.
+"""Configurations of earlier versions in today's keys and class names.
 
-Checkpoints and results carry the configuration of their run. The tables below say where its keys and
-classes are now, so that they still load.
+Checkpoints and results carry the configuration of their run. The tables below map its old names to today's,
+so that they still load.
 """
 
 import copy
@@ -27,12 +27,17 @@ KEYS: dict[str, str] = {
 #: Values that changed their name: (key of today, old value) to the new one.
 VALUES: dict[tuple[str, Any], Any] = {}
 
-#: Changes that no table can say, applied last: each takes the configuration and changes it in place.
+#: Options that changed their name: (group, old option) to the new one. Results list the options of their run.
+OPTIONS = {
+    ("optimizer", "pilot"): "from_scratch",
+}
+
+#: Changes that no table can express, applied last: each changes the configuration in place.
 STEPS: list[Callable[[dict[str, Any]], None]] = []
 
 
 def upgrade(config: Mapping[str, Any]) -> dict[str, Any]:
-    """``config`` in today's keys; one of today comes back unchanged."""
+    """``config`` in today's keys; one of today's version is returned unchanged."""
     result = _renamed_targets(copy.deepcopy(dict(config)))
     for old, new in KEYS.items():
         _move(result, old.split("."), new.split("."))
@@ -43,6 +48,18 @@ def upgrade(config: Mapping[str, Any]) -> dict[str, Any]:
             node[name] = new
     for step in STEPS:
         step(result)
+    return result
+
+
+def upgrade_provenance(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """The provenance of a result with its configurations and chosen options in today's names."""
+    result = dict(provenance)
+    for key in ("config", "checkpoint_config"):
+        if isinstance(result.get(key), Mapping):
+            result[key] = upgrade(result[key])
+    if "choices" in result:
+        chosen = result["choices"].items()
+        result["choices"] = {group: OPTIONS.get((group, option), option) for group, option in chosen}
     return result
 
 

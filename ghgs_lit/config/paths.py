@@ -2,13 +2,12 @@
 
 from pathlib import Path
 
-import ghgs_lit
 from ghgs_lit.errors import InputError
 
 
 def conf_dir() -> Path:
     """Absolute path of ``conf``: inside the package in a wheel, beside it in a checkout."""
-    package = Path(ghgs_lit.__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     candidates = (package / "conf", package.parent / "conf")
     for candidate in candidates:
         if (candidate / "train.yaml").is_file():

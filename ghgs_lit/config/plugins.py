@@ -1,7 +1,7 @@
-"""Own classes in configurations: modules beside this package whose names a ``_target_`` may have.
+"""The user's own classes in configurations: modules outside of this package that a ``_target_`` may name.
 
-A configuration can come out of somebody else's checkpoint, so none can admit anything. The user does: with
-``GHGS_PLUGINS`` in the environment (Python files or names of modules, separated as in ``PATH``), or by
+A configuration can come from somebody else's checkpoint, so it cannot allow modules itself. The user does,
+with ``GHGS_PLUGINS`` in the environment (Python files or names of modules, separated as in ``PATH``), or by
 installing a package that declares an entry point in the group ``ghgs_lit.plugins``.
 """
 
@@ -18,8 +18,8 @@ from ghgs_lit.errors import InputError
 VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
 
 
-def admits(target: str) -> bool:
-    """Whether ``target`` lies in a module that the user has admitted; that module is then imported."""
+def is_allowed(target: str) -> bool:
+    """Whether ``target`` is in a module that the user allows; that module is then imported."""
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
         if target.startswith(f"{name}."):
@@ -30,12 +30,12 @@ def admits(target: str) -> bool:
 
 @cache
 def _installed() -> tuple[str, ...]:
-    """Modules of installed packages that declare themselves plugins."""
+    """Modules of installed packages that declare the entry point."""
     return tuple(point.value for point in importlib.metadata.entry_points(group=GROUP))
 
 
 def _module_of(entry: str) -> str:
-    """The module's name; a file is made importable by the name of its stem, in child processes too.
+    """The name of the module; a file becomes importable by its stem.
 
     Raises:
         InputError: the file is missing, or another module has its name.
@@ -50,7 +50,7 @@ def _module_of(entry: str) -> str:
         raise InputError(f"{VARIABLE}: expected a file name that Python can import; found {path.name!r}")
     folder = str(path.parent)
     if folder not in sys.path:
-        # Behind everything else: the files beside it must not hide installed packages.
+        # Last in the search path: the file's neighbours must not hide installed packages.
         sys.path.append(folder)
         importlib.invalidate_caches()
     spec = importlib.util.find_spec(path.stem)

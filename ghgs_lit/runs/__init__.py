@@ -1,1 +1,1 @@
-"""Runs of sweeps: planning, carrying out, resuming, results and where they come from."""
+"""Runs and sweeps: planning, training once, resuming, results and their provenance."""

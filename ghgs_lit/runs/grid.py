@@ -1,7 +1,6 @@
 """The sweeper of ``conf/hydra/sweeper/grid.yaml``: launches the runs of a grid that are not done."""
 
 import logging
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,43 +11,43 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from ghgs_lit.cli.runtime import announce, plain
+from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.job import BUSY, refuse_shared_process
-from ghgs_lit.runs.plan import Planned, print_plan, print_results
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.job import BUSY, trains_in_several_processes
+from ghgs_lit.runs.plan import PlannedRun, print_plan, print_results
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import Run, State
+from ghgs_lit.runs.run import RunDirectory, State
 
 log = logging.getLogger(__name__)
-_POLL = 2.0  # seconds between two looks at runs that others work on
+_POLL = 2.0  # seconds between two looks at runs that other processes work on
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobReturn]]:
-    """Carry out, or only print (``dry_run``), the grid of ``arguments`` over the sweeper's parameters."""
+    """Run, or with ``dry_run`` only print, the grid of ``arguments`` and the sweeper's parameters."""
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
     directory = Path(str(config.hydra.sweep.dir)).resolve()
     planned = plan(
         combinations(sweeper.params, arguments),
         lambda overrides: loader.load_sweep_config(config, overrides),
     )
-    for item in planned:
-        refuse_shared_process(item.config, config.hydra.runtime.choices["hydra/launcher"])
+    for item in planned:  # an impossible launcher is refused before anything starts
+        trains_in_several_processes(item.config, config.hydra.runtime.choices["hydra/launcher"])
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []
-    remember(planned, config, directory)
-    returns = carry_out(planned, sweeper.launcher.launch, sweeper.max_batch_size)
+    write_plan(planned, config, directory)
+    returns = run_all(planned, sweeper.launcher.launch, sweeper.max_batch_size)
     print_results(planned, directory)
-    announce(directory)
     for result in returns:
         _ = result.return_value  # raises what the job raised
     return [returns]
 
 
 def combinations(params: Mapping[str, Any] | None, arguments: Sequence[str]) -> list[list[str]]:
-    """Overrides of each job; what the command line says of a key replaces the sweep's own values."""
+    """The overrides of each job; the command line's values of a key replace the sweep's own."""
     parser = OverridesParser.create()
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
@@ -57,69 +56,70 @@ def combinations(params: Mapping[str, Any] | None, arguments: Sequence[str]) -> 
     return batch
 
 
-def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[Planned]:
-    """The different runs among ``combos``, in order.
+def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:
+    """The different runs among the jobs, in order.
+
+    Args:
+        combos: the overrides of each job.
+        compose: composes the configuration of a job from its overrides.
 
     Raises:
         InputError: a job's configuration is bad or lacks a value.
     """
-    planned: dict[str, Planned] = {}
+    planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
         directory = Path(str(cfg.hydra.sweep.dir))
         with open_dict(cfg):
             del cfg["hydra"]
-        config = plain(cfg)
+        config = resolve(cfg)
         name = config_hash(config)
         shown = tuple(filter_overrides(overrides))
-        planned.setdefault(name, Planned(name, tuple(overrides), shown, config, Run(directory / name)))
+        run = RunDirectory(directory / name)
+        planned.setdefault(name, PlannedRun(name, tuple(overrides), shown, config, run))
     return list(planned.values())
 
 
-def remember(planned: Sequence[Planned], config: DictConfig, directory: Path) -> None:
-    """Write down what is planned: tables show runs that have a configuration and no results as missing."""
+def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Path) -> None:
+    """Write each run's configuration, by which tables know that it is planned."""
     for item in planned:
-        path = item.run.directory / "config.yaml"
+        path = item.run.path / "config.yaml"
         if not path.exists():
-            _write(path, OmegaConf.to_yaml(OmegaConf.create(item.config)))
-    _write(directory / "multirun.yaml", OmegaConf.to_yaml(config))
+            write_text_atomically(path, OmegaConf.to_yaml(OmegaConf.create(item.config)))
+    write_text_atomically(directory / "multirun.yaml", OmegaConf.to_yaml(config))
 
 
-def _write(path: Path, text: str) -> None:
-    """Written aside and renamed: two processes may work on one sweep."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    aside.write_text(text)
-    aside.replace(path)
+def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
+    """Launch runs until each one is done, here or elsewhere, or has failed.
 
+    A job whose run another process works on returns ``BUSY``: it is launched again once that process has
+    finished or died.
 
-def carry_out(planned: Sequence[Planned], launch: Launch, batch: int | None = None) -> list[JobReturn]:
-    """Launch what is not done until everything is done here or elsewhere, or has failed.
-
-    A job whose run another process has taken comes back ``BUSY``: it is launched again once that process
-    has finished or died.
+    Args:
+        planned: the runs of the grid.
+        launch: starts jobs, given their overrides and the number of the first.
+        batch: jobs that are launched at once; None for all.
     """
-    before = len(planned)
     todo = [item for item in planned if not item.run.done]
-    print(f"{before} runs: {before - len(todo)} done before, {len(todo)} to do", flush=True)
+    print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []
     while todo:
-        left = []
+        busy = []
         for jobs in _batches(todo, batch):
             results = launch([item.overrides for item in jobs], len(returns))
             for item, result in zip(jobs, results, strict=True):
                 if result.status == JobStatus.FAILED:
-                    log.error("failed: %s (%s): %s", item.run.directory, " ".join(item.shown), _error(result))
+                    log.error("failed: %s (%s): %s", item.run.path, " ".join(item.shown), _error(result))
                 if result.status == JobStatus.COMPLETED and result.return_value == BUSY:
-                    left.append(item)
+                    busy.append(item)
                 else:
                     returns.append(result)
-        todo = left
+        todo = busy
         _wait_for_one(todo)
     return returns
 
 
-def _batches(items: list[Planned], size: int | None) -> Iterator[list[Planned]]:
+def _batches(items: list[PlannedRun], size: int | None) -> Iterator[list[PlannedRun]]:
     if size is not None and size < 1:
         raise InputError(f"hydra.sweeper.max_batch_size: expected a number of at least 1; found {size}")
     size = size or len(items)
@@ -127,8 +127,8 @@ def _batches(items: list[Planned], size: int | None) -> Iterator[list[Planned]]:
         yield items[first : first + size]
 
 
-def _wait_for_one(items: Sequence[Planned]) -> None:
-    """Return when one of the runs is no longer worked on."""
+def _wait_for_one(items: Sequence[PlannedRun]) -> None:
+    """Return once no process works on one of the runs any more."""
     if not items:
         return
     print(f"waiting for {', '.join(item.run.owner for item in items)}", flush=True)

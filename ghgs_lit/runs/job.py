@@ -1,4 +1,4 @@
-"""What a job of a sweep does: take the run if it is free and not done, and go on where it was cut off."""
+"""What a job of a sweep does: lock its run if that is free and not done, and train or resume it."""
 
 import os
 import subprocess
@@ -13,16 +13,16 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import Run
+from ghgs_lit.runs.run import RunDirectory
 
 BUSY = "busy"
-"""What a job gives back when another process works on its run."""
+"""The return value of a job whose run another process works on."""
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
-# Set for a job that a sweep starts as a process of its own: "skip" or "wait" when its run is taken.
+# Set in the environment of a job's own process: whether to "skip" a locked run or to "wait" for it.
 _VARIABLE = "GHGS_SWEEP_JOB"
 
 Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
-"""``(config, directory, notes) -> metric``; the notes go to the session's log."""
+"""``(config, directory, stats) -> metric``; ``stats`` is filled for ``sessions.jsonl``."""
 
 
 def is_multirun() -> bool:
@@ -36,7 +36,7 @@ def in_sweep() -> bool:
 
 
 def _waits() -> bool:
-    """The grid comes back to a run that is taken; other sweepers need its result now."""
+    """Whether to wait for a locked run: the grid returns to it later, other sweepers need its result now."""
     if is_multirun():
         return HydraConfig.get().sweeper.get("_target_") != SWEEPER
     return os.environ.get(_VARIABLE) == "wait"
@@ -54,55 +54,57 @@ def _sqlite(path: str) -> str:
 
 
 def register_resolvers() -> None:
-    """``${config_hash:}``, the name of a job's directory, and ``${sqlite:path}``, the URL of a data base."""
+    """Register ``${config_hash:}``, a run's directory, and ``${sqlite:path}``, a database's URL."""
     OmegaConf.register_new_resolver("config_hash", _hash_of_run, replace=True)
     OmegaConf.register_new_resolver("sqlite", _sqlite, replace=True)
 
 
-def going_on(config: dict[str, Any], run: Run) -> dict[str, Any]:
-    """``config`` that resumes from the run's own last checkpoint; in a sweep only."""
+def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
+    """``config`` that, in a sweep, resumes from the run's own last checkpoint."""
     if not in_sweep() or config["resume"] is not None or run.checkpoint is None:
         return config
     return {**config, "resume": str(run.checkpoint)}
 
 
-def work_on(run: Run, config: dict[str, Any], train: Train) -> float | str | None:
-    """Train ``run`` unless it is done or another process does; its metric, or ``BUSY``."""
-    with run.claim(wait=_waits()) as mine:
-        if not mine and in_sweep():
-            print(f"skipped: {run.owner} works on {run.directory}", flush=True)
+def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
+    """Train ``run`` unless it is done; returns its metric, or ``BUSY`` if another process works on it."""
+    with run.claim(wait=_waits()) as claimed:
+        if not claimed and in_sweep():
+            print(f"skipped: {run.owner} works on {run.path}", flush=True)
             return BUSY
-        if not mine:
-            raise InputError(
-                f"{run.directory}: expected a directory that no process works in; found {run.owner}"
-            )
+        if not claimed:
+            raise InputError(f"{run.path}: expected a directory that no process works in; found {run.owner}")
         if in_sweep() and run.done:
-            print(f"done before: {run.directory}", flush=True)
+            print(f"done before: {run.path}", flush=True)
             return run.metric
-        config = going_on(config, run)
-        with run.session(resumed=config["resume"]) as notes:
-            return train(config, run.directory, notes)
+        config = with_resume(config, run)
+        with run.session(resumed=config["resume"]) as stats:
+            return train(config, run.path, stats)
 
 
-def work_in_own_process(run: Run) -> float | str | None:
-    """Run the job as ``ghgs train`` of its own: training in several processes cannot share one with others.
+def train_in_own_process(run: RunDirectory) -> float | str | None:
+    """Run this job as a ``ghgs train`` of its own: training in several processes cannot share its process.
 
-    The new process takes the run, so that it keeps it when this one dies.
+    The new process locks the run, so that the lock stays when this process dies.
     """
     command = [sys.executable, "-m", "ghgs_lit", "train", *HydraConfig.get().overrides.task]
-    command += [f"hydra.run.dir='{run.directory}'", "hydra.mode=RUN"]
+    command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
     mode = {_VARIABLE: "wait" if _waits() else "skip"}
     done = subprocess.run(command, env={**os.environ, **mode}, check=False)
     if done.returncode:
-        raise InputError(f"{run.directory}: expected a job that ends well; found exit code {done.returncode}")
+        raise InputError(f"{run.path}: expected a job that succeeds; found exit code {done.returncode}")
     return run.metric if run.done else BUSY
 
 
-def refuse_shared_process(config: Mapping[str, Any], launcher: str) -> bool:
+def trains_in_several_processes(config: Mapping[str, Any], launcher: str) -> bool:
     """Whether a job of a sweep trains in several processes.
 
+    Args:
+        config: the job's configuration.
+        launcher: the name of Hydra's launcher.
+
     Raises:
-        InputError: it does, and the ``launcher`` runs all jobs in one process.
+        InputError: it does, and the launcher runs all jobs in one process.
     """
     devices = config["trainer"].get("devices", 1)
     if devices in (1, "1", [0]):
@@ -121,4 +123,4 @@ def needs_own_process(config: Mapping[str, Any]) -> bool:
         return False
     launcher = HydraConfig.get().runtime.choices.get("hydra/launcher", "basic")
     # SLURM starts the processes of a job itself.
-    return refuse_shared_process(config, launcher) and "slurm" not in launcher
+    return trains_in_several_processes(config, launcher) and "slurm" not in launcher

@@ -1,8 +1,7 @@
-"""What a sweep is going to do, and what it has done, as tables on the terminal."""
+"""What a sweep will run, and what it has run, as tables on the terminal."""
 
 import datetime
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,20 +13,20 @@ from rich.table import Table
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.job import is_multirun
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.runs.run import Run, State
+from ghgs_lit.runs.run import RunDirectory, State
 
 OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
 
 
 @dataclass(frozen=True)
-class Planned:
-    """A run of a sweep: the hash of its configuration, its overrides (all, and those to show)."""
+class PlannedRun:
+    """A run of a sweep: the hash of its configuration, all of its overrides, and those to print."""
 
     name: str
     overrides: tuple[str, ...]
     shown: tuple[str, ...]
     config: Mapping[str, Any]
-    run: Run
+    run: RunDirectory
 
 
 def time_budget(config: Mapping[str, Any]) -> float | None:
@@ -48,7 +47,7 @@ def step_seconds(directory: Path) -> tuple[float, int] | None:
     """Mean seconds of a training step in the runs below ``directory`` that are done, and their number."""
     steps = seconds = count = 0
     for path in sorted(directory.glob("*/metrics.json")):
-        sessions = [s for s in Run(path.parent).sessions() if s.get("steps")]
+        sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
         steps += sum(s["steps"] for s in sessions)
         seconds += sum(s["seconds"] for s in sessions)
         count += bool(sessions)
@@ -56,7 +55,7 @@ def step_seconds(directory: Path) -> tuple[float, int] | None:
 
 
 def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | None:
-    """How long a run trains, by its budgets and the measured time of a ``step``; None where nobody knows."""
+    """How long a run trains, from its budgets and the measured seconds of a ``step``; None if unknown."""
     steps = config["trainer"].get("max_steps", -1)
     known = [time_budget(config), steps * step if steps > 0 and step is not None else None]
     return min((seconds for seconds in known if seconds is not None), default=None)
@@ -70,13 +69,13 @@ def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
     return f"{config['trainer'].get('max_steps')} steps" if seconds is None else _clock(seconds)
 
 
-def _print_table(planned: Sequence[Planned], columns: Mapping[str, Sequence[str]]) -> None:
-    """One line a run; overrides that all of them share are left out."""
+def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
+    """Print one line for each run; overrides that all runs share are left out."""
     shared = set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
     table = Table("run", "overrides", *columns)
     for item, *cells in zip(planned, *columns.values(), strict=True):
         table.add_row(item.name, " ".join(o for o in item.shown if o not in shared), *cells)
-    # A name cut short is worse than a line that wraps.
+    # A line that wraps is better than a name that is cut.
     width = max(Console().width, Console(width=1000).measure(table).maximum)
     Console(width=width).print(table)
 
@@ -85,8 +84,8 @@ def _counts(states: Sequence[State]) -> str:
     return ", ".join(f"{states.count(state)} {state.value}" for state in State if state in states)
 
 
-def print_plan(planned: Sequence[Planned], directory: Path) -> None:
-    """The runs, what there is of each, how long the rest trains, and where it goes."""
+def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
+    """Print the runs with their states, how long the remaining ones train, and where results go."""
     states = [item.run.state for item in planned]
     measured = step_seconds(directory)
     times = [expected_seconds(item.config, measured and measured[0]) for item in planned]
@@ -96,31 +95,31 @@ def print_plan(planned: Sequence[Planned], directory: Path) -> None:
     left = [t for t, state in zip(times, states, strict=True) if state != State.DONE]
     basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
     if measured:
-        basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} runs that are done")
+        basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
     known = _clock(None if None in left else sum(left))
-    reason = "; ".join(basis) or "no trainer.max_time, and no run that is done to measure a step in"
-    print(f"expected training time of what is left, one run after another: {known} ({reason})")
+    reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
+    print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
 
 
-def print_results(planned: Sequence[Planned], directory: Path) -> None:
-    """The runs with what each of them reached."""
+def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
+    """Print the runs with their states and results, and last the path of the sweep."""
     states = [item.run.state for item in planned]
     metrics = [item.run.metric for item in planned]
     shown = ["" if m is None else f"{m:.2f}" for m in metrics]
     sessions = [str(len(item.run.sessions())) for item in planned]
     _print_table(planned, {"state": [s.value for s in states], "PSNR": shown, "sessions": sessions})
-    print(f"{len(planned)} runs: {_counts(states)}", flush=True)
+    print(f"{len(planned)} runs: {_counts(states)}")
+    print(f"wrote {directory}", flush=True)
 
 
-def print_single_plan(config: Mapping[str, Any], run: Run) -> None:
-    """The plan of one training run; jobs of a sweep come here only where it is not known beforehand."""
+def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
+    """Print the plan of one training run; refused in a sweep whose runs are not known in advance."""
     if is_multirun():
-        print(
-            "dry_run: expected hydra/sweeper=grid, which knows its runs before; found another",
-            file=sys.stderr,
+        # Any other error would count as one failed job, and the sweep would continue.
+        raise SystemExit(
+            "dry_run: expected hydra/sweeper=grid, which knows its runs in advance; found another"
         )
-        raise SystemExit(1)  # a sweeper would take an error for a failed job and go on
     budget = _budget(config, expected_seconds(config, None))
-    _print_table([Planned(config_hash(config), (), (), config, run)], {"trains for": [budget]})
-    print(f"nothing was run; outputs: {run.directory}/ with {OUTPUTS}", flush=True)
+    _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [budget]})
+    print(f"nothing was run; outputs: {run.path}/ with {OUTPUTS}", flush=True)

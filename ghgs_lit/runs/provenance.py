@@ -10,41 +10,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy", "scipy", "gsplat")
+from ghgs_lit.config.keys import WITHOUT_INFLUENCE, flatten, is_below
 
-# Where a run writes, what it shows and how it shares the machine: no number depends on these.
-UNHASHED = frozenset(
-    {
-        "dry_run",
-        "resume",
-        "logger",
-        "callbacks",
-        "data.cache_dir",
-        "data.cache_images_mb",
-        "data.pin_memory",
-        "data.render_workers",
-        "data.workers",
-        "encoder.weights",  # said of init_from's, which counts
-        "evaluation.pictures",
-        "trainer.log_every_n_steps",
-    }
-)
+PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy", "scipy", "gsplat")
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits that stand for a resolved configuration; the order of keys is no matter.
+    """Twelve hexadecimal digits that identify a resolved configuration.
 
-    What no number depends on (``UNHASHED``) has no part in it.
+    The order of keys does not matter, nor do keys without influence on a number (``WITHOUT_INFLUENCE``).
     """
-
-    def hashed(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-        return {
-            key: hashed(value, f"{prefix}{key}.") if isinstance(value, Mapping) else value
-            for key, value in node.items()
-            if f"{prefix}{key}" not in UNHASHED
-        }
-
-    text = json.dumps(hashed(config), sort_keys=True, separators=(",", ":"), default=str)
+    hashed = {key: value for key, value in flatten(config).items() if not is_below(key, WITHOUT_INFLUENCE)}
+    text = json.dumps(hashed, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -60,17 +37,14 @@ def versions() -> dict[str, str]:
 
 
 def git_state() -> dict[str, Any] | None:
-    """Commit of the checkout that the package runs from and whether it was changed; None outside of one."""
+    """Commit of the checkout that the package runs from, and whether files were changed; None elsewhere."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
 
     def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=10
-        )
-        done.check_returncode()
-        return done.stdout.strip()
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
 
     try:
         return {
@@ -82,7 +56,7 @@ def git_state() -> dict[str, Any] | None:
 
 
 def provenance(config: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
-    """All of it as plain data; ``facts`` are what the verb knows (seed, protocol, parameters, seconds)."""
+    """Everything above as plain data, with ``facts`` that the verb knows (seed, protocol, seconds, ...)."""
     return {
         **facts,
         "config_hash": config_hash(config),

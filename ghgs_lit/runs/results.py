@@ -1,21 +1,23 @@
-"""``metrics.json`` and ``metrics.csv``: one row a subject, target and method, with provenance."""
+"""``metrics.json`` and ``metrics.csv``: one row for each subject, target and method, with provenance."""
 
 import csv
 import io
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ghgs_lit.config.legacy import upgrade_provenance
 from ghgs_lit.errors import InputError
+from ghgs_lit.files import write_text_atomically
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""The version that is written; earlier ones are read too."""
 METHOD = "model"
-"""The method of rows that a trained model made; others are baselines."""
+"""The method of the rows of a trained model; others are baselines."""
 KEYS = ("method", "subject", "views", "targets", "target", "inputs")
-"""What a row is about; everything else in it is a number."""
+"""What a row describes; all other entries of a row are metrics."""
 
 Row = dict[str, Any]
 
@@ -51,15 +53,8 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     ]
 
 
-def _write(path: Path, text: str) -> None:
-    """Write aside and rename: a reader never sees half a file."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    aside.write_text(text)
-    aside.replace(path)
-
-
 def _plain(value: Any) -> Any:
-    """Numbers that JSON does not know become null."""
+    """``value`` for JSON, in which infinite numbers and nan become null."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
@@ -70,11 +65,10 @@ def _plain(value: Any) -> Any:
 
 
 def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str, Any]) -> Path:
-    """Write ``metrics.csv`` and then ``metrics.json``, whose presence says that the run is complete."""
+    """Write ``metrics.csv`` and then ``metrics.json``, whose presence marks the run as complete."""
     if not rows:
         raise InputError("evaluation: expected at least one subject and target; found none")
-    directory.mkdir(parents=True, exist_ok=True)
-    # Lines of many runs can be put together and still be told apart.
+    # Rows of several runs can be concatenated and still be distinguished.
     origin = {
         "data": provenance.get("data", {}).get("name"),
         "split": provenance.get("data", {}).get("split"),
@@ -87,7 +81,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in _plain(rows))
-    _write(directory / "metrics.csv", table.getvalue())
+    write_text_atomically(directory / "metrics.csv", table.getvalue())
     content = {
         "format_version": FORMAT_VERSION,
         "provenance": provenance,
@@ -95,17 +89,21 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
         "rows": rows,
     }
     path = directory / "metrics.json"
-    _write(path, json.dumps(_plain(content), indent=1, allow_nan=False))
+    write_text_atomically(path, json.dumps(_plain(content), indent=1, allow_nan=False))
     return path
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``; an ``InputError`` names a file that is none."""
+    """Read a ``metrics.json``; its configurations come back in today's keys.
+
+    Raises:
+        InputError: the file is not a whole ``metrics.json``; the message names it.
+    """
     try:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected a metrics.json; found {error}") from error
-    if not isinstance(content, dict) or content.get("format_version") != FORMAT_VERSION:
-        found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
-        raise InputError(f"{path}: expected format_version {FORMAT_VERSION}; found {found}")
-    return content
+    found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
+    if found not in range(1, FORMAT_VERSION + 1):
+        raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {found}")
+    return {**content, "provenance": upgrade_provenance(content.get("provenance", {}))}

@@ -1,51 +1,46 @@
-"""One run on disk: whether it is done, who works on it, when it was worked on.
+"""One run on disk: its state, the process that works on it, and when it was worked on.
 
-``metrics.json`` is written last and renamed into place: a run that has it is done. ``.lock`` is locked by
-the process that works on the run (a POSIX record lock: the kernel frees it however the process ends, forked
-children do not inherit it, and NFS keeps it among machines). ``sessions.jsonl`` gets one line when
-somebody starts to work on the run and one when that ends; a killed process leaves only the first.
+``metrics.json`` is written last: a run that has it is done. The process that works on the run locks
+``.lock``. ``sessions.jsonl`` gets one line when a process starts to work on the run and one when it ends; a
+killed process leaves only the first.
 """
 
 import contextlib
 import datetime
-import errno
-import fcntl
 import json
 import os
 import socket
-import time
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.files import is_locked, lock, lock_owner
 from ghgs_lit.runs.results import read_results
-
-# Directories whose lock this process holds: closing a second handle of a lock file would free it.
-_HELD: set[Path] = set()
 
 
 class State(str, Enum):
-    """What there is of a run."""
+    """How far a run is."""
 
     DONE = "done"
     RUNNING = "running"
-    PARTIAL = "partial"  # goes on from its last checkpoint
-    FAILED = "failed"  # will be tried again
+    PARTIAL = "partial"  # resumes from its last checkpoint
+    FAILED = "failed"  # is started again
     MISSING = "missing"
 
 
-class Run:
-    """The run in ``directory``, which need not exist."""
+class RunDirectory:
+    """The directory of one run, which need not exist yet."""
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = Path(directory).resolve()
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path).resolve()
+        self._lock = self.path / ".lock"
 
     @property
     def results(self) -> dict[str, Any] | None:
-        """The content of a whole ``metrics.json``; None where there is none."""
-        path = self.directory / "metrics.json"
+        """The content of ``metrics.json``; None if it is missing or not whole."""
+        path = self.path / "metrics.json"
         try:
             return read_results(path) if path.is_file() else None
         except InputError:
@@ -57,21 +52,21 @@ class Run:
 
     @property
     def metric(self) -> float | None:
-        """Mean PSNR of the first protocol, the number that a sweep compares."""
+        """Mean PSNR of the first protocol, by which a sweep compares its runs."""
         results = self.results
         return None if results is None else results["summary"][0]["psnr"]
 
     @property
     def checkpoint(self) -> Path | None:
-        """Where a run that was cut off goes on from."""
-        path = self.directory / "checkpoints" / "last.ckpt"
+        """The checkpoint that an interrupted run resumes from."""
+        path = self.path / "checkpoints" / "last.ckpt"
         return path if path.is_file() else None
 
     @property
     def state(self) -> State:
         if self.done:
             return State.DONE
-        if self._locked():
+        if is_locked(self._lock):
             return State.RUNNING
         sessions = self.sessions()
         if sessions and sessions[-1].get("outcome") == "failed":
@@ -80,16 +75,17 @@ class Run:
 
     @property
     def owner(self) -> str:
-        """Who locked the run last, for messages."""
-        try:
-            return (self.directory / ".lock").read_text().strip() or "another process"
-        except OSError:
-            return "another process"
+        """The process that worked on the run last, for messages."""
+        return lock_owner(self._lock)
+
+    def claim(self, wait: bool = False) -> contextlib.AbstractContextManager[bool]:
+        """Lock the run for this process; gives whether that succeeded (:func:`ghgs_lit.files.lock`)."""
+        return lock(self._lock, wait)
 
     def sessions(self) -> list[dict[str, Any]]:
-        """Every time somebody worked on the run; ``ended`` and ``outcome`` are missing after a kill."""
+        """One entry for each process that worked on the run; a killed one has no ``outcome``."""
         try:
-            lines = (self.directory / "sessions.jsonl").read_text().splitlines()
+            lines = (self.path / "sessions.jsonl").read_text().splitlines()
         except FileNotFoundError:
             return []
         found: list[dict[str, Any]] = []
@@ -106,71 +102,26 @@ class Run:
 
     @contextlib.contextmanager
     def session(self, **facts: Any) -> Iterator[dict[str, Any]]:
-        """Note that this process works on the run, and how that ends; what is put into the dict, too."""
-        self._note({"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), **facts})
-        notes: dict[str, Any] = {}
+        """Log that this process works on the run, with ``facts``, and how it ends.
+
+        Gives a dict for numbers such as steps and seconds, which are logged at the end.
+        """
+        self._log({"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), **facts})
+        stats: dict[str, Any] = {}
         try:
-            yield notes
+            yield stats
         except BaseException as error:
             outcome = "failed" if isinstance(error, Exception) else "interrupted"
-            self._note({"ended": _now(), "outcome": outcome, "error": str(error), **notes})
+            self._log({"ended": _now(), "outcome": outcome, "error": str(error), **stats})
             raise
-        self._note({"ended": _now(), "outcome": "done", **notes})
+        self._log({"ended": _now(), "outcome": "done", **stats})
 
-    def _note(self, entry: dict[str, Any]) -> None:
-        path = self.directory / "sessions.jsonl"
-        cut_off = path.is_file() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
+    def _log(self, entry: dict[str, Any]) -> None:
+        path = self.path / "sessions.jsonl"
+        # A process that was killed while it wrote may have left a line without its end.
+        torn = path.is_file() and path.stat().st_size > 0 and not path.read_bytes().endswith(b"\n")
         with open(path, "a") as file:
-            file.write(("\n" if cut_off else "") + json.dumps(entry) + "\n")
-
-    @contextlib.contextmanager
-    def claim(self, wait: bool = False) -> Iterator[bool]:
-        """Whether this process, and no other, may work on the run inside the ``with``.
-
-        ``wait`` until whoever has it lets go or dies.
-        """
-        if self.directory in _HELD:
-            yield False
-            return
-        self.directory.mkdir(parents=True, exist_ok=True)
-        handle = os.open(self.directory / ".lock", os.O_RDWR | os.O_CREAT, 0o664)
-        try:
-            mine = _lock(handle, fcntl.LOCK_EX, wait, self.directory)
-            if not mine:  # unless somebody only looks whether the run is locked
-                time.sleep(0.05)
-                mine = _lock(handle, fcntl.LOCK_EX, wait, self.directory)
-            if mine:
-                _HELD.add(self.directory)
-                os.ftruncate(handle, 0)
-                os.write(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
-            yield mine
-        finally:
-            os.close(handle)
-            _HELD.discard(self.directory)
-
-    def _locked(self) -> bool:
-        path = self.directory / ".lock"
-        if self.directory in _HELD:
-            return True
-        if not path.exists():
-            return False
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            return not _lock(handle, fcntl.LOCK_SH, False, self.directory)
-        finally:
-            os.close(handle)
-
-
-def _lock(handle: int, kind: int, wait: bool, directory: Path) -> bool:
-    try:
-        fcntl.lockf(handle, kind | (0 if wait else fcntl.LOCK_NB))
-    except OSError as error:
-        if error.errno in (errno.EACCES, errno.EAGAIN):
-            return False
-        if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
-            raise InputError(f"{directory}: expected a file system with locks; found {error}") from None
-        raise
-    return True
+            file.write(("\n" if torn else "") + json.dumps(entry) + "\n")
 
 
 def _now() -> str:

@@ -1,1 +1,1 @@
-"""Published weights: their names, reading and writing them, import from the releases and export back."""
+"""Weight files: checkpoints of this package, and the published weights in both directions."""

@@ -1,6 +1,5 @@
-"""Checkpoints of this package: plain data that carries the whole configuration and rebuilds its model."""
+"""Checkpoints of this package: plain data with the whole configuration, enough to rebuild the model."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,35 +7,43 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_atomically
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import open_file
 
-#: Version of the checkpoints that are written and read.
-FORMAT_VERSION = 1
+#: Version of the checkpoints that are written; earlier ones are read too.
+FORMAT_VERSION = 2
 
-#: Where a LightningModule keeps its model.
+#: Prefix of the model's tensors in the state of a LightningModule.
 STATE_PREFIX = "model."
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a checkpoint, tensors mapped from the disk, and refuse what is not one of this package.
+    """Read a checkpoint of this package; its configuration comes back in today's keys.
+
+    Args:
+        path: the file; its tensors are mapped from the disk, not read.
+        map_location: the device of the tensors, as for ``torch.load``.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: it is no checkpoint; the line names the path, what was expected and what was found.
+        InputError: the file is not a checkpoint of this package; names what was expected and found.
     """
     checkpoint = open_file(path, map_location)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
         if not isinstance(found, kind):
             hint = " (`ghgs import` makes a checkpoint of published weights)" * _is_published(checkpoint)
-            raise InputError(f"{path}: expected a checkpoint with {key!r}; found {summary(checkpoint)}{hint}")
+            raise InputError(
+                f"{path}: expected a checkpoint with {key!r}; found {describe(checkpoint)}{hint}"
+            )
     version = checkpoint["format_version"]
     if not 1 <= version <= FORMAT_VERSION:
         newer = ", of a newer version of this package" if version > FORMAT_VERSION else ""
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
-    return checkpoint
+    return {**checkpoint, "config": upgrade(checkpoint["config"])}
 
 
 def _is_published(content: Any) -> bool:
@@ -45,8 +52,8 @@ def _is_published(content: Any) -> bool:
     )
 
 
-def summary(content: Any) -> str:
-    """What a file holds instead of what was expected, in a few words."""
+def describe(content: Any) -> str:
+    """The content of an unexpected file in a few words, for messages."""
     if not isinstance(content, Mapping):
         return f"a {type(content).__name__}"
     names = [repr(name) for name in content]
@@ -55,7 +62,7 @@ def summary(content: Any) -> str:
 
 
 def model_state(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The tensors of the model, without what a LightningModule holds beside it."""
+    """The tensors of the model alone; a LightningModule's checkpoint holds those of losses too."""
     return {
         key.removeprefix(STATE_PREFIX): value
         for key, value in checkpoint["state_dict"].items()
@@ -64,10 +71,15 @@ def model_state(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Refuse tensors that are not exactly those of ``module``, which may be on the meta device.
+    """Refuse tensors that are not exactly those of ``module``.
+
+    Args:
+        module: its tensors may be on the meta device.
+        state: tensors by name.
+        source: where they come from, for messages.
 
     Raises:
-        InputError: a key is missing, unknown, or of another shape; it names source, key and both shapes.
+        InputError: a key is missing, unknown or has another shape; names source, key and both shapes.
     """
     own = module.state_dict()
     for key in own:
@@ -78,40 +90,38 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
 
 
 def load_strictly(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Copy all of ``state`` into ``module``; refuses what :func:`require_fit` refuses."""
+    """Copy all of ``state`` into ``module``; raises as :func:`require_fit` does."""
     require_fit(module, state, source)
     module.load_state_dict(state)
 
 
 def require_shape(key: str, own: Tensor, found: Any) -> None:
-    """Refuse what does not fit the configured model's tensor ``own``."""
+    """Refuse a value that does not fit the configured model's tensor ``own``."""
     expected = f"shape {tuple(own.shape)} of the configured model"
     require(shape_of(found) == tuple(own.shape), key, expected, shape_of(found))
     require(found.is_floating_point(), key, "floating point numbers", found.dtype)
 
 
-def shape_of(value: Any) -> Any:
+def shape_of(value: Any) -> tuple[int, ...] | str:
+    """The shape of a tensor, or the type of anything else, for messages."""
     return tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
 
 
-def write_aside(path: str | Path, write: Any) -> None:
-    """Let ``write(path)`` write a file beside ``path``, then rename it: ``path`` is whole or not there."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        write(aside)
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+def write_checkpoint(
+    path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any
+) -> None:
+    """Write a checkpoint.
 
-
-def write_checkpoint(path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any):
-    """Write a checkpoint of a model's ``state``; ``facts`` are further plain data."""
+    Args:
+        path: the file to write.
+        state: the model's tensors by name.
+        config: the configuration that builds the model.
+        facts: further plain data to store.
+    """
     content = {
         "state_dict": {f"{STATE_PREFIX}{key}": value for key, value in state.items()},
         "config": dict(config),
         "format_version": FORMAT_VERSION,
         **facts,
     }
-    write_aside(path, lambda aside: torch.save(content, aside))
+    write_atomically(path, lambda temporary: torch.save(content, temporary))

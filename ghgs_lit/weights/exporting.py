@@ -1,25 +1,28 @@
-"""A checkpoint of this package back to the published names: for the authors' code, or VGGT's."""
+"""Writes a checkpoint's tensors under their published names, for the authors' code or VGGT's."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_atomically
 from ghgs_lit.weights import names
-from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_aside
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
 
 
 def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
-    """Write the encoder to ``vggt`` and all else to ``release``; where one is None it is left out.
+    """Write the tensors of ``checkpoint``, bit for bit, under their published names; returns a report.
 
-    Files are safetensors or PyTorch's, by their ending; the tensors are those of the checkpoint, bit by bit.
+    Args:
+        checkpoint: a checkpoint of this package.
+        vggt: the file for the encoder (safetensors or PyTorch, by its suffix); None to leave it out.
+        release: the PyTorch file for everything else; None to leave it out.
 
     Raises:
-        InputError: nothing is asked for, or a tensor has no published name.
+        InputError: both files are None, or a tensor has no published name.
     """
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
     state = model_state(read_checkpoint(checkpoint))
@@ -32,9 +35,7 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
     ):
         if path is not None:
             tensors = {_published(checkpoint, name, table): tensor for name, tensor in own.items()}
-            write_aside(
-                path, lambda aside, t=tensors, e=entry, p=path: write_tensors(Path(p).suffix, aside, t, e)
-            )
+            write_tensors(path, tensors, entry)
             report.append(f"{path}: {len(tensors)} tensors")
     return report
 
@@ -48,10 +49,20 @@ def _published(checkpoint: str | Path, name: str, table: Mapping[str, str]) -> s
     return published
 
 
-def write_tensors(suffix: str, path: Path, tensors: dict[str, Tensor], entry: str | None) -> None:
-    if suffix == ".safetensors":
-        require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", suffix)
-        save_file(tensors, path, metadata={"format": "pt"})
+def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:
+    """Write tensors by name as safetensors or a PyTorch file, by the suffix of ``path``.
+
+    Args:
+        path: the file to write.
+        tensors: tensors by name.
+        entry: the key of the PyTorch file under which they are stored; None for no such level.
+
+    Raises:
+        InputError: ``entry`` is given for safetensors, which have no levels.
+    """
+    if Path(path).suffix == ".safetensors":
+        require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")
+        write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata={"format": "pt"}))
     else:
-        content: Any = tensors if entry is None else {entry: tensors}
-        torch.save(content, path)
+        content = tensors if entry is None else {entry: tensors}
+        write_atomically(path, lambda temporary: torch.save(content, temporary))

@@ -1,4 +1,4 @@
-"""Fetches weights from the Hugging Face hub and checks what arrived."""
+"""Downloads weights from the Hugging Face hub and verifies their checksum."""
 
 import hashlib
 import re
@@ -11,8 +11,8 @@ from ghgs_lit.errors import InputError
 
 FILE = "model.safetensors"
 
-#: Seconds after which the hub counts as out of reach; its own client would try for half a minute.
-PATIENCE = 5.0
+#: Seconds after which the hub counts as unreachable; its own client would try for half a minute.
+TIMEOUT = 5.0
 
 
 def is_repository(name: str) -> bool:
@@ -25,19 +25,23 @@ def is_repository(name: str) -> bool:
 
 
 def fetch(repository: str, filename: str = FILE) -> tuple[Path, str]:
-    """The file of a repository, from the local cache or the hub, and its SHA-256.
+    """The path of a repository's file and its SHA-256, from the local cache or the hub.
 
-    Shows progress, goes on with what an earlier try left, and compares the sum with the published one.
+    Shows progress, resumes an earlier download, and compares the checksum with the published one.
+
+    Args:
+        repository: ``owner/repository``.
+        filename: the file in it.
 
     Raises:
-        InputError: the package or the network is missing, the repository is, or the sum is another.
+        InputError: the package, the network or the repository is missing, or the checksum differs.
     """
     try:
         import huggingface_hub
     except ImportError:
         raise InputError(
             f"{repository}: expected the package huggingface_hub (pip install 'ghgs-lit[hub]'); found none."
-            f" Or fetch https://huggingface.co/{repository}/resolve/main/{filename} by hand and say"
+            f" Or download https://huggingface.co/{repository}/resolve/main/{filename} by hand and set"
             " vggt=<that file>"
         ) from None
     address = huggingface_hub.hf_hub_url(repository, filename)
@@ -54,24 +58,25 @@ def fetch(repository: str, filename: str = FILE) -> tuple[Path, str]:
 
 
 def _require_network(huggingface_hub: ModuleType, repository: str, address: str) -> None:
-    """Whether the hub answers at all; what it answers is for its client to read."""
+    """Refuse if the hub does not answer; its client handles what it answers."""
     found = "HF_HUB_OFFLINE is set"
     if not huggingface_hub.constants.HF_HUB_OFFLINE:
         try:
             request = urllib.request.Request(address, method="HEAD")
-            urllib.request.urlopen(request, timeout=PATIENCE).close()
+            urllib.request.urlopen(request, timeout=TIMEOUT).close()
             return
         except urllib.error.HTTPError:
             return
         except (urllib.error.URLError, OSError) as error:
             found = str(getattr(error, "reason", error))
     raise InputError(
-        f"{repository}: expected the hub or a cached copy; found no connection ({found}). Fetch {address}"
-        f" by hand and say vggt=<that file>"
+        f"{repository}: expected the hub or a cached copy; found no connection ({found}). Download {address}"
+        f" by hand and set vggt=<that file>"
     )
 
 
 def sha256(path: Path) -> str:
+    """The checksum of a file in hexadecimal digits."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -80,10 +85,10 @@ def sha256(path: Path) -> str:
 
 
 def _checked(path: Path) -> str:
-    """The sum of a cached file; the cache names large files by the one that the hub published."""
+    """The checksum of a cached file, which the cache names by the published one."""
     found, published = sha256(path), path.resolve().name
     if re.fullmatch(r"[0-9a-f]{64}", published) and found != published:
         raise InputError(
-            f"{path.resolve()}: expected SHA-256 {published}; found {found}: a broken download, remove it"
+            f"{path.resolve()}: expected SHA-256 {published}; found {found}: a broken download: delete it"
         )
     return found

@@ -1,4 +1,4 @@
-"""Published weights to a checkpoint of this package: every tensor is used, or known to be ignored."""
+"""Published weights to a checkpoint of this package: every tensor is used, or is listed as ignored."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,34 +10,40 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights import names
-from ghgs_lit.weights.checkpoint import require_shape, shape_of, summary, write_checkpoint
+from ghgs_lit.weights.checkpoint import describe, require_shape, shape_of, write_checkpoint
 from ghgs_lit.weights.hub import fetch, is_repository, sha256
 from ghgs_lit.weights.reading import cast, open_file
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 
-#: What the files are, in words.
+#: The files' names in messages.
 KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}
 
-#: Where the depth head starts when there is no checkpoint of the release.
+#: What the depth head starts from without a checkpoint of the release.
 DEPTH_STARTS = ("fresh", "vggt")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file of published weights: ``table`` renames its tensors, ``ignored`` are prefixes left out."""
+    """A file of published weights."""
 
+    #: ``vggt`` or ``release``
     key: str
+    #: the repository or the file's name, for reports
     label: str
     path: Path
+    #: SHA-256
     checksum: str
+    #: prefixes of published names: our prefixes
     table: Mapping[str, str]
+    #: prefixes of tensors that are not used
     ignored: Sequence[str] = ()
+    #: the key of the file under which its tensors are; None for none
     entry: str | None = None
     #: our name: published name, of the tensors that are used
     used: dict[str, str] = field(default_factory=dict)
+    #: number of ignored tensors by the first part of their name
     skipped: Counter = field(default_factory=Counter)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -46,18 +52,19 @@ class Source:
         if self.entry is not None:
             found = content.get(self.entry) if isinstance(content, Mapping) else None
             if not isinstance(found, Mapping):
-                raise InputError(f"{self.path}: expected the entry {self.entry!r}; found {summary(content)}")
+                raise InputError(f"{self.path}: expected the entry {self.entry!r}; found {describe(content)}")
             content = found
         if not isinstance(content, Mapping) or not content or not isinstance(next(iter(content)), str):
-            raise InputError(f"{self.path}: expected tensors by name; found {summary(content)}")
+            raise InputError(f"{self.path}: expected tensors by name; found {describe(content)}")
         return dict(content)
 
-    def own_tensors(self) -> dict[str, Tensor]:
+    def used_tensors(self) -> dict[str, Tensor]:
+        """The tensors that are used, by our names."""
         tensors = self.tensors()
         return {own: tensors[published] for own, published in self.used.items()}
 
     def match(self, model: Mapping[str, Tensor]) -> None:
-        """Decide what becomes of every tensor of the file; refuse names and shapes that do not fit."""
+        """Fill ``used`` and ``skipped``; refuse names and shapes that do not fit the model's tensors."""
         for name, tensor in self.tensors().items():
             where = f"{self.path}: {name}"
             if name.startswith(tuple(self.ignored)):
@@ -71,6 +78,7 @@ class Source:
             self.used[own] = name
 
     def report(self) -> str:
+        """How many tensors are used and ignored, as one line."""
         ignored = ", ".join(f"{part} {count}" for part, count in sorted(self.skipped.items()))
         return f"{self.key}: {self.path}: {len(self.used)} tensors used, {self.skipped.total()} ignored" + (
             f" ({ignored})" if ignored else ""
@@ -78,7 +86,7 @@ class Source:
 
 
 def sources(vggt: str | None, release: str | None, depth_head: str = "fresh") -> Iterator[Source]:
-    """The files to read; a repository of the hub is fetched first."""
+    """The files to read; a repository of the hub is downloaded first."""
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
     choice("depth_head_start", depth_head, DEPTH_STARTS)
     use_depth = depth_head == "vggt" and release is None
@@ -100,6 +108,7 @@ def sources(vggt: str | None, release: str | None, depth_head: str = "fresh") ->
 
 
 def import_weights(
+    state: Mapping[str, Tensor],
     config: Mapping[str, Any],
     out: str | Path,
     vggt: str | None,
@@ -107,52 +116,65 @@ def import_weights(
     dtype: str = "float32",
     depth_head: str = "fresh",
 ) -> list[str]:
-    """Write a checkpoint of the model that ``config`` describes, with published weights; gives a report.
+    """Write a checkpoint with published weights; returns a report.
 
-    Without ``release`` the heads start afresh, the depth head from VGGT's where ``depth_head`` is ``vggt``.
-    ``dtype`` is the encoder's in the file; the heads are always float32. The published tensors are mapped
-    from their files and written from there: the model itself is never in memory.
+    The published tensors are mapped from their files and written from there.
+
+    Args:
+        state: the model's tensors. Those on the meta device must come from the files, others may keep
+            their values.
+        config: the configuration that builds the model.
+        out: the checkpoint to write.
+        vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
+        release: the authors' checkpoint; None without it.
+        dtype: precision of the encoder in the checkpoint (``DTYPES``); the heads are always float32.
+        depth_head: what the depth head starts from without ``release`` (``DEPTH_STARTS``).
 
     Raises:
-        FileNotFoundError, InputError: with one line that names the file, the tensor and both shapes.
+        FileNotFoundError: a file is missing.
+        InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
     choice("dtype", dtype, tuple(DTYPES))
     files = list(sources(vggt, release, depth_head))
     for source in files:
         same = Path(out).exists() and Path(out).samefile(source.path)
         require(not same, "out", f"another file than {source.key}", str(out))
-    config = {**config, "encoder": {**config["encoder"], "weights": files[0].label}}
-    fresh = () if release is not None else STAGES[1:]
-    own = GHGS.from_config(config, empty=[stage for stage in STAGES if stage not in fresh]).state_dict()
-    started = assign(own, files, fresh)
+    initial = match_files(state, files)
+    tensors = dict(state)
 
     def precision(name: str, stored: torch.dtype) -> torch.dtype:
-        # Depths and offsets of millimetres hang on the digits of the heads.
+        # Depths and offsets of millimetres depend on the digits of the heads.
         return DTYPES[dtype] if name.startswith("encoder.") else torch.float32
 
     for source in files:
-        tensors = cast(source.own_tensors, precision)
-        for name, tensor in tensors.items():
+        found = cast(source.used_tensors, precision)
+        for name, tensor in found.items():
             where = f"{source.path}: {source.used[name]}"
             require(bool(tensor.isfinite().all()), where, f"finite numbers in {dtype}", "others")
-        own |= tensors
+        tensors |= found
+    config = {**config, "encoder": {**config["encoder"], "weights": files[0].label}}
     facts = {s.key: {"name": s.label, "sha256": s.checksum, "tensors": len(s.used)} for s in files}
-    write_checkpoint(out, own, config, imported=facts)
+    write_checkpoint(out, tensors, config, imported=facts)
     report = [source.report() for source in files]
-    return report + [f"{len(started)} tensors of {', '.join(fresh)} start afresh"] * bool(started)
+    stages = ", ".join(dict.fromkeys(name.split(".")[0] for name in initial))
+    return report + [f"{len(initial)} tensors of {stages} start with initial values"] * bool(initial)
 
 
-def assign(own: Mapping[str, Tensor], files: Sequence[Source], fresh: Sequence[str]) -> list[str]:
-    """Which tensor of ``own`` each file gives (``Source.used``); returns those that no file does.
+def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> list[str]:
+    """Find the file of each tensor of ``state`` (``Source.used``), by names and shapes alone.
 
-    Only stages in ``fresh`` may have such. Looks at names and shapes alone.
+    Returns:
+        The names of tensors that are in no file and keep their values.
+
+    Raises:
+        InputError: a tensor on the meta device is in no file, or a file does not fit.
     """
     for source in files:
-        source.match(own)
-    missing = [name for name in own if not any(name in source.used for source in files)]
+        source.match(state)
+    missing = [name for name in state if not any(name in source.used for source in files)]
     for name in missing:
-        if name.split(".")[0] not in fresh:
-            _refuse_missing(name, own[name], files)
+        if state[name].is_meta:
+            _refuse_missing(name, state[name], files)
     return missing
 
 

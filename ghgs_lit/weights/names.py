@@ -1,8 +1,8 @@
-"""Published names and ours, in one table each; everything behind a prefix is called the same."""
+"""Published names of tensors and ours, as tables of prefixes; the rest of a name is the same."""
 
 from collections.abc import Mapping
 
-#: facebook/VGGT-1B. A file of the aggregator alone comes without its prefix.
+#: facebook/VGGT-1B. A file of the aggregator alone has no prefix ``aggregator.``.
 VGGT = {
     "aggregator.": "encoder.aggregator.",
     "camera_token": "encoder.aggregator.camera_token",
@@ -15,8 +15,8 @@ VGGT = {
 #: Parts of VGGT-1B that the method does not have: 62, 62, 69 and 394 tensors.
 VGGT_IGNORED = ("depth_head.", "point_head.", "camera_head.", "track_head.")
 
-#: VGGT's depth head as the start of ours (an option). Its last projection stays out: it gives a logarithm of
-#: depth in the scene's own unit, ours a share of the way from near to far.
+#: VGGT's depth head as the start of ours (``depth_head_start=vggt``), without its last projection: that
+#: predicts the logarithm of depth in the scene's own unit, ours a position between near and far.
 VGGT_DEPTH = {"depth_head.": "depth_head.dpt."}
 VGGT_DEPTH_IGNORED = ("depth_head.scratch.output_conv2.2.",)
 
@@ -32,12 +32,12 @@ RELEASE = {
 }
 RELEASE_ENTRY = "network"
 
-#: Modules below these prefixes that only our own variants have.
+#: Part of the names of tensors that only our own variants have.
 UNPUBLISHED = ".guide."
 
 
 def to_ours(name: str, table: Mapping[str, str]) -> str | None:
-    """Our name of a published tensor; None where ``table`` has no place for it."""
+    """Our name of a published tensor; None if ``table`` has none."""
     for published, own in table.items():
         if name.startswith(published):
             return own + name.removeprefix(published)
@@ -45,7 +45,7 @@ def to_ours(name: str, table: Mapping[str, str]) -> str | None:
 
 
 def to_published(name: str, table: Mapping[str, str]) -> str | None:
-    """The published name of one of our tensors; None where the release has no place for it."""
+    """The published name of one of our tensors; None if it has none."""
     if UNPUBLISHED in name:
         return None
     for published, own in table.items():

@@ -1,7 +1,7 @@
-"""Opens weight files of either kind and says in one line what is wrong with those that are none.
+"""Opens weight files of either format, and explains in one line what is wrong with any other file.
 
-Tensors are mapped from the disk, not read: they take memory where they are touched, and the system may
-take it back.
+Tensors are mapped from the disk, not read: only the pages that are used take memory, and the system can free
+them again.
 """
 
 import pickle
@@ -18,27 +18,32 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 
-#: What is found under the name of a weight file when a download went wrong: first bytes, what they mean.
-MISTAKEN = (
-    (b"version https://git-lfs", "a git-lfs pointer; `git lfs pull` fetches the file that it stands for"),
-    (b"<!doctype html", "a web page; the address that it came from wanted a login or led elsewhere"),
-    (b"<html", "a web page; the address that it came from wanted a login or led elsewhere"),
+_WEB_PAGE = "a web page; the address asked for a login or redirected"
+#: Results of failed downloads: the first bytes, and what they mean.
+FAILED_DOWNLOADS = (
+    (b"version https://git-lfs", "a git-lfs pointer; `git lfs pull` downloads the file itself"),
+    (b"<!doctype html", _WEB_PAGE),
+    (b"<html", _WEB_PAGE),
     (b"<?xml", "an XML document, as servers send it for an error"),
 )
 ZIP, PICKLE = b"PK", b"\x80"
 
-#: Bytes of tensors to convert before a file is mapped anew.
+#: Bytes of tensors to convert before the file is mapped again.
 _CHUNK = 1 << 28
 
 
 def open_file(path: str | Path, map_location: Any = "cpu") -> Any:
-    """What a ``.safetensors`` or PyTorch file holds, told by its content, whatever its name.
+    """The content of a safetensors or PyTorch file; its format is read from its first bytes.
 
     Nothing in the file is ever executed (``weights_only=True``).
 
+    Args:
+        path: the file.
+        map_location: the device of the tensors, as for ``torch.load``.
+
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: it is no such file, not a whole one, or holds code; one line.
+        InputError: it has another format, is truncated, or holds code.
     """
     path = Path(path)
     start = _first_bytes(path)
@@ -66,7 +71,7 @@ def _first_bytes(path: Path) -> bytes:
         start = file.read(64)
     if not start:
         raise _unfit(path, "an empty file")
-    for magic, meaning in MISTAKEN:
+    for magic, meaning in FAILED_DOWNLOADS:
         if start.lstrip().lower().startswith(magic):
             raise _unfit(path, meaning)
     return start
@@ -75,15 +80,15 @@ def _first_bytes(path: Path) -> bytes:
 def _open_torch(path: Path, map_location: Any, mmap: bool) -> Any:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about pickles that are none of PyTorch's; refused in a moment
+            warnings.simplefilter("ignore")  # about foreign pickles, which are refused below
             return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
     except Exception as error:
         text = str(error)
         code = re.search(r"GLOBAL ([\w.]+)", text)
         if code:
-            found = f"plain data that is mixed with code ({code[1]}), which is never run"
+            found = f"plain data mixed with code ({code[1]}), which is never run"
         elif isinstance(error, pickle.UnpicklingError):
-            found = "a pickle that PyTorch did not write, or that holds code; such are never run"
+            found = "a pickle that PyTorch did not write or that holds code, which is never run"
         else:
             found = f"one that cannot be read ({(text.strip() or type(error).__name__).splitlines()[0]})"
         raise _unfit(path, found) from error
@@ -95,7 +100,7 @@ def _open_safetensors(path: Path, map_location: Any) -> dict[str, Tensor]:
             return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         text = str(error)
-        # "not fully covered": the header announces more than follows; "header length": it breaks off itself.
+        # "not fully covered": data is missing; "header length": a part of the header is missing.
         cut = "not fully covered" in text or "header length" in text
         why = "the beginning of a safetensors file whose end is missing (truncated)" if cut else text
         raise _unfit(path, why) from error
@@ -104,11 +109,14 @@ def _open_safetensors(path: Path, map_location: Any) -> dict[str, Tensor]:
 def cast(
     open_tensors: Callable[[], Mapping[str, Tensor]], dtype_of: Callable[[str, torch.dtype], torch.dtype]
 ) -> dict[str, Tensor]:
-    """The tensors of a mapped file in the precision that ``dtype_of`` gives by name and stored precision.
+    """The tensors of a mapped file, converted to the precision that ``dtype_of`` chooses.
 
-    Tensors that are in it already stay mapped. A mapping counts as memory as far as it was touched, so
-    where tensors are converted the file is closed and opened again every 256 MB: no more than the result
-    and one chunk is ever held.
+    Tensors that have it already stay mapped. Pages of a mapping count as memory once they were read, so the
+    file is closed and opened again after every 256 MB: never more than the result and one chunk is held.
+
+    Args:
+        open_tensors: opens the file; gives its tensors by name.
+        dtype_of: the precision of a tensor, given its name and its stored precision.
     """
     tensors = open_tensors()
     names = list(tensors)

@@ -1,4 +1,4 @@
-"""What the authors' code computes otherwise: the switches of ``compat=release``."""
+"""Where the authors' code differs from the paper: the switches of ``compat=release``."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -11,7 +11,7 @@ from ghgs_lit.config import conf_dir
 
 @cache
 def release_switches() -> dict[tuple[str, ...], Any]:
-    """Each switch of the model by the path of its key, with the release's value."""
+    """The release's value of each switch of the model, by (group, key)."""
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "compat" / "release.yaml"))
     return {
         (group, key): value
@@ -22,7 +22,12 @@ def release_switches() -> dict[tuple[str, ...], Any]:
 
 
 def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> list[str]:
-    """The switches in which the models of two configurations differ (``other`` None: from the release's)."""
+    """The switches in which two models differ, as ``<key>=<value> for <other value>``.
+
+    Args:
+        config: the configuration of a model.
+        other: that of another model; None for the release.
+    """
     found = []
     for (group, key), value in release_switches().items():
         expected = value if other is None else (other.get(group) or {}).get(key)

@@ -23,6 +23,7 @@ def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
 
 
 def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, capsys):
+    """A verb in the help without a module or a configuration would fail only when a user calls it."""
     code, out, _ = call(monkeypatch, capsys, "--help")
     assert code == 0
     for verb, (_, example) in cli.VERBS.items():
@@ -33,6 +34,7 @@ def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, 
 
 @pytest.mark.parametrize("argv", [(), ("paint",)])
 def test_bad_verb_is_bad_usage(monkeypatch, capsys, argv):
+    """Scripts tell bad usage by exit code 2, and the message lists the verbs."""
     code, out, err = call(monkeypatch, capsys, *argv)
     assert code == 2
     assert "train" in out + err
@@ -49,6 +51,7 @@ def test_bad_verb_is_bad_usage(monkeypatch, capsys, argv):
     ],
 )
 def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys, argv, expected):
+    """A misspelt key must not end in a traceback or in Hydra's longer message."""
     code, _, err = call(monkeypatch, capsys, *argv)
     lines = [line for line in err.strip().splitlines() if line]
     assert code == 1
@@ -58,6 +61,7 @@ def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys
 
 
 def test_verb_help_and_cfg_are_hydras(monkeypatch, capsys):
+    """Hydra's own flags must reach it: they list the groups and the composed configuration."""
     code, out, _ = call(monkeypatch, capsys, "train", "--help")
     assert code == 0
     assert "ablation:" in out
@@ -67,6 +71,7 @@ def test_verb_help_and_cfg_are_hydras(monkeypatch, capsys):
 
 
 def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
+    """Hydra completes one application; the shell needs verbs first, and then the groups of that verb."""
     monkeypatch.setenv("COMP_LINE", "ghgs tr")
     _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
     assert set(out.split()) == set(cli.VERBS)
@@ -76,7 +81,7 @@ def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
 
 
 def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
-    """Lightning restarts sys.argv for the other processes of a DDP job."""
+    """Lightning starts the other processes of a DDP job by sys.argv, which must contain the verb."""
     seen = {}
 
     class Module:

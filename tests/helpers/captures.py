@@ -5,11 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
-from ghgs_lit.config import build, conf_dir
+from ghgs_lit.config import build, compose
 from ghgs_lit.data.reader import View
 from ghgs_lit.synthesis import people
 
@@ -25,8 +24,7 @@ def make_miniature(miniature, *arguments, **options) -> list[Path]:
 
 @functools.lru_cache
 def _config(*overrides: str):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("train", overrides=["targets=cameras", *overrides])
+    return compose("train", ["targets=cameras", *overrides])
 
 
 def build_data(name: str, root: Path, *overrides: str):

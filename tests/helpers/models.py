@@ -4,11 +4,10 @@ import copy
 import functools
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from torch import nn
 
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose
 from ghgs_lit.model import GHGS
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
@@ -22,8 +21,7 @@ def config(*overrides):
 
 @functools.cache  # composing costs more than the tiny models
 def _composed(overrides):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        composed = compose("train", overrides=[*TINY, *overrides])
+    composed = compose("train", [*TINY, *overrides])
     stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
     stages += ("model", "compat")
     return OmegaConf.to_container(OmegaConf.masked_copy(composed, list(stages)), resolve=True)

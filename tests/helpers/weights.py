@@ -1,4 +1,4 @@
-"""Files of published weights in small, with the names of the published ones."""
+"""Small files of published weights, with the published names."""
 
 import gzip
 import json
@@ -6,14 +6,13 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
-from ghgs_lit.cli.import_ import MODEL_NODES
-from ghgs_lit.config import conf_dir
+from ghgs_lit.cli.import_ import MODEL_NODES, initial_state
+from ghgs_lit.config import compose
 from ghgs_lit.model import GHGS
-from ghgs_lit.weights import names
+from ghgs_lit.weights import importing, names
 
 with gzip.open(Path(__file__).parents[1] / "fixtures" / "published_keys.json.gz") as file:
     PUBLISHED = json.load(file)
@@ -21,19 +20,25 @@ with gzip.open(Path(__file__).parents[1] / "fixtures" / "published_keys.json.gz"
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.depth=4", "encoder.layers=[0,1,2,3]"]
 TINY += ["encoder.vit.depth=2", "encoder.vit.heads=2", "encoder.image_size=56"]
 
-#: What VGGT-1B has beside the aggregator and its depth head, in part.
+#: Some tensors of VGGT-1B outside of the aggregator and the depth head.
 OTHER_HEADS = {"camera_head.pose.weight": (9, 4), "point_head.norm.bias": (8,), "track_head.x.bias": (2,)}
 
 
 def config(*overrides, tiny=True):
+    """The nodes of ``ghgs import`` that describe the model, of a tiny one or of the published size."""
     return json.loads(_composed((*(TINY if tiny else ()), *overrides)))
 
 
 @cache
 def _composed(overrides):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        composed = compose("import", overrides=list(overrides))
+    composed = compose("import", overrides)
     return json.dumps({key: OmegaConf.to_container(composed[key]) for key in MODEL_NODES})
+
+
+def import_weights(config, out, vggt, release=None, *args, **kwargs):
+    """Import as the verb does; returns the report."""
+    state = initial_state(config, release)
+    return importing.import_weights(state, config, out, vggt, release, *args, **kwargs)
 
 
 def published_tensors(seed=0, **changes):
@@ -54,7 +59,7 @@ def published_tensors(seed=0, **changes):
 
 
 def write_published(folder, suffix=".safetensors"):
-    """Paths of a tiny VGGT and of a tiny release in ``folder``, and what they hold."""
+    """Write a tiny VGGT and a tiny release to ``folder``; returns their paths and their tensors."""
     vggt, network = published_tensors()
     paths = folder / f"vggt{suffix}", folder / "release.pth"
     save_file(vggt, paths[0]) if suffix == ".safetensors" else torch.save(vggt, paths[0])

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hydra.core.global_hydra import GlobalHydra
 
-from ghgs_lit.runs.run import Run, State
+from ghgs_lit.runs.run import RunDirectory, State
 from tests.helpers.jobs import executed, hydra_app
 
 SETTINGS = {
@@ -23,26 +23,28 @@ SETTINGS = {
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    # Jobs in other processes import the stand-ins of this folder.
+    # Jobs in other processes import the replacements in tests/helpers.
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     GlobalHydra.instance().clear()
 
 
 @pytest.mark.parametrize("launcher", sorted(SETTINGS))
 def test_launchers_run_a_sweep_of_four_once(launcher, monkeypatch, capsys, tmp_path):
+    """Jobs in other processes must find resolvers and locks, and a second call must run nothing."""
     module, extra, settings = SETTINGS[launcher]
     pytest.importorskip(module, reason=f"the extra {extra} is not installed", exc_type=ImportError)
     chosen = ["-m", f"hydra/launcher={launcher}", *settings, f"hydra.sweep.dir={tmp_path}"]
     hydra_app(monkeypatch, *chosen, "seed=1,2", "ablation=full,neither")
     names = executed(tmp_path)
     assert len(names) == len(set(names)) == 4
-    assert all(Run(tmp_path / name).state == State.DONE for name in names)
+    assert all(RunDirectory(tmp_path / name).state == State.DONE for name in names)
     assert "4 runs: 4 done" in capsys.readouterr().out
     hydra_app(monkeypatch, *chosen, "seed=1,2", "ablation=full,neither")
     assert len(executed(tmp_path)) == 4
 
 
 def test_an_optuna_study_is_kept_in_the_sweep(monkeypatch, tmp_path):
+    """A second call must continue the study, and not train its first trials again."""
     pytest.importorskip(
         "hydra_plugins.hydra_optuna_sweeper", reason="the extra optuna is not installed", exc_type=ImportError
     )
@@ -57,12 +59,12 @@ def test_an_optuna_study_is_kept_in_the_sweep(monkeypatch, tmp_path):
     assert len(values) == 4
     assert study.best_value == max(values)
     assert all(trial.value == pytest.approx(20 + trial.params["optimizer.lr"]) for trial in study.trials)
-    # The second call begins as the first one did, finds those runs done, and runs none of them again.
+    # The second call repeats the first trials and finds their runs done.
     assert len(executed(tmp_path)) == len({t.params["optimizer.lr"] for t in study.trials}) == 2
     assert sys.modules["optuna"].__version__.startswith("2.")
 
 
-# What submitit calls, for jobs that run at once on this machine.
+# Replacements of the programs that submitit calls; jobs run at once on this machine.
 FAKES = {
     "sbatch": """#!/bin/bash
 export SLURM_ARRAY_JOB_ID=7 SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0
@@ -79,6 +81,7 @@ exec "$@"
 
 
 def test_the_slurm_example_submits_what_is_missing(monkeypatch, tmp_path):
+    """The shipped example must produce valid jobs that run each run once."""
     pytest.importorskip(
         "hydra_plugins.hydra_submitit_launcher",
         reason="the extra cluster is not installed",

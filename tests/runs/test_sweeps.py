@@ -1,4 +1,4 @@
-"""Sweeps: nothing twice, nothing lost; grown, cut off, shared, refused."""
+"""Sweeps run everything once: when they grow, are interrupted, or are shared by processes."""
 
 import json
 import multiprocessing
@@ -7,20 +7,26 @@ import signal
 import time
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 
 from ghgs_lit.cli import train as train_verb
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose, legacy
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job, plan
-from ghgs_lit.runs.grid import carry_out, combinations
+from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
-from ghgs_lit.runs.run import Run, State
+from ghgs_lit.runs.run import RunDirectory, State
 from tests.cli.test_main import call
-from tests.helpers.jobs import executed, finish, hold, noting, planned_by_hand, work_through
+from tests.helpers.jobs import (
+    executed,
+    hold_run,
+    plan_seeds,
+    record_execution,
+    work_through,
+    write_finished_run,
+)
 
 SPAWN = multiprocessing.get_context("spawn")
 
@@ -28,7 +34,7 @@ SPAWN = multiprocessing.get_context("spawn")
 @pytest.fixture
 def sweep(monkeypatch, capsys, tmp_path):
     """``sweep("seed=1,2")`` runs the verb as a sweep in ``tmp_path / "sweep"`` without training."""
-    monkeypatch.setattr(train_verb, "train", noting)
+    monkeypatch.setattr(train_verb, "train", record_execution)
 
     def run(*overrides: str):
         return call(monkeypatch, capsys, "train", "-m", f"hydra.sweep.dir={tmp_path / 'sweep'}", *overrides)
@@ -38,6 +44,7 @@ def sweep(monkeypatch, capsys, tmp_path):
 
 
 def test_a_grid_that_grows_runs_what_is_missing(sweep):
+    """A larger grid must not train finished runs again; keys without influence must not make new runs."""
     code, out, _ = sweep("seed=1,2")
     assert (code, len(executed(sweep.directory))) == (0, 2)
     code, out, _ = sweep("seed=1,2,3")
@@ -46,13 +53,14 @@ def test_a_grid_that_grows_runs_what_is_missing(sweep):
     names = executed(sweep.directory)
     assert len(names) == len(set(names)) == 3
     sweep("seed=2,3", "logger=none", "data.workers=1", "hydra.sweeper.max_batch_size=1")
-    assert executed(sweep.directory) == names  # what no number depends on makes no new run
+    assert executed(sweep.directory) == names  # keys without influence make no new run
     for name in names:
         source = read_results(sweep.directory / name / "metrics.json")["provenance"]
         assert name == source["config_hash"] == config_hash(source["config"])
 
 
 def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
+    """A plan must not start training, and its expected time must follow from budgets and measured steps."""
     code, out, _ = sweep("seed=1,2", "dry_run=true", "trainer.max_steps=100")
     assert code == 0
     assert not sweep.directory.exists()
@@ -64,29 +72,31 @@ def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
     assert executed(sweep.directory) == names
     assert names[0] in out
     assert "3 runs: 1 done, 2 missing" in out
-    assert "0:01:40 (0.5 s a step, measured in 1 runs that are done)" in out  # 2 x 100 x 0.5 s
+    assert "0:01:40 (0.5 s a step, measured in 1 finished runs)" in out  # 2 x 100 x 0.5 s
     code, out, _ = sweep("seed=2,3", "dry_run=true", "trainer.max_time=00:00:00:10")
     assert ": 0:00:20 (trainer.max_time; 0.5 s a step" in out  # the budget ends before 5000 x 0.5 s
 
 
-def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, monkeypatch):
-    def bad(config, directory, notes):
+def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monkeypatch):
+    """After Ctrl-C the same command must resume from the checkpoint and start failed runs again."""
+
+    def bad(config, directory, stats):
         if config["seed"] == 1:
             raise InputError("step 3: expected finite losses; found nan")
         if config["seed"] == 2:
             (directory / "checkpoints").mkdir()
             (directory / "checkpoints" / "last.ckpt").touch()
             raise KeyboardInterrupt
-        return noting(config, directory, notes)
+        return record_execution(config, directory, stats)
 
     monkeypatch.setattr(train_verb, "train", bad)
     code, _, _ = sweep("seed=3,1,2,4")
     assert code == 130
     assert len(executed(sweep.directory)) == 1
-    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4  # tables show what is planned as missing
+    assert len(list(sweep.directory.glob("*/config.yaml"))) == 4  # tables list planned runs as missing
     _, out, _ = sweep("seed=1,2,3,4", "dry_run=true")
     assert "4 runs: 1 done, 1 partial, 1 failed, 1 missing" in out
-    monkeypatch.setattr(train_verb, "train", noting)
+    monkeypatch.setattr(train_verb, "train", record_execution)
     code, out, _ = sweep("seed=1,2,3,4")
     assert code == 0
     assert "4 runs: 4 done" in out
@@ -96,15 +106,17 @@ def test_a_run_that_was_cut_off_goes_on_and_one_that_failed_stops_nobody(sweep, 
     cut = [name for name, resume in resumed.items() if resume != "None"]
     assert len(cut) == 1
     assert resumed[cut[0]] == str(sweep.directory / cut[0] / "checkpoints" / "last.ckpt")
-    outcomes = [s.get("outcome") for s in Run(sweep.directory / cut[0]).sessions()]
+    outcomes = [s.get("outcome") for s in RunDirectory(sweep.directory / cut[0]).sessions()]
     assert outcomes == ["interrupted", "done"]
 
 
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
-    def bad(config, directory, notes):
+    """One bad run must not cost the rest of the night."""
+
+    def bad(config, directory, stats):
         if config["seed"] == 1:
             raise InputError("step 3: expected finite losses; found nan")
-        return noting(config, directory, notes)
+        return record_execution(config, directory, stats)
 
     monkeypatch.setattr(train_verb, "train", bad)
     code, out, err = sweep("seed=1,2")
@@ -115,6 +127,7 @@ def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
 
 
 def test_an_impossible_job_fails_before_any_is_launched(sweep):
+    """A bad value must be found before hours of training, not at its turn."""
     code, _, err = sweep("seed=1,-2")
     assert code == 1
     assert "seed: expected an integer from 0" in err
@@ -125,35 +138,50 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
 
 
 def test_results_that_are_not_whole_are_no_results(tmp_path):
-    run = Run(tmp_path / "run")
+    """A torn ``metrics.json`` must not mark a run as done."""
+    run = RunDirectory(tmp_path / "run")
     assert run.state == State.MISSING
-    run.directory.mkdir()
-    (run.directory / "metrics.json").write_text('{"format_version": 1, "summ')
+    run.path.mkdir()
+    (run.path / "metrics.json").write_text('{"format_version": 1, "summ')
     assert run.state == State.MISSING
-    finish(run.directory, {"seed": 1})
+    write_finished_run(run.path, {"seed": 1})
     assert run.state == State.DONE
     assert run.metric == 20.0
 
 
+def test_results_of_an_earlier_version_are_read_in_todays_names(tmp_path, monkeypatch):
+    """Tables must put runs from before and after a renaming into the same row."""
+    monkeypatch.setitem(legacy.KEYS, "optim.rate", "optimizer.lr")
+    old = {"seed": 1, "optim": {"rate": 0.1}}
+    source = {"config": old, "checkpoint_config": old, "choices": {"optimizer": "pilot", "data": "scans"}}
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps({"format_version": 1, "provenance": source, "summary": [], "rows": []}))
+    found = read_results(path)["provenance"]
+    assert found["config"]["optimizer"] == found["checkpoint_config"]["optimizer"] == {"lr": 0.1}
+    assert found["choices"] == {"optimizer": "from_scratch", "data": "scans"}
+
+
 def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
-    run = Run(tmp_path)
+    """A torn line of ``sessions.jsonl`` must not hide the sessions around it."""
+    run = RunDirectory(tmp_path)
     with run.session():
         pass
     with open(tmp_path / "sessions.jsonl", "a") as file:
         file.write('{"started": "2026-')
-    with run.session(resumed="x") as notes:
-        notes["steps"] = 3
+    with run.session(resumed="x") as stats:
+        stats["steps"] = 3
     first, second = run.sessions()
     assert first["outcome"] == second["outcome"] == "done"
     assert (second["resumed"], second["steps"]) == ("x", 3)
 
 
 def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
+    """A killed process must not block its run, nor may a forked child that outlives it."""
     ready = SPAWN.Event()
-    holder = SPAWN.Process(target=hold, args=(tmp_path, ready))
+    holder = SPAWN.Process(target=hold_run, args=(tmp_path, ready))
     holder.start()
     assert ready.wait(30)
-    run = Run(tmp_path)
+    run = RunDirectory(tmp_path)
     assert run.state == State.RUNNING
     assert str(holder.pid) in run.owner
     with run.claim() as mine:
@@ -162,10 +190,10 @@ def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
     with run.claim(wait=True) as mine:
         assert mine
         assert run.state == State.RUNNING
-        with Run(tmp_path).claim() as again:
+        with RunDirectory(tmp_path).claim() as again:
             assert not again
         child = os.fork()
-        if child == 0:  # such as a worker that reads data, left over after a kill
+        if child == 0:  # like a data worker that outlives its killed parent
             time.sleep(30)
             os._exit(0)
     try:
@@ -177,6 +205,7 @@ def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
 
 
 def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
+    """Two processes on one sweep must not train a run twice, and both must end with all results."""
     count, barrier = 8, SPAWN.Barrier(2)
     processes = [SPAWN.Process(target=work_through, args=(tmp_path, count, barrier)) for _ in range(2)]
     for process in processes:
@@ -184,38 +213,41 @@ def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):
     for process in processes:
         process.join()
         assert process.exitcode == 0
-    assert sorted(executed(tmp_path)) == sorted(item.name for item in planned_by_hand(tmp_path, count))
+    assert sorted(executed(tmp_path)) == sorted(item.name for item in plan_seeds(tmp_path, count))
     assert [p.read_text() for p in tmp_path.glob("seen_*")] == ["8", "8"]
     pids = {line.split()[1] for line in (tmp_path / "executed").read_text().splitlines()}
     assert len(pids) == 2
 
 
-def test_a_sweep_comes_back_to_what_others_worked_on(tmp_path):
-    items, launched = planned_by_hand(tmp_path, 2), []
+def test_a_sweep_returns_to_runs_that_others_worked_on(tmp_path):
+    """A run that another process held must be launched again: that process may have died."""
+    items, launched = plan_seeds(tmp_path, 2), []
 
     def launch(jobs, first):
         launched.append([overrides[0] for overrides in jobs])
         values = [job.BUSY if len(launched) == 1 and name == "0" else 20.0 for (name,) in jobs]
         return [JobReturn(_return_value=value, status=JobStatus.COMPLETED) for value in values]
 
-    assert [result.return_value for result in carry_out(items, launch)] == [20.0, 20.0]
+    assert [result.return_value for result in run_all(items, launch)] == [20.0, 20.0]
     assert launched == [["0", "1"], ["0"]]
 
 
 def test_a_directory_of_a_single_run_is_not_shared_either(tmp_path):
+    """Two trainings in one directory would overwrite each other."""
     ready = SPAWN.Event()
-    holder = SPAWN.Process(target=hold, args=(tmp_path, ready))
+    holder = SPAWN.Process(target=hold_run, args=(tmp_path, ready))
     holder.start()
     try:
         assert ready.wait(30)
         with pytest.raises(InputError, match=f"that no process works in; found process {holder.pid} on"):
-            job.work_on(Run(tmp_path), {"resume": None}, noting)
+            job.train_once(RunDirectory(tmp_path), {"resume": None}, record_execution)
     finally:
         holder.kill()
         holder.join()
 
 
 def test_the_command_line_replaces_a_sweeps_own_values():
+    """``seed=7`` must replace the three seeds of a named sweep, not add to them."""
     own = {"seed": "1,2,3", "views": "v4"}
     assert combinations(own, ["seed=7", "model=hull"]) == [["views=v4", "seed=7", "model=hull"]]
     assert len(combinations(own, ["ablation=full,neither"])) == 6
@@ -223,17 +255,18 @@ def test_the_command_line_replaces_a_sweeps_own_values():
 
 @pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
 def test_time_budgets(value, seconds):
+    """Expected times of a plan depend on both forms that Lightning accepts."""
     assert plan.time_budget({"trainer": {"max_time": value}}) == seconds
 
 
 def test_a_bad_time_budget_names_its_key():
+    """Lightning would refuse it only after the data is prepared."""
     with pytest.raises(InputError, match=r"trainer\.max_time: expected days:hours:minutes:seconds"):
         plan.time_budget({"trainer": {"max_time": "10 minutes"}})
 
 
 def composed(*overrides: str):
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("train", overrides=list(overrides), return_hydra_config=True)
+    return compose("train", overrides, with_hydra=True)
 
 
 @pytest.mark.parametrize(
@@ -246,6 +279,7 @@ def composed(*overrides: str):
     ],
 )
 def test_named_sweeps(name, count, data):
+    """The paper's tables need exactly these runs."""
     cfg = composed(f"sweep={name}")
     assert cfg.hydra.mode.name == "MULTIRUN"
     assert cfg.data.name == data
@@ -254,6 +288,7 @@ def test_named_sweeps(name, count, data):
 
 
 def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
+    """Without its own mode ``sweep=table4`` would train a single run."""
     there = f"hydra.sweep.dir={tmp_path}"
     code, out, _ = call(monkeypatch, capsys, "train", "sweep=table4", "seed=1", "dry_run=true", there)
     assert code == 0
@@ -261,6 +296,8 @@ def test_a_named_sweep_needs_no_flag(monkeypatch, capsys, tmp_path):
 
 
 def test_tables_share_runs_and_take_other_data(sweep):
+    """A run that two tables need must have one hash, and data of the command line another."""
+
     def names(*overrides):
         code, out, err = sweep("dry_run=true", "seed=1", *overrides)
         assert code == 0, err
@@ -274,9 +311,9 @@ def test_tables_share_runs_and_take_other_data(sweep):
 
 
 def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tmp_path):
-    """Lightning starts the command line again for its other processes: it must be this job's."""
+    """Lightning repeats the command line for its other processes, which must be that of this job."""
     started = {}
-    finish(tmp_path, {"seed": 1}, 31.0)
+    write_finished_run(tmp_path, {"seed": 1}, 31.0)
 
     def fake(command, env, check):
         started.update(command=command, env=env)
@@ -287,7 +324,7 @@ def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tm
     monkeypatch.setattr(HydraConfig.instance(), "cfg", cfg)
     monkeypatch.setattr(job.subprocess, "run", fake)
     assert job.needs_own_process({"trainer": {"devices": 2}})
-    assert job.work_in_own_process(Run(tmp_path)) == 31.0
+    assert job.train_in_own_process(RunDirectory(tmp_path)) == 31.0
     assert started["command"][2:] == [
         "ghgs_lit",
         "train",
@@ -302,8 +339,10 @@ def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tm
 
 
 def test_hash_ignores_only_what_no_number_depends_on():
+    """Two different runs must never share a directory."""
     base = {"seed": 1, "resume": None, "data": {"root": "a", "workers": 0}, "logger": {"csv": {}}}
     same = {"seed": 1, "resume": "x", "data": {"root": "a", "workers": 4}, "logger": {}}
     assert config_hash(base) == config_hash(same)
     assert config_hash(base) != config_hash({**base, "data": {"root": "b", "workers": 0}})
+    assert config_hash(base) == config_hash(dict(reversed(base.items())))
     assert json.loads(json.dumps(base)) == base

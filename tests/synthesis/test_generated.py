@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ghgs_lit.config import build, conf_dir
+from ghgs_lit.config import build, compose
 from ghgs_lit.data.sampling import (
     TargetProtocol,
     subject_rng,
@@ -13,15 +13,8 @@ from ghgs_lit.synthesis import ScansDataModule, SyntheticDataModule, people
 from tests.helpers.people import RELEASE, RIG, V4, box_person, equal
 
 
-def compose(*overrides):
-    import hydra
-
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose("prepare", overrides=list(overrides))
-
-
 def built(*overrides, **extra):
-    cfg = compose(*overrides)
+    cfg = compose("prepare", overrides)
     return build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed, **extra)
 
 

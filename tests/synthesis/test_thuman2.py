@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from ghgs_lit.config import build
+from ghgs_lit.config import build, compose
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.overlap import overlap
 from ghgs_lit.data.sampling import subject_rng
@@ -276,14 +276,7 @@ def test_ranges_of_ids():
 
 
 def composed(name, root, *overrides):
-    import hydra
-
-    from ghgs_lit.config import conf_dir
-
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = hydra.compose(
-            "train", [f"experiment={name}", f"data.root={root}", "data.workers=0", *overrides]
-        )
+    cfg = compose("train", [f"experiment={name}", f"data.root={root}", "data.workers=0", *overrides])
     return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed), cfg
 
 

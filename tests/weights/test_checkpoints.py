@@ -1,4 +1,4 @@
-"""Checkpoints rebuild their models; what does not fit is refused by name."""
+"""Checkpoints rebuild their models; files that do not fit are refused by name."""
 
 import os
 import pickle
@@ -9,9 +9,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from ghgs_lit.config import legacy
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import FORMAT_VERSION, GHGS
+from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import make_batch
 
@@ -29,6 +31,7 @@ def checkpoint(path, **changes):
 
 
 def test_a_checkpoint_rebuilds_its_model(tmp_path):
+    """A checkpoint alone must give the same Gaussians, without any YAML."""
     model = checkpoint(tmp_path / "a.ckpt").eval()
     loaded = GHGS.from_checkpoint(tmp_path / "a.ckpt")
     assert not loaded.training
@@ -38,6 +41,7 @@ def test_a_checkpoint_rebuilds_its_model(tmp_path):
 
 
 def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
+    """Weights of another model must not load in part."""
     path = tmp_path / "a.ckpt"
     checkpoint(path, config=config("gaussian_head.hidden=[64,32]"))
     with pytest.raises(
@@ -49,8 +53,19 @@ def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
         GHGS.from_checkpoint(path)
 
 
+def test_a_checkpoint_of_an_earlier_version_loads(tmp_path, monkeypatch):
+    """Renamed keys must not make earlier checkpoints useless."""
+    monkeypatch.setitem(legacy.KEYS, "spaces.old_name", "recalibration.k")
+    model, old = make_model(), config()
+    old["spaces"] = {"old_name": old["recalibration"].pop("k")}
+    checkpoint(tmp_path / "a.ckpt", config=old, format_version=1)
+    assert read_checkpoint(tmp_path / "a.ckpt")["config"]["recalibration"] == config()["recalibration"]
+    state = GHGS.from_checkpoint(tmp_path / "a.ckpt").state_dict()
+    assert all(torch.equal(state[name], value) for name, value in model.state_dict().items())
+
+
 class Foreign:
-    """Pickles as code to be called."""
+    """An object whose pickle calls a function."""
 
     def __reduce__(self):
         return os.system, ("false",)
@@ -68,6 +83,7 @@ class Foreign:
     ],
 )
 def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
+    """A file without the keys of a checkpoint must be named, not end in a KeyError."""
     path = tmp_path / "b.ckpt"
     checkpoint(path, **changes)
     with pytest.raises(InputError, match=message) as error:
@@ -107,7 +123,7 @@ def changed_state(change):
 
 TOKEN = "model.encoder.aggregator.camera_token"
 
-#: name: (content, what the one line must say); docs/weights.md has the whole lines.
+#: name: (content, part of the message); docs/weights.md lists the messages.
 BAD_FILES = {
     "empty": (lambda _: b"", "found an empty file"),
     "web page": (lambda _: b"<!DOCTYPE html><html><title>Sign in</title>", "found a web page"),
@@ -140,6 +156,7 @@ BAD_FILES = {
 
 @pytest.mark.parametrize("name", BAD_FILES)
 def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
+    """Failed downloads and pickled code must be explained, and never be executed."""
     make, message = BAD_FILES[name]
     path = tmp_path / "bad.ckpt"
     path.write_bytes(make(tmp_path))
@@ -154,15 +171,16 @@ def test_every_bad_file_is_answered_by_one_line(tmp_path, name):
     assert "\n" not in text
 
 
-def test_what_is_no_file_is_refused(tmp_path):
+def test_a_path_without_a_file_is_refused(tmp_path):
+    """A wrong path must be named in one line."""
     with pytest.raises(FileNotFoundError, match=r"c\.ckpt: expected a file of weights; found none"):
         GHGS.from_checkpoint(tmp_path / "c.ckpt")
     with pytest.raises(InputError, match="found a directory"):
         GHGS.from_checkpoint(tmp_path)
 
 
-def test_weights_are_mapped_and_may_be_trained_all_the_same(tmp_path):
-    """Nothing is copied on loading; training writes to memory, never to the file."""
+def test_weights_are_mapped_and_can_be_trained(tmp_path):
+    """Loading must not copy 4 GB, and training must not write to the mapped file."""
     path = tmp_path / "a.ckpt"
     checkpoint(path)
     before = path.read_bytes()
@@ -181,7 +199,7 @@ def test_weights_are_mapped_and_may_be_trained_all_the_same(tmp_path):
 
 @pytest.mark.parametrize("trainable", ["none", "last_1", "last_2", "all"])
 def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
-    """Gradients where they should be, none elsewhere, and an optimizer of these parameters alone."""
+    """``encoder.trainable`` must decide which parameters get gradients and are in the optimizer."""
     path = tmp_path / "a.ckpt"
     checkpoint(path, config=config(f"encoder.trainable={trainable}"))
     model = GHGS.from_checkpoint(path).train()

@@ -1,4 +1,4 @@
-"""The hub's client is stood in for: progress, resume and cache are its own; checks and answers are ours."""
+"""Downloads with a replacement of the hub's client: checks and error messages are this project's."""
 
 import hashlib
 import sys
@@ -13,7 +13,7 @@ from ghgs_lit.weights import hub
 ADDRESS = "https://hub.test/facebook/VGGT-1B/resolve/main/model.safetensors"
 
 
-def stand_in(monkeypatch, cached=None, download=None, offline=False):
+def fake_client(monkeypatch, cached=None, download=None, offline=False):
     """A client whose cache holds ``cached`` and whose download is ``download``."""
     client = types.ModuleType("huggingface_hub")
     client.constants = types.SimpleNamespace(HF_HUB_OFFLINE=offline)
@@ -53,10 +53,12 @@ def cached_file(folder, content, name=None):
     ],
 )
 def test_repositories_are_told_from_files(name, expected):
+    """A file name must not be looked up on the hub, nor a repository on the disk."""
     assert hub.is_repository(name) is expected
 
 
 def test_a_file_that_exists_is_a_file(tmp_path, monkeypatch):
+    """A local file that is named like a repository must be preferred."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "facebook").mkdir()
     (tmp_path / "facebook" / "VGGT-1B").write_bytes(b"x")
@@ -64,17 +66,19 @@ def test_a_file_that_exists_is_a_file(tmp_path, monkeypatch):
 
 
 def test_a_cached_file_needs_no_network(monkeypatch, tmp_path):
+    """Weights that were downloaded once must work offline."""
     path = cached_file(tmp_path, b"weights")
-    stand_in(monkeypatch, cached=path, offline=True)
+    fake_client(monkeypatch, cached=path, offline=True)
     found, checksum = hub.fetch("facebook/VGGT-1B")
     assert str(found) == path
     assert checksum == hashlib.sha256(b"weights").hexdigest()
 
 
 def test_a_download_is_checked(monkeypatch, tmp_path):
+    """A broken download must not become a checkpoint."""
     monkeypatch.setattr(hub.urllib.request, "urlopen", lambda *_, **__: types.SimpleNamespace(close=int))
     broken = cached_file(tmp_path, b"half of the wei", name="0" * 64)
-    stand_in(monkeypatch, download=lambda *_: broken)
+    fake_client(monkeypatch, download=lambda *_: broken)
     with pytest.raises(InputError, match=r"0{64}: expected SHA-256 0{64}; found \w{64}: a broken download"):
         hub.fetch("facebook/VGGT-1B")
 
@@ -89,28 +93,30 @@ def test_a_download_is_checked(monkeypatch, tmp_path):
     ],
 )
 def test_without_a_network_it_says_at_once_what_to_fetch(monkeypatch, error, offline, reason):
-    """Not after the client's half a minute of tries."""
-    stand_in(monkeypatch, offline=offline)
+    """The client itself would try for half a minute before it fails."""
+    fake_client(monkeypatch, offline=offline)
     unreachable(monkeypatch, error)
     with pytest.raises(InputError, match=reason) as caught:
         hub.fetch("facebook/VGGT-1B")
     text = str(caught.value)
-    assert f"Fetch {ADDRESS} by hand and say vggt=<that file>" in text
+    assert f"Download {ADDRESS} by hand and set vggt=<that file>" in text
     assert "\n" not in text
 
 
 def test_what_the_hub_refuses_is_one_line(monkeypatch):
+    """The client's long answer must become one line with the address."""
     unreachable(monkeypatch, urllib.error.HTTPError(ADDRESS, 404, "not found", {}, None))
 
     def refuse(*_):
         raise RuntimeError("Repository Not Found.\nMake sure that you are logged in.")
 
-    stand_in(monkeypatch, download=refuse)
+    fake_client(monkeypatch, download=refuse)
     with pytest.raises(InputError, match=r"expected https://hub\.test.*; found: Repository Not Found\.$"):
         hub.fetch("facebook/VGGT-1B")
 
 
 def test_without_the_package_it_names_the_extra_and_the_file(monkeypatch):
+    """Without the optional package the user needs its name, or the address of the file."""
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(InputError, match=r"ghgs-lit\[hub\].*resolve/main/model\.safetensors by hand"):
         hub.fetch("facebook/VGGT-1B")

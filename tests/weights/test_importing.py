@@ -1,4 +1,4 @@
-"""Published weights come in strictly, run, and go out again as they were."""
+"""Published weights are imported strictly, run, and are exported unchanged."""
 
 import re
 
@@ -9,16 +9,25 @@ from safetensors.torch import load_file, save_file
 
 from ghgs_lit.cli import main as cli
 from ghgs_lit.errors import InputError
-from ghgs_lit.model import GHGS, STAGES, read_checkpoint
+from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.training import start
 from ghgs_lit.weights import importing, names
+from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.exporting import export_weights
-from ghgs_lit.weights.importing import Source, assign, import_weights
+from ghgs_lit.weights.importing import Source, match_files
 from ghgs_lit.weights.reading import cast
 from ghgs_lit.weights.switches import differences
 from tests.helpers.models import close
 from tests.helpers.scenes import make_batch
-from tests.helpers.weights import OTHER_HEADS, PUBLISHED, TINY, config, published_tensors, write_published
+from tests.helpers.weights import (
+    OTHER_HEADS,
+    PUBLISHED,
+    TINY,
+    config,
+    import_weights,
+    published_tensors,
+    write_published,
+)
 
 
 @pytest.fixture
@@ -33,7 +42,7 @@ def meta(shapes, prefix=""):
 
 @pytest.mark.parametrize("prefix", ["", "aggregator."])
 def test_the_published_names_and_shapes_are_exactly_the_models(monkeypatch, prefix):
-    """Every published tensor has one place in the full-size model, and every place its tensor."""
+    """The published files must fill the full-size model exactly, tensor by tensor."""
     contents = {
         "vggt": meta(PUBLISHED["vggt"], prefix) | meta(OTHER_HEADS),
         "release": {"network": meta(PUBLISHED["network"]), "total_steps": 1},
@@ -45,7 +54,7 @@ def test_the_published_names_and_shapes_are_exactly_the_models(monkeypatch, pref
     ]
     own = GHGS.from_config(config(tiny=False), empty=STAGES).state_dict()
     assert all(tensor.is_meta for tensor in own.values())
-    assert assign(own, files, fresh=()) == []
+    assert match_files(own, files) == []
     assert [len(source.used) for source in files] == [1210, 164]
     assert sum(own[name].numel() for name in files[0].used) == 909_112_320
     assert sum(own[name].numel() for name in files[1].used) == 77_942_669
@@ -56,6 +65,7 @@ def test_the_published_names_and_shapes_are_exactly_the_models(monkeypatch, pref
 
 @pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
 def test_import_and_export_give_the_same_tensors_back(tmp_path, suffix):
+    """A tensor that is renamed wrongly, changed or lost would show here."""
     (vggt, release), (agg, network) = write_published(tmp_path, suffix)
     out = tmp_path / "out.ckpt"
     report = import_weights(config(), out, str(vggt), str(release))
@@ -74,6 +84,7 @@ def test_import_and_export_give_the_same_tensors_back(tmp_path, suffix):
 
 
 def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
+    """The imported model must compute with the published tensors, and record their origin."""
     vggt, release, agg, network = files
     out = tmp_path / "out.ckpt"
     import_weights(config(), out, vggt, release)
@@ -93,13 +104,14 @@ def test_the_checkpoint_is_the_published_model_and_says_so(tmp_path, files):
         close(model(batch).gaussians, expected(batch).gaussians, 0)
 
 
-def test_without_the_release_heads_start_afresh(tmp_path, files):
+def test_without_the_release_heads_start_with_initial_values(tmp_path, files):
+    """VGGT alone must give a trainable model, with repeatable heads."""
     vggt, _, agg, _ = files
     out = tmp_path / "out.ckpt"
     settings = config("compat=none")
     torch.manual_seed(5)
     report = import_weights(settings, out, vggt)
-    assert "start afresh" in report[-1]
+    assert "start with initial values" in report[-1]
     model = GHGS.from_checkpoint(out)
     torch.manual_seed(5)
     again = import_weights(settings, tmp_path / "again.ckpt", vggt)
@@ -112,6 +124,7 @@ def test_without_the_release_heads_start_afresh(tmp_path, files):
 
 
 def test_the_depth_head_can_start_from_vggts(tmp_path, files):
+    """The option must take VGGT's tensors, but not its last projection, which has another meaning."""
     vggt, _, agg, _ = files
     out = tmp_path / "out.ckpt"
     report = import_weights(config("compat=none"), out, vggt, depth_head="vggt")
@@ -123,6 +136,7 @@ def test_the_depth_head_can_start_from_vggts(tmp_path, files):
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
 def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
+    """Half precision must reach the encoder alone, and stay close to the float32 model."""
     vggt, release, agg, _ = files
     out = tmp_path / "out.ckpt"
     import_weights(config(), out, vggt, release, dtype)
@@ -145,7 +159,8 @@ def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
     assert (inverse[0] - inverse[1]).abs().max() < 0.05 * inverse[1].abs().max()
 
 
-def test_conversion_maps_the_file_anew_and_keeps_what_fits(monkeypatch, tmp_path):
+def test_conversion_maps_the_file_again_and_keeps_what_fits(monkeypatch, tmp_path):
+    """Without closing the file between chunks a conversion would hold two copies of the weights."""
     monkeypatch.setattr("ghgs_lit.weights.reading._CHUNK", 3000)
     tensors = {f"a{i}": torch.randn(16, 16) for i in range(8)} | {"b": torch.randn(3)}
     opened = []
@@ -197,6 +212,7 @@ def tampered(files, tmp_path, change):
     ],
 )
 def test_a_tensor_that_does_not_fit_is_named(tmp_path, files, change, message):
+    """A damaged release must be refused by tensor, and leave no checkpoint."""
     release = tampered(files, tmp_path, change)
     with pytest.raises(InputError, match=r"release\.pth: " + message):
         import_weights(config(), tmp_path / "out.ckpt", files[0], release)
@@ -204,6 +220,7 @@ def test_a_tensor_that_does_not_fit_is_named(tmp_path, files, change, message):
 
 
 def test_a_tensor_that_comes_twice_is_refused(tmp_path, files):
+    """With two tensors for one place it would be unclear which one is used."""
     vggt = dict(files[2])
     vggt["camera_token"] = vggt["aggregator.camera_token"]
     save_file({name: tensor.clone() for name, tensor in vggt.items()}, tmp_path / "twice.safetensors")
@@ -212,6 +229,7 @@ def test_a_tensor_that_comes_twice_is_refused(tmp_path, files):
 
 
 def test_files_in_the_wrong_place_are_refused(tmp_path, files):
+    """Exchanged files, missing ones, and overwriting the input must be refused."""
     vggt, release, *_ = files
     with pytest.raises(InputError, match=r"release\.pth: network: expected a tensor of VGGT-1B"):
         import_weights(config(), tmp_path / "out.ckpt", release, None)
@@ -226,6 +244,7 @@ def test_files_in_the_wrong_place_are_refused(tmp_path, files):
 
 
 def test_our_own_variants_have_no_published_names(tmp_path, files):
+    """A model that the authors' code cannot load must not be exported to it."""
     vggt, *_ = files
     out = tmp_path / "out.ckpt"
     import_weights(config("compat=none", "gaussian_head.guide=true"), out, vggt)
@@ -251,12 +270,13 @@ def command(monkeypatch, capsys, *argv):
 
 
 def test_the_verbs(monkeypatch, capsys, tmp_path, files):
+    """The command line must pass its keys on, print paths last, and answer errors in one line."""
     monkeypatch.chdir(tmp_path)
     code, out, _ = command(
         monkeypatch, capsys, "import", "vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY
     )
     assert code == 0
-    assert "not as the release computes" not in out
+    assert "differs from the release" not in out
     assert out.splitlines()[-1] == "wrote a/out.ckpt"
     code, out, _ = command(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
     assert code == 0
@@ -271,7 +291,8 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
         assert len(err.strip().splitlines()) == 1
 
 
-def test_switches_that_differ_from_the_releases_are_told():
+def test_switches_that_differ_from_the_releases_are_listed():
+    """Users must learn which parts of a model differ from the authors' code."""
     assert differences(config()) == []
     found = differences(config("points.tokens=subject"))
     assert found == ["points.tokens=subject for release"]
@@ -280,7 +301,7 @@ def test_switches_that_differ_from_the_releases_are_told():
 
 
 def test_tiny_files_have_the_published_structure():
-    """The tests' small files miss nothing that the published ones have, numbers of blocks aside."""
+    """The small files of these tests must have the structure of the published ones, but for their size."""
     vggt, network = published_tensors()
 
     def kinds(tensors):
@@ -292,7 +313,7 @@ def test_tiny_files_have_the_published_structure():
 
 
 def test_training_from_imported_weights_says_where_they_come_from(tmp_path, files):
-    """Tables read ``encoder.weights``: it follows the encoder's tensors, if all of them come along."""
+    """Tables read ``encoder.weights``, so it must follow the encoder's tensors if all of them are loaded."""
     out = str(tmp_path / "out.ckpt")
     settings = config("compat=none", "encoder.trainable=last_1")
     import_weights(settings, out, files[0])

@@ -1,0 +1,37 @@
+"""Composes the configuration of a verb, and turns a composed one into plain data."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, OmegaConf
+
+from ghgs_lit.config.paths import conf_dir
+from ghgs_lit.errors import InputError, require
+
+
+def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
+    """The configuration ``conf/<verb>.yaml`` after ``overrides``, as ``ghgs <verb>`` composes it.
+
+    Args:
+        verb: a verb of the command line, such as ``train``.
+        overrides: as on the command line (``key=value``, ``group=option``).
+        with_hydra: whether to keep the node ``hydra``.
+    """
+    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
+
+
+def resolve(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as plain data, interpolations resolved.
+
+    Raises:
+        InputError: a value is missing, or the seed is impossible.
+    """
+    missing = sorted(OmegaConf.missing_keys(cfg))
+    if missing:
+        raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
+    data = OmegaConf.to_container(cfg, resolve=True)
+    seed = data.get("seed", 0)
+    require(isinstance(seed, int) and 0 <= seed < 2**32, "seed", "an integer from 0 to 4294967295", seed)
+    return data

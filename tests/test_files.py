@@ -1,0 +1,97 @@
+"""Files that several processes share: whole or absent, and locks that end with their process."""
+
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from ghgs_lit.files import is_locked, lock, lock_owner, write_atomically, write_text_atomically
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_failing_writer_leaves_the_old_file_or_none(tmp_path):
+    """A run that dies in a write must neither lose the last checkpoint nor leave half of a new one."""
+
+    def fail(temporary):
+        temporary.write_text("half")
+        raise OSError("disk full")
+
+    path = tmp_path / "new" / "a.json"
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, fail)
+    assert names(path.parent) == []
+    write_text_atomically(path, "old")
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, fail)
+    assert path.read_text() == "old"
+    assert names(path.parent) == ["a.json"]
+
+
+def test_leftovers_of_dead_processes_are_removed_and_no_others(tmp_path):
+    """Killed runs must not fill the disk; a process that is still writing must not lose its file."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    host = socket.gethostname()
+    kept = {f".a.ckpt.{host}.{os.getppid()}.tmp", f".a.ckpt.elsewhere.{dead.pid}.tmp", "b.ckpt"}
+    for name in (f".a.ckpt.{host}.{dead.pid}.tmp", *kept):
+        (tmp_path / name).write_text("half")
+    write_text_atomically(tmp_path / "a.ckpt", "whole")
+    assert names(tmp_path) == sorted({*kept, "a.ckpt"})
+
+
+def write_often(path, letter):
+    for _ in range(200):
+        write_text_atomically(path, letter * 10_000)
+
+
+def test_two_processes_write_one_file_and_readers_see_whole_ones(tmp_path):
+    """Two processes of one sweep write the same plan: a reader must never see a mixture."""
+    path = tmp_path / "plan"
+    writers = [SPAWN.Process(target=write_often, args=(path, letter)) for letter in "ab"]
+    for writer in writers:
+        writer.start()
+    seen = set()
+    while any(writer.is_alive() for writer in writers):
+        if path.exists():
+            seen.add(path.read_text())
+    assert all(writer.exitcode == 0 for writer in writers)
+    assert {path.read_text(), *seen} <= {"a" * 10_000, "b" * 10_000}
+    assert names(tmp_path) == ["plan"]
+
+
+def hold_lock(path, ready):
+    with lock(path) as locked:
+        assert locked
+        ready.set()
+        signal.pause()
+
+
+def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
+    """Two processes must not work on one run, and a killed one must not block it."""
+    path, ready = tmp_path / "folder" / "lock", SPAWN.Event()
+    assert not is_locked(path)
+    holder = SPAWN.Process(target=hold_lock, args=(path, ready))
+    holder.start()
+    assert ready.wait(60)
+    assert is_locked(path)
+    assert lock_owner(path) == f"process {holder.pid} on {socket.gethostname()}"
+    with lock(path) as locked:
+        assert not locked
+    holder.kill()
+    with lock(path, wait=True) as locked:
+        assert locked
+        assert is_locked(path)
+        with lock(path, wait=True) as again:  # waiting for itself would never end
+            assert not again
+        assert is_locked(path)
+    holder.join()
+    assert not is_locked(path)
