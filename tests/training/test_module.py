@@ -107,7 +107,7 @@ def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
     path = tmp_path / "a" / "checkpoints" / "last.ckpt"
     content = torch.load(path, weights_only=True)
     assert content["config"] == CONFIG
-    assert content["format_version"] == 1
+    assert content["format_version"] == FORMAT_VERSION
     assert content["global_step"] == 12
     assert set(content["state_dict"]) == {"model.depth", "model.shift"}
     assert "hyper_parameters" not in content
