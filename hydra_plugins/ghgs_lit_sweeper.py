@@ -1,4 +1,4 @@
-"""Hydra finds sweepers in ``hydra_plugins`` only; what this one does stands in ``ghgs_lit.runs.grid``."""
+"""The sweeper's class, which Hydra finds only in ``hydra_plugins``; ``ghgs_lit.runs.grid`` does the work."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ from hydra._internal.core_plugins import basic_sweeper
 
 
 class GridSweeper(basic_sweeper.BasicSweeper):
-    """Every combination of values once, without what is done; comes back to what others worked on."""
+    """Runs every combination of values once, and skips runs that are done."""
 
     def sweep(self, arguments: list[str]) -> Any:
         from ghgs_lit.runs.grid import sweep  # Hydra imports its plugins for every application

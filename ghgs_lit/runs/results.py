@@ -94,7 +94,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``; its configurations come back in today's keys.
+    """Read a ``metrics.json``; its configurations are returned in today's keys.
 
     Raises:
         InputError: the file is not a whole ``metrics.json``; the message names it.

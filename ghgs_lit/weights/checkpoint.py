@@ -21,7 +21,7 @@ STATE_PREFIX = "model."
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a checkpoint of this package; its configuration comes back in today's keys.
+    """Read a checkpoint of this package; its configuration is returned in today's keys.
 
     Args:
         path: the file; its tensors are mapped from the disk, not read.

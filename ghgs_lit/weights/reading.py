@@ -120,8 +120,8 @@ def cast(
     """
     tensors = open_tensors()
     names = list(tensors)
-    wanted = {name: dtype_of(name, tensor.dtype) for name, tensor in tensors.items()}
-    changed = [name for name in names if tensors[name].dtype != wanted[name]]
+    target = {name: dtype_of(name, tensor.dtype) for name, tensor in tensors.items()}
+    changed = [name for name in names if tensors[name].dtype != target[name]]
     result: dict[str, Tensor] = {}
     used = 0
     for name in changed:
@@ -129,7 +129,7 @@ def cast(
             tensors, used = {}, 0
             tensors = open_tensors()
         used += tensors[name].nbytes
-        result[name] = tensors[name].to(wanted[name])
+        result[name] = tensors[name].to(target[name])
     tensors = {}
     if len(result) < len(names):
         tensors = open_tensors()

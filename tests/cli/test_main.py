@@ -4,8 +4,11 @@ import importlib
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
 
 from ghgs_lit.cli import main as cli
+from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import conf_dir
 
 
@@ -95,3 +98,14 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     monkeypatch.setattr(cli.importlib, "import_module", lambda name: Module)
     cli.Verb("train", ("ghgs", "train", "seed=1"))(None)
     assert seen["argv"] == ["ghgs", "train", "seed=1"]
+
+
+def test_a_verb_prints_the_path_of_its_configuration_and_on_request_all_of_it(monkeypatch, capsys, tmp_path):
+    """A sweep of many runs must not print thousands of lines of configuration; the file has it all."""
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
+    config = {"print_config": False, "optimizer": {"lr": 0.25}}
+    write_config(config, tmp_path)
+    assert capsys.readouterr().out == f"config: {tmp_path / 'config.yaml'} (no overrides)\n"
+    assert OmegaConf.load(tmp_path / "config.yaml") == config
+    write_config({**config, "print_config": True}, tmp_path)
+    assert "lr: 0.25" in capsys.readouterr().out

@@ -52,7 +52,7 @@ def cached_file(folder, content, name=None):
         ("a/b/c", False),
     ],
 )
-def test_repositories_are_told_from_files(name, expected):
+def test_repositories_and_files_are_distinguished(name, expected):
     """A file name must not be looked up on the hub, nor a repository on the disk."""
     assert hub.is_repository(name) is expected
 
