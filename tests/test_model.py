@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 import ghgs_lit
+from ghgs_lit.bounds import NoBounds, SubjectBox
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.geometry.unprojection import Unprojection
@@ -15,7 +16,7 @@ from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.model import GHGS, check_batch
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.types import Batch, Cameras, Tokens
+from ghgs_lit.types import Batch, Cameras, DepthBounds, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import CASES, fixture, make_batch
@@ -41,18 +42,19 @@ class GivenTokens(nn.Module):
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         self.tokens = Tokens(latent, inputs["dino"].flatten(0, 1), image, row, column, (1, 3, 5, 5), 14)
 
-    def forward(self, images, masks, interval):
+    def forward(self, images, masks, bounds, cache):
         return self.tokens
 
 
 def release_model(inputs, dtype):
     dpt = {"features": 16, "out_channels": [16, 20, 24, 32]}
     model = GHGS(
+        NoBounds(),
         GivenTokens(inputs),
-        DepthHead(64, dpt, parameterization="inverse_linear", bounds="none"),
+        DepthHead(64, dpt, parameterization="inverse_linear"),
+        Unprojection("release", 3),
         Recalibration(64, k=8, similarity="product_clamped", tokens="all"),
         GaussianHead(64, dpt, parameterization="release"),
-        Unprojection("release", 3),
         pad="multiple",
     ).to(dtype)
     published = fixture("predict_gaussian_reduced", "state", dtype)
@@ -183,13 +185,15 @@ def test_an_ablation_wins_over_the_releases_values():
     cfg = config("compat=release", "ablation=no_semantic")
     assert cfg["recalibration"]["similarity"] == "none"
     assert cfg["recalibration"]["tokens"] == "all"
-    assert cfg["points"] == {"tokens": "release", "border": 3}
+    assert (cfg["unprojection"]["tokens"], cfg["unprojection"]["border"]) == ("release", 3)
 
 
 def test_named_models_choose_their_parts_and_the_command_line_wins():
-    assert config("model=hull")["depth_head"]["bounds"] == "hull"
-    assert config("model=paper")["depth_head"]["bounds"] == "box"
-    assert config("model=paper", "depth_head=hull")["depth_head"]["bounds"] == "hull"
+    assert config("model=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
+    assert config("model=paper")["bounds"]["_target_"] == "ghgs_lit.bounds.SubjectBox"
+    assert config("model=paper", "bounds=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
+    assert config("model=paper", "depth_head=hull")["depth_head"]["parameterization"] == "linear"
+    assert config("model=hull", "recalibration=paper")["recalibration"]["s_min"] == 0.01
 
 
 def test_order_of_later_views_does_not_matter():
@@ -213,11 +217,11 @@ def test_geometry_is_wide_under_autocast():
     expected = model(batch)
     assert prediction.depth.dtype == prediction.points.pixels.dtype == prediction.gaussians.means.dtype
     assert prediction.depth.dtype == torch.float32
-    assert torch.equal(prediction.depth_maps.near, expected.depth_maps.near)
+    assert torch.equal(prediction.depth_maps.bounds.near, expected.depth_maps.bounds.near)
     assert (prediction.depth - expected.depth).abs()[batch.masks].max() < 0.1
     again = Unprojection()(
         prediction.depth_maps,
-        model.encoder(batch.images, batch.masks, model.depth_head.interval(batch)),
+        model.encoder(batch.images, batch.masks, model.bounds(batch)),
         batch,
     )
     assert torch.equal(again.pixels, prediction.points.pixels)
@@ -263,10 +267,36 @@ def test_a_bad_batch_is_refused_by_name(message):
 def test_a_missing_stage_and_a_bad_value_name_their_key():
     with pytest.raises(InputError, match="gaussian_head: expected a stage"):
         GHGS.from_config({k: v for k, v in config().items() if k != "gaussian_head"})
-    with pytest.raises(InputError, match=r"depth_head\.bounds: expected one of box, hull"):
-        GHGS.from_config(config("depth_head.bounds=sphere"))
+    with pytest.raises(InputError, match=r"depth_head\.parameterization: expected one of bounded_inverse"):
+        GHGS.from_config(config("depth_head.parameterization=sphere"))
     with pytest.raises(InputError, match="recalibration"):
         GHGS.from_config(config("+recalibration.neighbours=3"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "found"),
+    [
+        (["model=paper", "bounds=none"], "NoBounds with bounded_inverse"),
+        (["model=hull", "depth_head.parameterization=inverse_linear"], "consistency_depths"),
+        (["model=paper", "depth_head.parameterization=inverse_linear"], "SubjectBox with inverse_linear"),
+        (
+            ["model=hull", "compat=release", "encoder.bounds_input=true"],
+            "encoder.bounds_input: expected false",
+        ),
+    ],
+)
+def test_bounds_that_do_not_fit_the_depths_are_refused(overrides, found):
+    """Depths between bounds that nobody computes would fail in the first forward pass only."""
+    with pytest.raises(InputError, match=found):
+        GHGS.from_config(config(*overrides))
+
+
+def test_an_unknown_precision_is_refused_when_it_is_set():
+    """A typing error must not wait for the first forward pass."""
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match="precision: expected one of inherit"):
+        model.precision = "half"
+    assert model.precision == "inherit"
 
 
 def test_importing_the_package_does_not_import_torch():
@@ -290,7 +320,7 @@ def test_windows_give_gaussians_of_the_same_pixels(size):
         assert torch.equal(getattr(part.gaussians, name), getattr(whole.gaussians, name)), name
     assert part.gaussians.splits == whole.gaussians.splits
     for name in ("near", "far"):
-        near = (getattr(prediction.depth_maps, name)[batch.masks] for prediction in (part, whole))
+        near = (getattr(prediction.depth_maps.bounds, name)[batch.masks] for prediction in (part, whole))
         assert torch.equal(*near)
     # Points of the pasted maps lie on the rays of their pixels in the whole photograph.
     camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
@@ -339,11 +369,13 @@ def test_padding_is_what_a_black_border_does_by_hand():
     masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))
     by_hand = Batch(border, masks, batch.cameras.cropped(-3, -3, 56, 70))
     model = make_model("model=paper", *PADS)
-    # The box is carved from the photographs: a border would say that nothing lies beyond them.
-    expected = model._predict(by_hand, tuple(
-        nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in model.depth_head.interval(batch)
-    ))  # fmt: skip
     found = model(batch)
+    # The box is carved from the photographs: a border would say that nothing lies beyond them.
+    bounds = model.bounds(batch)
+    near, far = (nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in (bounds.near, bounds.far))
+    model.bounds = lambda _: DepthBounds(near, far)
+    expected = model(by_hand)
+    model.bounds = SubjectBox()
     close(found.gaussians, expected.gaussians, 0)
     assert torch.equal(found.depth, expected.depth[..., 3:-3, 3:-3])
     assert torch.equal(found.points.tokens, expected.points.tokens)

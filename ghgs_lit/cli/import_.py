@@ -10,7 +10,7 @@ from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
 
 #: What a checkpoint says about its model; the rest is about this run.
-MODEL_NODES = (*STAGES, "points", "skip", "model", "compat", "ablation")
+MODEL_NODES = (*STAGES, "skip", "model", "compat", "ablation")
 
 
 def run(cfg: DictConfig) -> None:

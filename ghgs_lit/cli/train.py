@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir, plain, write_config
 from ghgs_lit.config import build
-from ghgs_lit.encoder import attach_cache
+from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.session import build_data, choices, measure_and_write, overrides
@@ -94,7 +94,7 @@ def train(config: dict[str, Any], directory: Path, notes: dict[str, Any]) -> flo
     L.seed_everything(config["seed"], workers=True, verbose=False)
     data = build_data(config)
     model = GHGS.from_config(config)
-    attach_cache(model, config.get("feature_cache"))
+    model.feature_cache = open_cache(config.get("feature_cache"), model.recalibration.tokens)
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")

@@ -14,9 +14,9 @@ from rich.table import Table
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.measure import Method, measure_all
-from ghgs_lit.model import read_checkpoint
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runs.results import Row, metric_names, summarize, write_results
+from ghgs_lit.weights.checkpoint import read_checkpoint
 
 # What is printed, with its decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}

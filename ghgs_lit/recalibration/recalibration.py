@@ -16,24 +16,27 @@ from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
 from ghgs_lit.types import Batch, Points, Tokens
 
-#: Cosines that are held at once.
+#: Cosines that are computed at once, at most.
 _SIMILARITIES = 1 << 21
 
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
 
 class Recalibration(nn.Module):
-    """One :class:`SemanticAttention` for all layers; neighbours and cosines are found once a forward.
+    """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward.
 
     Args:
         dim_latent: width of the tokens (from the encoder).
-        k: neighbours of a token, or as many as there are.
-        num_heads, similarity, s_min: see :class:`SemanticAttention`.
-        neighborhood: near in what: ``xyz``, the token points; ``image_plane``, token centres in units of the
-            image's longer side, shared by all views (the paper without unprojection); ``feature``, directions
-            of the semantic features.
+        k: neighbours of a token, or all there are if they are fewer.
+        num_heads: see :class:`SemanticAttention`.
+        similarity: see :class:`SemanticAttention`.
+        s_min: see :class:`SemanticAttention`.
+        neighborhood: where distances are measured: ``xyz``, between token points; ``image_plane``, between
+            token centres in units of the image's longer side, shared by all views (the paper without
+            unprojection); ``feature``, between directions of the semantic features.
         neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
-        tokens: ``subject``, tokens with a valid point; others pass unchanged. ``all``, the release's.
+        tokens: which tokens take part: ``subject``, those with a valid point, others pass unchanged; ``all``,
+            as in the release.
     """
 
     def __init__(
@@ -56,7 +59,13 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, num_heads, similarity, s_min)
 
     def forward(self, tokens: Tokens, points: Points, batch: Batch) -> Tokens:
-        """Tokens with recalibrated layers; the semantic features and the order stay."""
+        """Tokens with recalibrated layers; the semantic features and the order stay.
+
+        Args:
+            tokens: from the encoder.
+            points: of the same tokens.
+            batch: the number of elements and views is read.
+        """
         batch_size, views = batch.masks.shape[:2]
         takes_part = points.tokens_valid | (self.tokens == "all")
         chosen = takes_part.nonzero()[:, 0]
@@ -94,13 +103,13 @@ class Recalibration(nn.Module):
 def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Float[Tensor, "n k"]:
     """Cosines of the semantic features of tokens and their neighbours (Eq. 4), float32 or wider.
 
-    Features are normalised once, before they are picked; a feature of length 0 has cosine 0 to all.
+    Features are normalised once, before they are gathered; a feature of length 0 has cosine 0 to all.
     """
     with torch.autocast(semantic.device.type, enabled=False):
         semantic = at_least_float32(semantic)
         if cpu.is_supported(semantic, 1, neighbors.index.shape[1]):
             return cpu.cosines(semantic, neighbors.index)
-        # What stays is made first: behind freed features it would hold their memory.
+        # The result is allocated first: behind the freed features it would keep their memory in use.
         cosines = semantic.new_empty(neighbors.index.shape)
         unit = F.normalize(semantic, dim=-1, eps=1e-12)
         for rows in even_parts(len(unit), _SIMILARITIES // max(1, len(unit))):

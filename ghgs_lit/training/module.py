@@ -13,10 +13,10 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import PSNR, depth_error_mm
 from ghgs_lit.metrics.functional import ssim
-from ghgs_lit.model import FORMAT_VERSION
 from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
 
 class DivergedError(InputError):

@@ -7,8 +7,7 @@ from typing import Any
 from torch import nn
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.model import load_strictly, read_checkpoint
-from ghgs_lit.weights.checkpoint import model_state
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 from ghgs_lit.weights.switches import differences as differing_switches
 
 #: What may differ between a run and the one that it goes on from: where it writes, how far it goes.

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import open_file
@@ -36,7 +37,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     if not 1 <= version <= FORMAT_VERSION:
         newer = ", of a newer version of this package" if version > FORMAT_VERSION else ""
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
-    return checkpoint
+    return {**checkpoint, "config": upgrade(checkpoint["config"])}
 
 
 def _is_published(content: Any) -> bool:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.model import GHGS, HEADS, STAGES
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import require_shape, shape_of, summary, write_checkpoint
 from ghgs_lit.weights.hub import fetch, is_repository, sha256
@@ -122,7 +122,7 @@ def import_weights(
         same = Path(out).exists() and Path(out).samefile(source.path)
         require(not same, "out", f"another file than {source.key}", str(out))
     config = {**config, "encoder": {**config["encoder"], "weights": files[0].label}}
-    fresh = () if release is not None else STAGES[1:]
+    fresh = () if release is not None else HEADS
     own = GHGS.from_config(config, empty=[stage for stage in STAGES if stage not in fresh]).state_dict()
     started = assign(own, files, fresh)
 

@@ -1,8 +1,9 @@
-import dataclasses
+"""Depths: parameterizations, bounds, the dense head around them."""
 
 import pytest
 import torch
 
+from ghgs_lit.bounds import NoBounds, SubjectBox, VisualHull
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.unprojection import Unprojection, subject_tokens
@@ -25,8 +26,8 @@ def make_tokens(batch, dim=64, seed=0):
     return Tokens(latent, semantic, image, row, column, grid, PATCH)
 
 
-def predict(head, batch):
-    return head(make_tokens(batch), batch, head.interval(batch))
+def predict(head, batch, bounds=None):
+    return head(make_tokens(batch), batch, (bounds or SubjectBox())(batch))
 
 
 def make_head(**options):
@@ -121,11 +122,7 @@ def test_unprojection_of_kept_tokens_only():
     maps = DepthMaps(batch.depths, batch.masks, batch.depths)
     every = Unprojection()(maps, tokens, batch)
     keep = torch.arange(0, len(tokens.image), 3)
-    packed = dataclasses.replace(
-        tokens, image=tokens.image[keep], row=tokens.row[keep], column=tokens.column[keep],
-        latent=tuple(t[keep] for t in tokens.latent), semantic=tokens.semantic[keep],
-    )  # fmt: skip
-    assert torch.equal(Unprojection()(maps, packed, batch).tokens, every.tokens[keep])
+    assert torch.equal(Unprojection()(maps, tokens.select(keep), batch).tokens, every.tokens[keep])
 
 
 @pytest.mark.parametrize("name", list(BOUNDED))
@@ -147,12 +144,14 @@ def test_parameterizations_stay_in_bounds_and_keep_their_gradient(name):
     assert raw.grad[20] > 0.04
 
 
-@pytest.mark.parametrize("bounds", ["box", "hull"])
+@pytest.mark.parametrize("bounds", [SubjectBox(), VisualHull()])
 @pytest.mark.parametrize("name", list(BOUNDED))
-def test_head_starts_at_a_share_of_its_bounds(name, bounds):
+def test_head_starts_at_a_fraction_of_its_bounds(name, bounds):
     batch = make_batch(2, 3)
-    maps = predict(make_head(parameterization=name, bounds=bounds, start=0.4), batch)
-    torch.testing.assert_close(maps.depth, BOUNDED[name](torch.tensor(0.4), maps.near, maps.far))
+    maps = predict(make_head(parameterization=name, start=0.4), batch, bounds)
+    torch.testing.assert_close(
+        maps.depth, BOUNDED[name](torch.tensor(0.4), maps.bounds.near, maps.bounds.far)
+    )
     assert torch.equal(maps.valid, batch.masks)
     assert (maps.confidence >= 1).all()
     assert (maps.depth - batch.depths)[batch.masks].abs().mean() < 0.3
@@ -160,14 +159,14 @@ def test_head_starts_at_a_share_of_its_bounds(name, bounds):
 
 def test_depth_is_wide_under_autocast():
     batch = make_batch()
-    head, tokens = make_head(bounds="hull"), make_tokens(batch)
+    head, tokens, bounds = make_head(), make_tokens(batch), VisualHull()(batch)
     torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
-    expected = head(tokens, batch, head.interval(batch))
+    expected = head(tokens, batch, bounds)
     with torch.autocast("cpu", torch.bfloat16):
-        found = head(tokens, batch, head.interval(batch))
+        found = head(tokens, batch, bounds)
         points = Unprojection()(expected, tokens, batch)
-    assert found.depth.dtype == found.near.dtype == points.pixels.dtype == torch.float32
-    assert torch.equal(found.near, expected.near)
+    assert found.depth.dtype == found.bounds.near.dtype == points.pixels.dtype == torch.float32
+    assert torch.equal(found.bounds.near, expected.bounds.near)
     assert torch.equal(points.tokens, Unprojection()(expected, tokens, batch).tokens)
     assert (found.depth - expected.depth).abs().max() < 0.05
 
@@ -184,8 +183,8 @@ def test_values_that_are_not_finite_are_invalid_and_finite():
 
 def test_the_releases_parameterization_has_either_sign_and_no_bounds():
     batch = make_batch()
-    maps = predict(make_head(parameterization="inverse_linear", bounds="none"), batch)
-    assert maps.near is None
+    maps = predict(make_head(parameterization="inverse_linear"), batch, NoBounds())
+    assert maps.bounds is None
     values = torch.tensor([0.5, -0.5, 0.0])
     torch.testing.assert_close(inverse_linear(values), torch.tensor([2.0, -2.0, 1e8]))
 
@@ -201,11 +200,8 @@ def test_widths_follow_the_published_ones():
     ("options", "key"),
     [
         ({"parameterization": "linar"}, "depth_head.parameterization: expected one of bounded_inverse"),
-        ({"bounds": "sphere"}, "depth_head.bounds"),
-        ({"bounds": "none"}, "depth_head.bounds"),
-        ({"parameterization": "inverse_linear", "bounds": "box"}, "depth_head.bounds"),
+        ({"views": "some"}, "depth_head.views"),
         ({"start": 1.0}, "depth_head.start"),
-        ({"search": {"samples": 0}}, "depth_head.search.samples"),
     ],
 )
 def test_impossible_options_are_refused(options, key):
@@ -214,7 +210,7 @@ def test_impossible_options_are_refused(options, key):
 
 
 def test_impossible_token_points_are_refused():
-    with pytest.raises(InputError, match=r"points\.tokens"):
+    with pytest.raises(InputError, match=r"unprojection\.tokens"):
         Unprojection("center")
 
 

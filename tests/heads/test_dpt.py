@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.heads import dpt
 from ghgs_lit.heads.activations import split_activated, unit
 from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
 from ghgs_lit.heads.position import position_embedding
@@ -20,11 +21,6 @@ def _tokens(b=1, v=2, h=3, w=2, patch_size=14, width=16, dtype=torch.float32, se
     )
     latent = tuple(torch.randn(len(image), width, generator=g, dtype=dtype) for _ in range(4))
     return Tokens(latent, latent[0], image, row, column, (b, v, h, w), patch_size)
-
-
-def _select(tokens: Tokens, kept: torch.Tensor) -> Tokens:
-    packed = {name: getattr(tokens, name)[kept] for name in ("semantic", "image", "row", "column")}
-    return dataclasses.replace(tokens, latent=tuple(x[kept] for x in tokens.latent), **packed)
 
 
 def _head(seed=0, **options) -> DPTHead:
@@ -41,15 +37,21 @@ def test_any_patch_size_and_grid(patch_size, grid):
     assert raw.isfinite().all()
 
 
-def test_images_are_independent_and_steps_change_nothing():
-    head = _head(images_per_step=2).double()
+def test_images_are_independent_and_steps_change_nothing(monkeypatch):
+    head = _head().double()
     tokens = _tokens(v=5, dtype=torch.float64)
     together = head(tokens)
+    seen, decode = [], head._decode
+    monkeypatch.setattr(
+        head, "_decode", lambda levels, *rest: seen.append(len(levels[0])) or decode(levels, *rest)
+    )
+    monkeypatch.setattr(dpt, "_LARGEST", 2 * 4 * 42 * 28)  # two images of 4 channels
     with torch.no_grad():
         in_steps = head(tokens)
+    assert seen == [1, 2, 2]
     torch.testing.assert_close(in_steps, together, rtol=1e-12, atol=1e-12)
     kept = tokens.image == 3
-    one = _select(tokens, kept)
+    one = tokens.select(kept)
     one = dataclasses.replace(one, image=torch.zeros_like(one.image), grid=(1, 1, 3, 2))
     torch.testing.assert_close(head(one), together[3:4], rtol=1e-12, atol=1e-12)
 
@@ -59,7 +61,7 @@ def test_tokens_that_were_not_kept_are_blank():
     tokens = _tokens(h=4, w=4)
     kept = torch.ones(32, dtype=torch.bool)
     kept[[3, 17]] = False
-    fewer = _select(tokens, kept)
+    fewer = tokens.select(kept)
     levels = head._levels(fewer)
     for level, full in zip(levels, head._levels(tokens), strict=True):
         blank = (level == 0).all(dim=1).flatten()
@@ -167,7 +169,6 @@ def test_activations_are_wide():
         ({"features": 12}, "features: expected a multiple of 8; found 12"),
         ({"out_channels": (4, 8, 8)}, "out_channels: expected four multiples of 4"),
         ({"out_channels": (4, 8, 8, 10)}, "out_channels: expected four multiples of 4"),
-        ({"images_per_step": 0}, "images_per_step"),
     ],
 )
 def test_impossible_options_are_refused(options, message):

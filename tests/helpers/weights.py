@@ -33,7 +33,7 @@ def config(*overrides, tiny=True):
 def _composed(overrides):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         composed = compose("import", overrides=list(overrides))
-    return json.dumps({key: OmegaConf.to_container(composed[key]) for key in MODEL_NODES})
+    return json.dumps({key: OmegaConf.to_container(composed[key], resolve=True) for key in MODEL_NODES})
 
 
 def published_tensors(seed=0, **changes):
