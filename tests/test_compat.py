@@ -36,6 +36,7 @@ VERBS = [path.stem for path in CONF.glob("*.yaml") if "- compat:" in path.read_t
 
 @pytest.mark.parametrize(("key", "values"), QUIRKS.items())
 def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
+    """New training must not inherit the release's quirks, and each must be selectable alone."""
     group, name = key
     assert config("model=paper")[group][name] == values[0]
     assert config("model=paper", "compat=release")[group][name] == values[1]
@@ -49,6 +50,7 @@ def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
 
 @pytest.mark.parametrize("model", ["paper", "hull"])
 def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
+    """The authors' checkpoint must fit whatever `model` is chosen."""
     overrides = [f"model={model}", "compat=release"]
     state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=STAGES).state_dict()
     found = {
@@ -61,6 +63,7 @@ def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_releases_protocol_of_measuring_comes_with_it(verb):
+    """Numbers beside the release's must be measured as the release does."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = OmegaConf.to_container(compose(verb, overrides=["compat=release"]))
         chosen = OmegaConf.to_container(compose(verb, overrides=["compat=release", "metrics=correct"]))
@@ -90,6 +93,7 @@ def token_pixels(mode, border, size=512):
 
 
 def test_tokens_lie_at_the_true_centres_and_the_releases_where_it_puts_them():
+    """Token points must be right for ours and as shifted as the release's."""
     index = torch.arange(37) + 0.5
     v, u = torch.meshgrid(index, index, indexing="ij")
     grid = torch.stack((u, v), -1)
@@ -143,6 +147,7 @@ def test_a_fresh_model_of_the_release_may_look_behind_the_camera_and_ours_not():
 
 
 def test_background_tokens_take_part_by_a_switch():
+    """Background tokens must take part under recalibration.tokens=all only."""
     batch = make_batch(1, 3, 56, 56, zoom=0.4)
     touched = {}
     for tokens in ("subject", "all"):

@@ -1,3 +1,5 @@
+"""The whole model: numbers of the release, invariances, skipping, padding, refusals."""
+
 import dataclasses
 import functools
 import subprocess
@@ -64,6 +66,7 @@ def release_model(inputs, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_pipeline_matches_the_release(dtype):
+    """The whole pipeline must reproduce the numbers of the authors' code."""
     name = "predict_gaussian_reduced"
     inputs, expected = fixture(name, "in", dtype), fixture(name, "out64", torch.float64)
     extrinsics = torch.eye(4, dtype=dtype).repeat(1, 3, 1, 1)
@@ -98,6 +101,7 @@ def test_the_pipeline_matches_the_release(dtype):
 
 @pytest.mark.parametrize("model_name", ["paper", "hull"])
 def test_a_batch_of_two_equals_two_singles(model_name):
+    """A result must not depend on the other subjects of its batch."""
     batch = make_batch(2, 3)
     model = make_model(f"model={model_name}").eval()
     with torch.no_grad():
@@ -112,6 +116,7 @@ def test_a_batch_of_two_equals_two_singles(model_name):
     "overrides", [["model=paper"], ["model=hull"], ["compat=release"], ["model=hull", "skip=none"]]
 )
 def test_every_parameter_gets_a_finite_gradient(overrides):
+    """A parameter without a gradient would never be trained."""
     batch = make_batch(2, 3, 42, 56)
     model = make_model(*overrides)
     prediction = model(batch)
@@ -129,6 +134,7 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
 
 @pytest.mark.parametrize(("size", "views"), [((56, 56), 2), ((28, 70), 3), ((42, 28), 5)])
 def test_shapes(size, views):
+    """Any number of views and any shape must give complete maps."""
     batch = make_batch(1, views, *size)
     prediction = make_model()(batch)
     assert prediction.depth.shape == prediction.depth_valid.shape == batch.masks.shape
@@ -137,6 +143,7 @@ def test_shapes(size, views):
 
 
 def test_a_view_with_an_empty_mask_gives_no_gaussians():
+    """A view without the subject must give nothing, and no NaN."""
     batch = make_batch(1, 3)
     masks = batch.masks.clone()
     masks[0, 1] = False
@@ -146,6 +153,7 @@ def test_a_view_with_an_empty_mask_gives_no_gaussians():
 
 
 def test_skip_exact_gives_the_gaussians_of_skip_none():
+    """skip=exact promises the same Gaussians."""
     batch = make_batch(2, 3)
     batch.masks[0, 1] = False
     with torch.no_grad():
@@ -154,6 +162,7 @@ def test_skip_exact_gives_the_gaussians_of_skip_none():
 
 
 def test_views_without_the_subject_are_not_decoded():
+    """skip=exact must skip the work, except where all tokens need a depth."""
     batch = make_batch(2, 3)
     batch.masks[1, 0] = False
     model = make_model("skip=exact")
@@ -167,6 +176,7 @@ def test_views_without_the_subject_are_not_decoded():
 
 
 def test_ablations_differ_and_say_what_they_leave_out():
+    """An ablation that changes nothing would make a wrong table."""
     batch = make_batch(1, 3)
     outputs = {}
     for name in ("full", "no_unprojection", "no_semantic", "neither"):
@@ -182,6 +192,7 @@ def test_ablations_differ_and_say_what_they_leave_out():
 
 
 def test_an_ablation_wins_over_the_releases_values():
+    """Ablations of the release's model must take effect."""
     cfg = config("compat=release", "ablation=no_semantic")
     assert cfg["recalibration"]["similarity"] == "none"
     assert cfg["recalibration"]["tokens"] == "all"
@@ -189,6 +200,7 @@ def test_an_ablation_wins_over_the_releases_values():
 
 
 def test_named_models_choose_their_parts_and_the_command_line_wins():
+    """What is written on the command line must be what one gets."""
     assert config("model=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
     assert config("model=paper")["bounds"]["_target_"] == "ghgs_lit.bounds.SubjectBox"
     assert config("model=paper", "bounds=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
@@ -197,6 +209,7 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
 
 
 def test_order_of_later_views_does_not_matter():
+    """The order of the later views must not change the Gaussians."""
     batch = make_batch(1, 4)
     order = torch.tensor([0, 3, 1, 2])  # the encoder treats the first view apart
     swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])
@@ -210,6 +223,7 @@ def test_order_of_later_views_does_not_matter():
 
 
 def test_geometry_is_wide_under_autocast():
+    """Depths and points in half precision would be off by centimetres."""
     batch = make_batch(1, 3)
     model = make_model("model=hull")
     with torch.autocast("cpu", torch.bfloat16):
@@ -260,11 +274,13 @@ def bad_batches():
 
 @pytest.mark.parametrize("message", list(bad_batches()))
 def test_a_bad_batch_is_refused_by_name(message):
+    """Bad input must be refused with the name of the field."""
     with pytest.raises(InputError, match=message):
         check_batch(bad_batches()[message], 14)
 
 
 def test_a_missing_stage_and_a_bad_value_name_their_key():
+    """Errors of a configuration must start with the key."""
     with pytest.raises(InputError, match="gaussian_head: expected a stage"):
         GHGS.from_config({k: v for k, v in config().items() if k != "gaussian_head"})
     with pytest.raises(InputError, match=r"depth_head\.parameterization: expected one of bounded_inverse"):
@@ -300,6 +316,7 @@ def test_an_unknown_precision_is_refused_when_it_is_set():
 
 
 def test_importing_the_package_does_not_import_torch():
+    """`ghgs --help` must not wait for PyTorch."""
     code = (
         "import sys, ghgs_lit; assert 'torch' not in sys.modules; from ghgs_lit import GHGS, Batch, Gaussians"
     )
@@ -364,6 +381,7 @@ def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
 
 
 def test_padding_is_what_a_black_border_does_by_hand():
+    """model.pad must give exactly what a padded photograph gives."""
     batch = make_batch(1, 3, 50, 64)
     border = nn.functional.pad(batch.images, (3, 3, 3, 3))
     masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))

@@ -33,6 +33,7 @@ def inside(near, far, batch, slack=1e-4):
 @pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize(("views", "size"), [(2, (56, 56)), (3, (70, 42)), (4, (42, 56)), (5, (56, 56))])
 def test_true_depth_is_within_the_bounds(stage, views, size):
+    """Bounds that exclude the surface would make the true depth unreachable."""
     batch = make_batch(2, views, *size, spread=180.0 if views == 2 else 360.0)
     near, far = near_and_far(stage(), batch)
     assert near.shape == far.shape == batch.masks.shape
@@ -43,6 +44,7 @@ def test_true_depth_is_within_the_bounds(stage, views, size):
 
 @pytest.mark.parametrize("resolution", [30, 50, 160])
 def test_a_coarse_search_stays_conservative(resolution):
+    """A low resolution of the search may widen the bounds, never cut the subject off."""
     batch = make_batch(1, 4, 112, 112)
     near, far = near_and_far(VisualHull(resolution=resolution), batch)
     assert inside(near, far, batch) == 1
@@ -52,6 +54,7 @@ def test_a_coarse_search_stays_conservative(resolution):
 
 
 def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
+    """A hull as wide as the box would cost its time for nothing."""
     batch = make_batch(1, 5, 112, 112)
     lengths = {}
     for stage in STAGES:
@@ -62,6 +65,7 @@ def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
 
 
 def test_the_box_holds_the_subject_and_little_more():
+    """The carved box must neither cut the subject nor keep the empty space around it."""
     batch = make_batch(2, 4, 112, 112)
     lower, upper = subject_box(batch.masks, batch.cameras, radius=1)
     assert (lower <= CENTER - RADII).all()
@@ -71,6 +75,7 @@ def test_the_box_holds_the_subject_and_little_more():
 
 
 def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
+    """What lies outside a view's frame must not count as empty."""
     batch = make_batch(1, 4, 56, 56, zoom=1.6)
     assert batch.masks[:, :, 0].any(), "the head must touch the border in this test"
     for stage in STAGES:
@@ -79,6 +84,7 @@ def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_an_empty_mask_does_not_vote(stage):
+    """A view without the subject would otherwise carve everything away."""
     batch = make_batch(2, 3, 56, 56)
     masks = batch.masks.clone()
     masks[0, 1] = False
@@ -104,6 +110,7 @@ def test_an_empty_mask_does_not_vote(stage):
 
 
 def test_tolerance_outvotes_a_wrong_mask():
+    """One wrong mask must not cut off what the other views see."""
     batch = make_batch(1, 5, 56, 56)
     wrong = batch.masks.clone()
     wrong[0, 2, 20:] = False  # one view has lost everything below the head
@@ -116,6 +123,7 @@ def test_tolerance_outvotes_a_wrong_mask():
 
 
 def test_masks_that_contradict_one_another_fall_back_to_the_box():
+    """An empty hull must give finite bounds, not NaN."""
     batch = make_batch(1, 3, 56, 56)
     masks = torch.zeros_like(batch.masks)
     masks[0, 0, :6, :6] = masks[0, 1, -6:, -6:] = masks[0, 2, :6, -6:] = True
@@ -125,6 +133,7 @@ def test_masks_that_contradict_one_another_fall_back_to_the_box():
 
 
 def test_depths_in_a_box_end_on_its_faces():
+    """Entry and exit of a ray must lie on the box."""
     cameras = ring(2, 3, 28, 42)
     lower, upper = torch.tensor([[-0.3, 0.2, -0.4]] * 2), torch.tensor([[0.5, 1.6, 0.3]] * 2)
     bounds = depths_in_box(cameras, lower, upper)
@@ -137,6 +146,7 @@ def test_depths_in_a_box_end_on_its_faces():
 
 @pytest.mark.parametrize("radius", [0, 1, 3, 40])
 def test_dilation_is_a_maximum_over_a_square(radius):
+    """The fast dilation must equal its definition at every radius."""
     masks = torch.rand(2, 3, 17, 23, generator=torch.Generator().manual_seed(0)) > 0.97
     padded = F.pad(masks.float(), (radius,) * 4)
     expected = padded.unfold(-2, 2 * radius + 1, 1).unfold(-2, 2 * radius + 1, 1).amax((-1, -2)).bool()
@@ -145,6 +155,7 @@ def test_dilation_is_a_maximum_over_a_square(radius):
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
 def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
+    """Cameras in other units must not overflow into NaN bounds."""
     batch = make_batch(1, 3)
     cameras = batch.cameras
     for name, index in (("intrinsics", (..., [0, 1], [0, 1])), ("extrinsics", (..., slice(3), 3))):
@@ -159,6 +170,7 @@ def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
 
 
 def test_autocast_changes_nothing():
+    """Geometry in half precision would be off by centimetres."""
     batch = make_batch(1, 3)
     expected = near_and_far(VisualHull(), batch)
     with torch.autocast("cpu", torch.bfloat16):
@@ -167,6 +179,7 @@ def test_autocast_changes_nothing():
 
 
 def test_elements_of_a_batch_do_not_mix():
+    """A result must not depend on the other subjects of its batch."""
     batch = make_batch(2, 3)
     together = near_and_far(VisualHull(), batch)
     for b in range(2):

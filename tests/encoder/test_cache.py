@@ -37,6 +37,7 @@ def same(a, b):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
+    """A cached run must see exactly the tokens of an uncached one."""
     encoder = make().to(dtype)
     images, masks = views(b=2)
     expected = [encoder(images[b : b + 1], masks[b : b + 1]) for b in range(2)]
@@ -53,6 +54,7 @@ def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
 
 
 def test_the_subject_and_a_margin_are_kept(tmp_path):
+    """The kept tokens must be those at and around the subject, unchanged."""
     encoder = make()
     images, masks = views()
     everything = encoder(images, masks)
@@ -68,6 +70,7 @@ def test_the_subject_and_a_margin_are_kept(tmp_path):
 
 @pytest.mark.parametrize("change", ["weight", "image", "mask", "bounds", "option", "margin", "autocast"])
 def test_whatever_changes_the_tokens_misses(tmp_path, change):
+    """A hit for other weights or photographs would be a silent wrong result."""
     encoder = make(bounds_input=change == "bounds", mask_input=True)
     images, masks = views()
     depth = torch.ones_like(masks, dtype=torch.float32)
@@ -94,6 +97,7 @@ def test_whatever_changes_the_tokens_misses(tmp_path, change):
 
 
 def test_masks_that_nothing_reads_do_not_miss(tmp_path):
+    """A mask that has no influence must not make the cache encode again."""
     encoder = make()
     images, masks = views()
     cache = FeatureCache(tmp_path, tokens="all")
@@ -104,6 +108,7 @@ def test_masks_that_nothing_reads_do_not_miss(tmp_path):
 
 @pytest.mark.parametrize("left", [0, 7, 2000])
 def test_a_truncated_file_is_written_again(tmp_path, left, capsys):
+    """A file that a crash cut off must be replaced, with a message."""
     encoder = make()
     images, masks = views()
     cache = FeatureCache(tmp_path)
@@ -118,6 +123,7 @@ def test_a_truncated_file_is_written_again(tmp_path, left, capsys):
 
 
 def test_half_precision_files_give_the_same_twice(tmp_path):
+    """The first run must see the rounded tokens that later runs see."""
     encoder = make()
     images, masks = views()
     exact = encoder(images, masks)
@@ -137,6 +143,7 @@ def _work(directory, queue):
 
 
 def test_two_processes_share_a_directory(tmp_path):
+    """Runs of a sweep must not corrupt each other's files."""
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     workers = [context.Process(target=_work, args=(tmp_path, queue)) for _ in range(2)]
@@ -152,6 +159,7 @@ def test_two_processes_share_a_directory(tmp_path):
 
 
 def test_an_encoder_that_learns_is_refused(tmp_path):
+    """Tokens from disk carry no gradient: a trained encoder would not learn."""
     encoder, cache = make(trainable="last_1"), FeatureCache(tmp_path)
     with pytest.raises(InputError, match="feature_cache: expected a frozen encoder"):
         encoder(*views(), cache=cache)
@@ -161,6 +169,7 @@ def test_an_encoder_that_learns_is_refused(tmp_path):
 
 
 def test_the_report_says_how_much_there_is(tmp_path):
+    """The user must see whether the cache worked and what it takes on disk."""
     encoder, cache = make(), FeatureCache(tmp_path / "new", tokens="all")
     images, masks = views()
     encoder(images, masks, cache=cache)
@@ -174,11 +183,13 @@ def test_the_report_says_how_much_there_is(tmp_path):
 
 @pytest.mark.parametrize("option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}])
 def test_impossible_options_are_refused(tmp_path, option):
+    """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=f"feature_cache.{next(iter(option))}"):
         FeatureCache(tmp_path, **option)
 
 
 def test_tokens_of_a_hit_need_no_encoder(tmp_path, monkeypatch):
+    """A hit must not run the encoder, which is the point of the cache."""
     encoder = make()
     images, masks = views()
     cache = FeatureCache(tmp_path)
@@ -190,6 +201,7 @@ def test_tokens_of_a_hit_need_no_encoder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("recalibrated", "kept"), [("subject", "subject"), ("all", "all")])
 def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, kept):
+    """Recalibration of all tokens must not see a subset of them."""
     model = make_model("model=paper", f"recalibration.tokens={recalibrated}").eval()
     batch = make_batch(height=140, width=112, views=3)
     options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "float32"}

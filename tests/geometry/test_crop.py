@@ -26,6 +26,7 @@ def boxes(b, v, height, width, seed=0):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size", [(70, 56), (42, 98)])
 def test_crops_hold_the_masks_at_a_multiple_of_the_patch(size, seed):
+    """A crop must keep every pixel of the subject and fit the patches."""
     masks = boxes(2, 3, *size, seed)
     crop = crop_to_subject(masks, 14)
     assert crop.height % 14 == crop.width % 14 == 0
@@ -36,6 +37,7 @@ def test_crops_hold_the_masks_at_a_multiple_of_the_patch(size, seed):
 
 
 def test_points_of_a_cut_batch_are_those_of_the_whole():
+    """The cameras of a crop must see the same world points."""
     masks = boxes(2, 2, 70, 56)
     depths = torch.rand(2, 2, 70, 56) + 1
     images = torch.rand(2, 2, 3, 70, 56)
@@ -50,6 +52,7 @@ def test_points_of_a_cut_batch_are_those_of_the_whole():
 
 
 def test_an_empty_mask_and_a_full_one():
+    """The extreme masks must still give a valid crop."""
     masks = torch.zeros(1, 2, 28, 28, dtype=torch.bool)
     assert crop_to_subject(masks, 14, margin=2).height == 14
     masks[0, 1] = True

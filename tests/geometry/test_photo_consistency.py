@@ -49,6 +49,7 @@ def by_hand(batch, bounds, b, v, row, column, steps):
 
 @pytest.mark.parametrize("size", [(42, 56), (56, 42)])
 def test_agreement_is_that_of_each_ray(size):
+    """The batched plane sweep must equal a pixel-by-pixel version."""
     batch = make_batch(2, 3, *size, spread=150.0)
     bounds = VisualHull()(batch)
     maps = photo_consistency(batch, bounds, 5)
@@ -75,12 +76,14 @@ def test_the_surface_agrees_more_than_what_lies_behind_it():
 
 
 def test_opposite_views_say_nothing():
+    """Views from opposite sides see no common surface and must not vote."""
     batch = make_batch(1, 2)
     bounds = VisualHull()(batch)
     assert not photo_consistency(batch, bounds, 4).any()
 
 
 def test_empty_masks_and_points_behind_cameras_are_defined():
+    """Degenerate input must give finite values in [0, 1]."""
     batch = make_batch(1, 3)
     empty = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks))
     depth = batch.depths.clamp(min=1)
@@ -92,6 +95,7 @@ def test_empty_masks_and_points_behind_cameras_are_defined():
 
 
 def test_the_order_of_views_does_not_matter():
+    """The best other view must not depend on the order of views."""
     batch = make_batch(1, 3, spread=250.0)
     order = [2, 0, 1]
     turned = dataclasses.replace(
@@ -111,6 +115,7 @@ def test_the_order_of_views_does_not_matter():
 
 
 def test_precision_is_that_of_the_bounds():
+    """Double-precision bounds must not be computed in single precision."""
     batch = make_batch(1, 3, spread=150.0)
     bounds = DepthBounds(batch.depths, batch.depths + 0.2)
     single = photo_consistency(batch, bounds, 2)
@@ -120,6 +125,7 @@ def test_precision_is_that_of_the_bounds():
 
 
 def test_heads_ask_for_what_photo_consistency_needs():
+    """Photo-consistency without a guide would be computed and never seen."""
     for options in ({"guide": False, "consistency_depths": 4}, {"guide": True, "consistency_depths": -1}):
         with pytest.raises(InputError, match=r"depth_head\.consistency_depths"):
             DepthHead(64, **options)
@@ -128,6 +134,7 @@ def test_heads_ask_for_what_photo_consistency_needs():
 
 
 def test_splats_see_photo_consistency_and_colors_leave_their_pixels_within_the_limit():
+    """The guide must reach the opacities, and colours must stay within their limit."""
     batch = make_batch(1, 3, spread=250.0)
     other = dataclasses.replace(batch, cameras=ring(1, 3, 56, 56, spread=200.0))
     head = shake(make_head(guide=True, photo_consistency=True, color_limit=0.25))

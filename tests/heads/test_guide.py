@@ -23,6 +23,7 @@ def make_encoder(**options):
 
 
 def test_relative_maps_know_shape_and_not_distance():
+    """Moving the subject away from the camera must not change what the network sees."""
     batch = make_batch(2, 3)
     bounds = VisualHull()(batch)
     near, far = bounds.near, bounds.far
@@ -37,6 +38,7 @@ def test_relative_maps_know_shape_and_not_distance():
 
 
 def test_relative_depth_has_no_gradient_and_no_mean():
+    """The Gaussian head must not train the depth through its guide."""
     depth = make_batch().depths.requires_grad_()
     masks = depth > 0
     maps = relative_depth(depth, masks)
@@ -45,6 +47,7 @@ def test_relative_depth_has_no_gradient_and_no_mean():
 
 
 def test_an_empty_mask_gives_empty_maps():
+    """A view without the subject must give 0, not NaN."""
     masks = torch.zeros(1, 2, 8, 8, dtype=torch.bool)
     depth = torch.rand(1, 2, 8, 8)
     assert not relative_depth(depth, masks).any()
@@ -53,6 +56,7 @@ def test_an_empty_mask_gives_empty_maps():
 
 @pytest.mark.parametrize("size", [(28, 42), (35, 21)])
 def test_pyramid_halves_twice(size):
+    """Odd image sides must give maps of the expected sizes."""
     full, half, quarter = GuidePyramid(6, 16)(torch.rand(2, 6, *size))
     assert full.shape == (2, 8, *size)
     assert half.shape == (2, 16, *((n + 1) // 2 for n in size))
@@ -74,6 +78,7 @@ def test_depth_follows_the_guide():
 
 
 def test_the_guide_is_asked_for_and_refused():
+    """A guide that is missing or unexpected must be named."""
     batch = make_batch()
     tokens = make_encoder()(batch.images, batch.masks)
     guided = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, guide=True).dpt
@@ -85,6 +90,7 @@ def test_the_guide_is_asked_for_and_refused():
 
 
 def test_the_encoder_sees_bounds_where_it_is_told_to():
+    """encoder.bounds_input must reach the tokens, and ask for bounds."""
     batch = make_batch()
     bounds = VisualHull()(batch)
     encoder = make_encoder(mask_input=True, bounds_input=True)
