@@ -30,8 +30,8 @@ from stage_scenes import make_batch
 from ghgs_lit import encoder, recalibration
 from ghgs_lit.config import conf_dir
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.model import GHGS
-from ghgs_lit.types import Batch, Points, Tokens
+from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.types import Batch, DepthBounds, Points, Tokens
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 STATUS = Path("/proc/self/status")
@@ -58,8 +58,7 @@ def configuration(size: str, options: list[str]) -> dict:
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         config = compose("train", overrides=overrides)
-    keys = ["encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points"]
-    return OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
+    return OmegaConf.to_container(OmegaConf.masked_copy(config, [*STAGES, "skip"]), resolve=True)
 
 
 @torch.no_grad()
@@ -116,7 +115,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
     aggregator = model.encoder.aggregator
     embed = aggregator.patch_embed
 
-    def encode(batch: Batch, interval) -> Tokens:
+    def encode(batch: Batch, bounds: DepthBounds | None) -> Tokens:
         found = []
         kept = embed.forward
 
@@ -129,7 +128,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
         embed.forward = timed
         try:
             start = time.perf_counter()
-            tokens = model.encoder(batch.images, batch.masks, interval)
+            tokens = model.encoder(batch.images, batch.masks, bounds)
             seconds = time.perf_counter() - start
         finally:
             del embed.forward
@@ -143,13 +142,13 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
 
 @torch.no_grad()
 def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points]:
-    """``GHGS._predict``, stage by stage; the tokens and points that the recalibration saw."""
-    interval = model.depth_head.interval(batch)
-    tokens = _patch_tokens_first(model, record)(batch, interval)
+    """``GHGS.forward``, stage by stage; the tokens and points that the recalibration saw."""
+    bounds = model.bounds(batch)
+    tokens = _patch_tokens_first(model, record)(batch, bounds)
     with record("depth head"):
-        depth_maps = model.depth_head(tokens, batch, interval)
+        depth_maps = model.depth_head(tokens, batch, bounds)
     with record("unproject"):
-        points = model.unproject(depth_maps, tokens, batch)
+        points = model.unprojection(depth_maps, tokens, batch)
     with record("recalibration"):
         recalibrated = model.recalibration(tokens, points, batch)
     with record("Gaussian head"):

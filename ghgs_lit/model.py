@@ -60,18 +60,11 @@ class GHGS(nn.Module):
         super().__init__()
         choice("model.pad", pad, ("none", "multiple"))
         has_bounds = not isinstance(bounds, NoBounds)
-        require(
-            has_bounds == depth_head.is_bounded,
-            "bounds",
-            "none with depth_head.parameterization=inverse_linear, box or hull with all others",
-            f"{type(bounds).__name__} with {depth_head.parameterization}",
-        )
-        require(
-            has_bounds or not getattr(encoder, "bounds_input", False),
-            "encoder.bounds_input",
-            "false where bounds is none",
-            True,
-        )
+        expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
+        found = f"{type(bounds).__name__} with {depth_head.parameterization}"
+        require(has_bounds == depth_head.is_bounded, "bounds", expected, found)
+        sees_bounds = getattr(encoder, "bounds_input", False)
+        require(has_bounds or not sees_bounds, "encoder.bounds_input", "false where bounds is none", True)
         self.bounds = bounds
         self.encoder = encoder
         self.depth_head = depth_head

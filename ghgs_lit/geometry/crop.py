@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.masks import first_and_last
-from ghgs_lit.types import Batch, DepthBounds, Points, Prediction
+from ghgs_lit.types import Batch, DepthBounds, Prediction
 
 
 class Crop(ABC):
@@ -68,16 +68,12 @@ class Crop(ABC):
             for start in (self.top, self.left)
         )
         row, column = gaussians.pixel // self.width + top, gaussians.pixel % self.width + left
+        pixels = self.paste(prediction.points.pixels, 0.0)
         return Prediction(
             gaussians=dataclasses.replace(gaussians, pixel=row * self.full[1] + column),
             depth=whole.depth,
             depth_valid=whole.valid,
-            points=Points(
-                pixels=self.paste(prediction.points.pixels, 0.0),
-                valid=whole.valid,
-                tokens=prediction.points.tokens,
-                tokens_valid=prediction.points.tokens_valid,
-            ),
+            points=dataclasses.replace(prediction.points, pixels=pixels, valid=whole.valid),
             depth_maps=whole,
         )
 
