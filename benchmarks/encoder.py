@@ -26,8 +26,8 @@ from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 from ghgs_lit import encoder, recalibration
 from ghgs_lit.config import compose
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.model import GHGS
-from ghgs_lit.types import Batch, Points, Tokens
+from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.types import Batch, DepthBounds, Points, Tokens
 from tests.helpers.literal_recalibration import literal_recalibration
 from tests.helpers.scenes import make_batch
 
@@ -38,8 +38,7 @@ def configuration(size: str, options: list[str]) -> dict:
     """The paper's model with an encoder of ``size``, without skipping any token or pixel."""
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
     config = compose("train", overrides)
-    keys = ["encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points"]
-    return OmegaConf.to_container(OmegaConf.masked_copy(config, keys), resolve=True)
+    return OmegaConf.to_container(OmegaConf.masked_copy(config, [*STAGES, "skip"]), resolve=True)
 
 
 @torch.no_grad()
@@ -66,7 +65,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
     aggregator = model.encoder.aggregator
     embed = aggregator.patch_embed
 
-    def encode(batch: Batch, interval) -> Tokens:
+    def encode(batch: Batch, bounds: DepthBounds | None) -> Tokens:
         found = []
         kept = embed.forward
 
@@ -79,7 +78,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
         embed.forward = timed
         try:
             start = time.perf_counter()
-            tokens = model.encoder(batch.images, batch.masks, interval)
+            tokens = model.encoder(batch.images, batch.masks, bounds)
             seconds = time.perf_counter() - start
         finally:
             del embed.forward
@@ -93,13 +92,13 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
 
 @torch.no_grad()
 def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points]:
-    """``GHGS._predict``, stage by stage; returns the tokens and points that enter the recalibration."""
-    interval = model.depth_head.interval(batch)
-    tokens = _patch_tokens_first(model, record)(batch, interval)
+    """``GHGS.forward``, stage by stage; returns the tokens and points that enter the recalibration."""
+    bounds = model.bounds(batch)
+    tokens = _patch_tokens_first(model, record)(batch, bounds)
     with record("depth head"):
-        depth_maps = model.depth_head(tokens, batch, interval)
+        depth_maps = model.depth_head(tokens, batch, bounds)
     with record("unproject"):
-        points = model.unproject(depth_maps, tokens, batch)
+        points = model.unprojection(depth_maps, tokens, batch)
     with record("recalibration"):
         recalibrated = model.recalibration(tokens, points, batch)
     with record("Gaussian head"):

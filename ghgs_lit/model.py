@@ -1,7 +1,7 @@
 """The whole method as one module: photographs in, Gaussians out (paper, section 3)."""
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -9,99 +9,110 @@ from typing import Any
 import torch
 from torch import nn
 
-from ghgs_lit.bounds.visual_hull import Interval
+from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
-from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.encoder import FeatureCache, VGGTEncoder
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.crop import patch_padding, subject_windows
+from ghgs_lit.geometry.crop import crop_to_subject, pad_to_patches
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
-from ghgs_lit.kernels.precision import precision_of
+from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.types import Batch, Prediction, Tokens
-from ghgs_lit.weights.checkpoint import (
-    FORMAT_VERSION,
-    STATE_PREFIX,
-    load_strictly,
-    model_state,
-    read_checkpoint,
-    require_fit,
-)
+from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_fit
 from ghgs_lit.weights.reading import cast
 
-__all__ = [
-    "FORMAT_VERSION",
-    "GHGS",
-    "STAGES",
-    "STATE_PREFIX",
-    "check_batch",
-    "load_strictly",
-    "read_checkpoint",
-]
+#: Stages with weights whose widths follow the encoder's.
+HEADS = ("depth_head", "recalibration", "gaussian_head")
 
-STAGES = ("encoder", "depth_head", "recalibration", "gaussian_head")
+#: The nodes of a configuration that :meth:`GHGS.from_config` builds, in the order of the data flow.
+STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head")
 
 
 class GHGS(nn.Module):
-    """Encode, predict depth, unproject, recalibrate, regress Gaussians: ``model(batch) -> Prediction``.
+    """``model(batch) -> Prediction``: bounds, encode, depth, unproject, recalibrate, Gaussians.
 
-    With ``pad="multiple"`` photographs of any size get a black border up to the next multiple of the
-    patch size. With ``crop`` the stages see windows around the subject in place of the whole photographs.
-    What comes back is that of the whole photographs.
+    Args:
+        bounds: near and far of each pixel; :class:`NoBounds` goes with
+            ``depth_head.parameterization=inverse_linear``, any other with all other parameterizations.
+        encoder: photographs to tokens.
+        depth_head: tokens to depths.
+        unprojection: depths to world points.
+        recalibration: tokens to tokens by multi-view semantic consistency.
+        gaussian_head: tokens to Gaussians.
+        crop: let the stages see crops around the subject; the prediction is that of whole photographs.
+        pad: ``multiple`` gives photographs of any size a black border up to the next multiple of the patch
+            size; ``none`` refuses them.
     """
 
     def __init__(
         self,
+        bounds: Callable[[Batch], DepthBounds | None],
         encoder: VGGTEncoder,
         depth_head: DepthHead,
+        unprojection: Unprojection,
         recalibration: Recalibration,
         gaussian_head: GaussianHead,
-        unprojection: Unprojection | None = None,
         crop: bool = False,
         pad: str = "none",
     ):
         super().__init__()
         choice("model.pad", pad, ("none", "multiple"))
-        require(
-            depth_head.bounds is not None or not getattr(encoder, "interval_input", False),
-            "encoder.interval_input",
-            "false where depth_head.bounds is none",
-            True,
-        )
+        has_bounds = not isinstance(bounds, NoBounds)
+        expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
+        found = f"{type(bounds).__name__} with {depth_head.parameterization}"
+        require(has_bounds == depth_head.is_bounded, "bounds", expected, found)
+        sees_bounds = getattr(encoder, "bounds_input", False)
+        require(has_bounds or not sees_bounds, "encoder.bounds_input", "false where bounds is none", True)
+        self.bounds = bounds
         self.encoder = encoder
         self.depth_head = depth_head
-        self.unproject = unprojection or Unprojection()
+        self.unprojection = unprojection
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
-        #: Of the stages' products: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`.
+        self.crops = [pad_to_patches] * (pad == "multiple") + [crop_to_subject] * crop
+        #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
+        self.feature_cache: FeatureCache | None = None
         self.precision = "inherit"
-        self.frames = [patch_padding] * (pad == "multiple") + [subject_windows] * crop
+
+    @property
+    def precision(self) -> str:
+        """Of the stages' matrix products: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`."""
+        return self._precision
+
+    @precision.setter
+    def precision(self, name: str) -> None:
+        choice("precision", name, PRECISIONS)
+        self._precision = name
 
     def forward(self, batch: Batch) -> Prediction:
-        patch = self.encoder.patch_size
-        check_batch(batch, 1 if patch_padding in self.frames else patch)
-        # From the whole photographs: a frame hides from the hull, or invents, what lies at its border.
-        interval = self.depth_head.interval(batch)
-        used = []
-        for frame_of in self.frames:
-            frame = frame_of(batch.masks, patch)
-            if frame is not None:
-                batch, interval = frame.cut_batch(batch), frame.cut_interval(interval)
-                used.append(frame)
-        with precision_of(self.precision, batch.images.device):
-            prediction = self._predict(batch, interval)
-        for frame in reversed(used):
-            prediction = frame.paste_prediction(prediction)
-        return prediction
+        """Gaussians, depths and points of a batch.
 
-    def _predict(self, batch: Batch, interval: Interval | None) -> Prediction:
-        tokens = self._in_heads_precision(self.encoder(batch.images, batch.masks, interval))
-        depth_maps = self.depth_head(tokens, batch, interval)
-        points = self.unproject(depth_maps, tokens, batch)
-        tokens = self.recalibration(tokens, points, batch)
-        gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
-        return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps)
+        Raises:
+            InputError: :func:`check_batch` refuses the batch.
+        """
+        patch = self.encoder.patch_size
+        check_batch(batch, 1 if pad_to_patches in self.crops else patch)
+        # From whole photographs: a crop hides what lies at its border, padding invents something there.
+        bounds = self.bounds(batch)
+        crops = []
+        for crop_of in self.crops:
+            crop = crop_of(batch.masks, patch)
+            if crop is not None:
+                batch, bounds = crop.cut_batch(batch), crop.cut_bounds(bounds)
+                crops.append(crop)
+        with precision_of(self.precision, batch.images.device):
+            tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache)
+            tokens = self._in_heads_precision(tokens)
+            depth_maps = self.depth_head(tokens, batch, bounds)
+            points = self.unprojection(depth_maps, tokens, batch)
+            tokens = self.recalibration(tokens, points, batch)
+            gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
+        prediction = Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps)
+        for crop in reversed(crops):
+            prediction = crop.paste_prediction(prediction)
+        return prediction
 
     def _in_heads_precision(self, tokens: Tokens) -> Tokens:
         """Tokens of an encoder whose weights are in half precision, for heads whose weights are not."""
@@ -113,10 +124,12 @@ class GHGS(nn.Module):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], empty: Collection[str] = ()) -> "GHGS":
-        """Build from the nodes ``encoder``, ``depth_head``, ``recalibration``, ``gaussian_head``, and, where
-        they are given, ``points``, ``skip`` and ``model.pad``; other keys are ignored.
+        """The model that a configuration describes.
 
-        Stages in ``empty`` are built without storage (on the meta device), for weights to be assigned to.
+        Args:
+            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.crop`` and ``model.pad``;
+                other keys are ignored.
+            empty: stages that are built without storage (on the meta device), for weights to be assigned to.
 
         Raises:
             InputError: a stage is missing, or a value is impossible; the message starts with the key.
@@ -124,28 +137,17 @@ class GHGS(nn.Module):
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
 
-        def storage(name: str) -> Any:
-            return torch.device("meta") if name in empty else nullcontext()
+        def stage(name: str, **extra: Any) -> Any:
+            with torch.device("meta") if name in empty else nullcontext():
+                return build(config[name], name, **extra)
 
-        with storage("encoder"):
-            # `weights` says where an imported encoder comes from; it has no part in what is built.
-            encoder = build({k: v for k, v in config["encoder"].items() if k != "weights"}, "encoder")
-        skip = config.get("skip") or {}
-        extra = {name: {} for name in STAGES}
-        extra["gaussian_head"] = {key: skip[key] for key in ("pixels", "views") if key in skip}
-        if "views" in skip and config["recalibration"].get("tokens") != "all":
-            # Otherwise tokens of views without the subject need a depth as well.
-            extra["depth_head"] = {"views": skip["views"]}
-        stages = {}
-        for name in STAGES[1:]:
-            with storage(name):
-                stages[name] = build(config[name], name, dim_latent=encoder.dim_latent, **extra[name])
-        points = config.get("points")
+        encoder = stage("encoder")
         return cls(
+            stage("bounds"),
             encoder,
-            **stages,
-            unprojection=Unprojection(**points) if points else None,
-            crop=bool(skip.get("crop", False)),
+            unprojection=stage("unprojection"),
+            **{name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS},
+            crop=bool((config.get("skip") or {}).get("crop", False)),
             pad=(config.get("model") or {}).get("pad", "none"),
         )
 
@@ -153,21 +155,25 @@ class GHGS(nn.Module):
     def from_checkpoint(
         cls, path: str | Path, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "GHGS":
-        """The model of a checkpoint, in evaluation mode, with no YAML at hand.
+        """The model of a checkpoint, in evaluation mode; needs no YAML.
 
-        The weights are mapped from the file and not read before they are used. ``dtype`` is the encoder's
-        (None: as in the file); the heads are float32 or wider.
+        The weights are mapped from the file and not read before they are used.
+
+        Args:
+            path: of the checkpoint.
+            map_location: device of the model.
+            dtype: of the encoder (None: as in the file); the heads are float32 or wider.
 
         Raises:
             FileNotFoundError: there is no such file.
-            InputError: the file is no checkpoint of this package, or its weights do not fit its config.
+            InputError: the file is not a checkpoint of this package, or its weights do not fit its config.
         """
         model = cls.from_config(read_checkpoint(path)["config"], empty=STAGES)
         model.load(path, dtype)
         return model.to(map_location).eval()
 
     def load(self, path: str | Path, dtype: torch.dtype | None = None) -> None:
-        """Take over the weights of a checkpoint, as :meth:`from_checkpoint` does."""
+        """Take the weights of a checkpoint; arguments and errors as in :meth:`from_checkpoint`."""
         require_fit(self, model_state(read_checkpoint(path)), path)
 
         def precision(name: str, stored: torch.dtype) -> torch.dtype:
@@ -179,7 +185,15 @@ class GHGS(nn.Module):
 
 
 def check_batch(batch: Batch, patch_size: int) -> None:
-    """Refuse a batch that the stages cannot work on, by the name of what is wrong."""
+    """Refuse a batch that the stages cannot work on.
+
+    Args:
+        batch: the inputs; targets are not looked at.
+        patch_size: must divide height and width, in pixels.
+
+    Raises:
+        InputError: names the field, what was expected and what was found.
+    """
     require(batch.images.dim() == 5, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
     b, v, _, height, width = batch.images.shape
     require(v >= 2, "batch.images", "2 views or more", v)

@@ -1,11 +1,11 @@
-"""What the stages hand to one another.
+"""The data that the stages exchange.
 
-Conventions, stated here once and true everywhere in the package:
+Conventions, stated once here and used everywhere in the package:
 
-* camera axes are OpenCV's: x right, y down, z forward; ``extrinsics`` map world to camera;
+* camera axes are OpenCV's: x right, y down, z forward; ``extrinsics`` map the world to the camera;
 * ``intrinsics`` are in pixels and pixel ``(row i, column j)`` has its centre at
-  ``(u, v) = (j + 0.5, i + 0.5)``; a calibration made with OpenCV puts centres at integers, so its
-  ``cx`` and ``cy`` need ``+ 0.5`` before any resize;
+  ``(u, v) = (j + 0.5, i + 0.5)``; a calibration made with OpenCV puts centres at integers, so add
+  0.5 to its ``cx`` and ``cy`` before any resize;
 * quaternions are ``(w, x, y, z)``; lengths are metres; depth is z in the camera;
 * images are float in ``[0, 1]``, RGB, on a black background outside the mask.
 
@@ -40,16 +40,18 @@ def _map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
 
 
 class _TensorStruct:
-    """``to`` and ``detach`` for a dataclass of tensors."""
+    """``to``, ``detach`` and ``pin_memory`` for a dataclass of tensors."""
 
     def to(self, *args, **kwargs):
         """Move to a device (dtypes are kept: geometry stays float32 or wider, masks stay bool)."""
         return _map_tensors(self, lambda t: t.to(*args, **kwargs))
 
     def detach(self):
+        """The same tensors without their gradient."""
         return _map_tensors(self, Tensor.detach)
 
     def pin_memory(self):
+        """The tensors in page-locked memory, for fast copies to a GPU."""
         return _map_tensors(self, Tensor.pin_memory)
 
 
@@ -82,16 +84,26 @@ class Cameras(_TensorStruct):
             self, intrinsics=self.intrinsics * scale[:, None], height=height, width=width
         )
 
-    def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
-        """The same cameras for the window that starts at ``(top, left)``; negative pads."""
-        shift = self.intrinsics.new_zeros(3, 3)
-        shift[0, 2], shift[1, 2] = -left, -top
-        return dataclasses.replace(self, intrinsics=self.intrinsics + shift, height=height, width=width)
+    def cropped(
+        self, top: Int[Tensor, "*batch"] | int, left: Int[Tensor, "*batch"] | int, height: int, width: int
+    ) -> "Cameras":
+        """The same cameras for a crop of the image.
+
+        Args:
+            top: row of the image at which the crop starts, one number or one for each camera; negative pads.
+            left: column of the image at which the crop starts.
+            height: rows of the crop in pixels.
+            width: columns of the crop in pixels.
+        """
+        intrinsics = self.intrinsics.clone()
+        intrinsics[..., 0, 2] -= left
+        intrinsics[..., 1, 2] -= top
+        return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
 
 @dataclass(frozen=True)
 class Targets(_TensorStruct):
-    """Photographs to be predicted, from cameras that are not the inputs'."""
+    """Photographs to predict, from cameras other than the input cameras."""
 
     images: Float[Tensor, "B T 3 h w"]
     masks: Bool[Tensor, "B T h w"]
@@ -101,7 +113,11 @@ class Targets(_TensorStruct):
 
 @dataclass(frozen=True)
 class Batch(_TensorStruct):
-    """Input photographs of ``B`` subjects with everything known about them."""
+    """Input photographs of ``B`` subjects, with everything that is known about them.
+
+    ``body_vertices`` are points of the body's surface in metres, ``depths`` true z-depths in metres (0 where
+    there is none); both None where the data set has none. ``views`` names the photographs of each subject.
+    """
 
     images: Float[Tensor, "B V 3 H W"]
     masks: Bool[Tensor, "B V H W"]
@@ -114,12 +130,21 @@ class Batch(_TensorStruct):
 
 
 @dataclass(frozen=True)
+class DepthBounds(_TensorStruct):
+    """The nearest and the farthest z-depth, in metres, at which each pixel's ray can meet the subject."""
+
+    near: Float[Tensor, "B V H W"]
+    far: Float[Tensor, "B V H W"]
+
+
+@dataclass(frozen=True)
 class Tokens(_TensorStruct):
-    """Tokens of the encoder, packed over the kept ones of the batch.
+    """Tokens of the encoder: the kept ones of the whole batch, packed.
 
     Token ``n`` is the patch at ``row[n]``, ``column[n]`` of image ``image[n]`` (``b * V + v``); tokens
     are ordered by image, row, column. ``grid`` is ``(B, V, h, w)``. ``latent`` holds the embeddings E
-    of the encoder's read-out layers, ``semantic`` the features F (detached: they steer attention).
+    of the encoder's read-out layers, ``semantic`` the features F (detached: they weight the attention and
+    are not trained through it).
     """
 
     latent: tuple[Float[Tensor, "N C"], ...]
@@ -136,8 +161,19 @@ class Tokens(_TensorStruct):
         b, v, h, w = self.grid
         return self.image.shape[0] == b * v * h * w
 
+    def select(self, index: Tensor | slice) -> "Tokens":
+        """The tokens at ``index`` (a slice, a mask or indices) of the same grid."""
+        return dataclasses.replace(
+            self,
+            latent=tuple(layer[index] for layer in self.latent),
+            semantic=self.semantic[index],
+            image=self.image[index],
+            row=self.row[index],
+            column=self.column[index],
+        )
+
     def maps(self, layer: int) -> Float[Tensor, "BV C h w"]:
-        """One layer on the image grid; tokens that were not kept are zero."""
+        """One layer on the token grid; 0 at patches whose tokens were not kept."""
         b, v, h, w = self.grid
         values = self.latent[layer]
         if not self.is_dense:
@@ -148,18 +184,17 @@ class Tokens(_TensorStruct):
 
 @dataclass(frozen=True)
 class DepthMaps(_TensorStruct):
-    """One depth for each pixel, in metres; ``near`` and ``far`` bound it where it is bounded."""
+    """One z-depth for each pixel, in metres, and the bounds that it lies between, if there are any."""
 
     depth: Float[Tensor, "B V H W"]
     valid: Bool[Tensor, "B V H W"]
     confidence: Float[Tensor, "B V H W"]
-    near: Float[Tensor, "B V H W"] | None = None
-    far: Float[Tensor, "B V H W"] | None = None
+    bounds: DepthBounds | None = None
 
 
 @dataclass(frozen=True)
 class Points(_TensorStruct):
-    """World points of pixels and of tokens. Invalid ones are finite but mean nothing."""
+    """World points of pixels and of tokens, in metres. Invalid ones are finite but meaningless."""
 
     pixels: Float[Tensor, "B V H W 3"]
     valid: Bool[Tensor, "B V H W"]
@@ -171,9 +206,9 @@ class Points(_TensorStruct):
 class Gaussians(_TensorStruct):
     """3D Gaussians of a batch, packed; ``splits[b]`` of them belong to element ``b``.
 
-    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres;
-    ``colors`` may have any number of channels. ``image`` (``b * V + v``) and ``pixel``
-    (row-major index) say which input pixel a Gaussian came from, where it came from one.
+    ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres; ``colors`` may have
+    any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index) are the input pixel that
+    a Gaussian belongs to, None where there is none.
     """
 
     means: Float[Tensor, "N 3"]
@@ -189,7 +224,12 @@ class Gaussians(_TensorStruct):
         return self.means.shape[0]
 
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
-        """The Gaussians at ``index`` (a slice, a mask or indices), divided as ``splits`` says."""
+        """The Gaussians at ``index`` (a slice, a mask or indices).
+
+        Args:
+            index: which Gaussians.
+            splits: how many of them belong to each batch element.
+        """
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in dataclasses.fields(self)
@@ -209,7 +249,7 @@ class Gaussians(_TensorStruct):
 
 @dataclass(frozen=True)
 class Prediction(_TensorStruct):
-    """What ``model(batch)`` returns."""
+    """The result of ``model(batch)``; ``depth`` in metres, meaningful where ``depth_valid``."""
 
     gaussians: Gaussians
     depth: Float[Tensor, "B V H W"]
@@ -220,7 +260,7 @@ class Prediction(_TensorStruct):
 
 @dataclass(frozen=True)
 class Rendering(_TensorStruct):
-    """Images of Gaussians. ``depth`` is the expected z, ``sum(w z) / max(sum(w), 1e-10)``."""
+    """Rendered Gaussians. ``depth`` is the expected z in metres, ``sum(w z) / max(sum(w), 1e-10)``."""
 
     image: Float[Tensor, "B T C h w"]
     alpha: Float[Tensor, "B T 1 h w"]

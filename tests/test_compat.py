@@ -4,6 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from ghgs_lit.bounds import SubjectBox
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection
@@ -20,10 +21,10 @@ from tests.helpers.weights import config as imported_config
 #: What a new model of the paper does, beside what the release does (docs/weights.md).
 QUIRKS = {
     ("model", "pad"): ("none", "multiple"),
-    ("points", "tokens"): ("subject", "release"),
-    ("points", "border"): (0, 3),
+    ("unprojection", "tokens"): ("subject", "release"),
+    ("unprojection", "border"): (0, 3),
     ("depth_head", "parameterization"): ("bounded_inverse", "inverse_linear"),
-    ("depth_head", "bounds"): ("box", "none"),
+    ("bounds", "_target_"): ("ghgs_lit.bounds.SubjectBox", "ghgs_lit.bounds.NoBounds"),
     ("recalibration", "similarity"): ("product", "product_clamped"),
     ("recalibration", "tokens"): ("subject", "all"),
     ("gaussian_head", "parameterization"): ("footprint", "release"),
@@ -34,19 +35,21 @@ VERBS = [path.stem for path in CONF.glob("*.yaml") if "- compat:" in path.read_t
 
 @pytest.mark.parametrize(("key", "values"), QUIRKS.items())
 def test_every_quirk_is_a_switch_that_is_off_by_default(key, values):
+    """New training must not inherit the release's quirks, and each must be selectable alone."""
     group, name = key
     assert config("model=paper")[group][name] == values[0]
     assert config("model=paper", "compat=release")[group][name] == values[1]
     assert release_switches()[key] == values[1]
     overrides = [f"{group}.{name}={values[1]}"]
-    if group == "depth_head":  # depths without bounds are the release's alone
-        overrides = ["depth_head.bounds=none", "depth_head.parameterization=inverse_linear"]
+    if group in ("bounds", "depth_head"):  # depths without bounds are the release's alone
+        overrides = ["bounds=none", "depth_head.parameterization=inverse_linear"]
     with torch.device("meta"):
         GHGS.from_config(config("model=paper", *overrides))
 
 
 @pytest.mark.parametrize("model", ["paper", "hull"])
 def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
+    """The authors' checkpoint must fit whatever `model` is chosen."""
     overrides = [f"model={model}", "compat=release"]
     state = GHGS.from_config(imported_config(*overrides, tiny=False), empty=STAGES).state_dict()
     found = {
@@ -59,6 +62,7 @@ def test_the_releases_model_has_the_releases_tensors_and_no_others(model):
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_releases_protocol_of_measuring_comes_with_it(verb):
+    """Numbers beside the release's must be measured as the release does."""
     cfg = OmegaConf.to_container(compose(verb, ["compat=release"]))
     chosen = OmegaConf.to_container(compose(verb, ["compat=release", "metrics=correct"]))
     assert cfg["metrics"]["protocol"] == "release"
@@ -87,6 +91,7 @@ def token_pixels(mode, border, size=512):
 
 
 def test_tokens_lie_at_the_true_centres_and_the_releases_where_it_puts_them():
+    """Token points must be right for ours and as shifted as the release's."""
     index = torch.arange(37) + 0.5
     v, u = torch.meshgrid(index, index, indexing="ij")
     grid = torch.stack((u, v), -1)
@@ -105,7 +110,7 @@ def test_no_value_of_the_head_flips_or_explodes_a_depth(name):
     """Whatever a network says, depths lie between near and far, and so do their gradients."""
     batch = make_batch(1, 3)
     torch.manual_seed(0)
-    head = DepthHead(64, {"features": 16, "out_channels": [16] * 4}, name, "box")
+    head = DepthHead(64, {"features": 16, "out_channels": [16] * 4}, name)
     tokens = torch.zeros(3 * 16, 64)
     axes = (torch.arange(n) for n in (3, 4, 4))
     image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
@@ -114,15 +119,15 @@ def test_no_value_of_the_head_flips_or_explodes_a_depth(name):
     for value in EXTREMES:
         with torch.no_grad():
             last.bias[0] = value
-        maps = head(packed, batch, head.interval(batch))
+        maps = head(packed, batch, SubjectBox()(batch))
         assert torch.equal(maps.valid, batch.masks)
-        assert (maps.near > 0).all()
-        assert (maps.depth >= maps.near * (1 - 1e-6)).all()
-        assert (maps.depth <= maps.far * (1 + 1e-6)).all()
+        assert (maps.bounds.near > 0).all()
+        assert (maps.depth >= maps.bounds.near * (1 - 1e-6)).all()
+        assert (maps.depth <= maps.bounds.far * (1 + 1e-6)).all()
         last.bias.grad = None
         maps.depth.sum().backward()
         assert last.bias.grad.isfinite().all()
-        assert last.bias.grad[0] <= (maps.far - maps.near).sum()
+        assert last.bias.grad[0] <= (maps.bounds.far - maps.bounds.near).sum()
 
 
 def test_a_fresh_model_of_the_release_may_look_behind_the_camera_and_ours_not():
@@ -140,6 +145,7 @@ def test_a_fresh_model_of_the_release_may_look_behind_the_camera_and_ours_not():
 
 
 def test_background_tokens_take_part_by_a_switch():
+    """Background tokens must take part under recalibration.tokens=all only."""
     batch = make_batch(1, 3, 56, 56, zoom=0.4)
     touched = {}
     for tokens in ("subject", "all"):

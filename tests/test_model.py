@@ -1,3 +1,5 @@
+"""The whole model: numbers of the release, invariances, skipping, padding, refusals."""
+
 import dataclasses
 import functools
 import subprocess
@@ -8,6 +10,7 @@ import torch
 from torch import nn
 
 import ghgs_lit
+from ghgs_lit.bounds import NoBounds, SubjectBox
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.geometry.unprojection import Unprojection
@@ -15,7 +18,7 @@ from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.model import GHGS, check_batch
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.types import Batch, Cameras, Tokens
+from ghgs_lit.types import Batch, Cameras, DepthBounds, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import CASES, fixture, make_batch
@@ -41,18 +44,19 @@ class GivenTokens(nn.Module):
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         self.tokens = Tokens(latent, inputs["dino"].flatten(0, 1), image, row, column, (1, 3, 5, 5), 14)
 
-    def forward(self, images, masks, interval):
+    def forward(self, images, masks, bounds, cache):
         return self.tokens
 
 
 def release_model(inputs, dtype):
     dpt = {"features": 16, "out_channels": [16, 20, 24, 32]}
     model = GHGS(
+        NoBounds(),
         GivenTokens(inputs),
-        DepthHead(64, dpt, parameterization="inverse_linear", bounds="none"),
+        DepthHead(64, dpt, parameterization="inverse_linear"),
+        Unprojection("release", 3),
         Recalibration(64, k=8, similarity="product_clamped", tokens="all"),
         GaussianHead(64, dpt, parameterization="release"),
-        Unprojection("release", 3),
         pad="multiple",
     ).to(dtype)
     published = fixture("predict_gaussian_reduced", "state", dtype)
@@ -62,6 +66,7 @@ def release_model(inputs, dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_pipeline_matches_the_release(dtype):
+    """The whole pipeline must reproduce the numbers of the authors' code."""
     name = "predict_gaussian_reduced"
     inputs, expected = fixture(name, "in", dtype), fixture(name, "out64", torch.float64)
     extrinsics = torch.eye(4, dtype=dtype).repeat(1, 3, 1, 1)
@@ -96,6 +101,7 @@ def test_the_pipeline_matches_the_release(dtype):
 
 @pytest.mark.parametrize("model_name", ["paper", "hull"])
 def test_a_batch_of_two_equals_two_singles(model_name):
+    """A result must not depend on the other subjects of its batch."""
     batch = make_batch(2, 3)
     model = make_model(f"model={model_name}").eval()
     with torch.no_grad():
@@ -110,6 +116,7 @@ def test_a_batch_of_two_equals_two_singles(model_name):
     "overrides", [["model=paper"], ["model=hull"], ["compat=release"], ["model=hull", "skip=none"]]
 )
 def test_every_parameter_gets_a_finite_gradient(overrides):
+    """A parameter without a gradient would never be trained."""
     batch = make_batch(2, 3, 42, 56)
     model = make_model(*overrides)
     prediction = model(batch)
@@ -127,6 +134,7 @@ def test_every_parameter_gets_a_finite_gradient(overrides):
 
 @pytest.mark.parametrize(("size", "views"), [((56, 56), 2), ((28, 70), 3), ((42, 28), 5)])
 def test_shapes(size, views):
+    """Any number of views and any shape must give complete maps."""
     batch = make_batch(1, views, *size)
     prediction = make_model()(batch)
     assert prediction.depth.shape == prediction.depth_valid.shape == batch.masks.shape
@@ -135,6 +143,7 @@ def test_shapes(size, views):
 
 
 def test_a_view_with_an_empty_mask_gives_no_gaussians():
+    """A view without the subject must give nothing, and no NaN."""
     batch = make_batch(1, 3)
     masks = batch.masks.clone()
     masks[0, 1] = False
@@ -144,6 +153,7 @@ def test_a_view_with_an_empty_mask_gives_no_gaussians():
 
 
 def test_skip_exact_gives_the_gaussians_of_skip_none():
+    """skip=exact promises the same Gaussians."""
     batch = make_batch(2, 3)
     batch.masks[0, 1] = False
     with torch.no_grad():
@@ -152,6 +162,7 @@ def test_skip_exact_gives_the_gaussians_of_skip_none():
 
 
 def test_views_without_the_subject_are_not_decoded():
+    """skip=exact must skip the work, except where all tokens need a depth."""
     batch = make_batch(2, 3)
     batch.masks[1, 0] = False
     model = make_model("skip=exact")
@@ -165,6 +176,7 @@ def test_views_without_the_subject_are_not_decoded():
 
 
 def test_ablations_differ_and_say_what_they_leave_out():
+    """An ablation that changes nothing would make a wrong table."""
     batch = make_batch(1, 3)
     outputs = {}
     for name in ("full", "no_unprojection", "no_semantic", "neither"):
@@ -180,19 +192,24 @@ def test_ablations_differ_and_say_what_they_leave_out():
 
 
 def test_an_ablation_wins_over_the_releases_values():
+    """Ablations of the release's model must take effect."""
     cfg = config("compat=release", "ablation=no_semantic")
     assert cfg["recalibration"]["similarity"] == "none"
     assert cfg["recalibration"]["tokens"] == "all"
-    assert cfg["points"] == {"tokens": "release", "border": 3}
+    assert (cfg["unprojection"]["tokens"], cfg["unprojection"]["border"]) == ("release", 3)
 
 
 def test_named_models_choose_their_parts_and_the_command_line_wins():
-    assert config("model=hull")["depth_head"]["bounds"] == "hull"
-    assert config("model=paper")["depth_head"]["bounds"] == "box"
-    assert config("model=paper", "depth_head=hull")["depth_head"]["bounds"] == "hull"
+    """What is written on the command line must be what one gets."""
+    assert config("model=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
+    assert config("model=paper")["bounds"]["_target_"] == "ghgs_lit.bounds.SubjectBox"
+    assert config("model=paper", "bounds=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
+    assert config("model=paper", "depth_head=hull")["depth_head"]["parameterization"] == "linear"
+    assert config("model=hull", "recalibration=paper")["recalibration"]["s_min"] == 0.01
 
 
 def test_order_of_later_views_does_not_matter():
+    """The order of the later views must not change the Gaussians."""
     batch = make_batch(1, 4)
     order = torch.tensor([0, 3, 1, 2])  # the encoder treats the first view apart
     swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])
@@ -206,6 +223,7 @@ def test_order_of_later_views_does_not_matter():
 
 
 def test_geometry_is_wide_under_autocast():
+    """Depths and points in half precision would be off by centimetres."""
     batch = make_batch(1, 3)
     model = make_model("model=hull")
     with torch.autocast("cpu", torch.bfloat16):
@@ -213,11 +231,11 @@ def test_geometry_is_wide_under_autocast():
     expected = model(batch)
     assert prediction.depth.dtype == prediction.points.pixels.dtype == prediction.gaussians.means.dtype
     assert prediction.depth.dtype == torch.float32
-    assert torch.equal(prediction.depth_maps.near, expected.depth_maps.near)
+    assert torch.equal(prediction.depth_maps.bounds.near, expected.depth_maps.bounds.near)
     assert (prediction.depth - expected.depth).abs()[batch.masks].max() < 0.1
     again = Unprojection()(
         prediction.depth_maps,
-        model.encoder(batch.images, batch.masks, model.depth_head.interval(batch)),
+        model.encoder(batch.images, batch.masks, model.bounds(batch)),
         batch,
     )
     assert torch.equal(again.pixels, prediction.points.pixels)
@@ -256,20 +274,49 @@ def bad_batches():
 
 @pytest.mark.parametrize("message", list(bad_batches()))
 def test_a_bad_batch_is_refused_by_name(message):
+    """Bad input must be refused with the name of the field."""
     with pytest.raises(InputError, match=message):
         check_batch(bad_batches()[message], 14)
 
 
 def test_a_missing_stage_and_a_bad_value_name_their_key():
+    """Errors of a configuration must start with the key."""
     with pytest.raises(InputError, match="gaussian_head: expected a stage"):
         GHGS.from_config({k: v for k, v in config().items() if k != "gaussian_head"})
-    with pytest.raises(InputError, match=r"depth_head\.bounds: expected one of box, hull"):
-        GHGS.from_config(config("depth_head.bounds=sphere"))
+    with pytest.raises(InputError, match=r"depth_head\.parameterization: expected one of bounded_inverse"):
+        GHGS.from_config(config("depth_head.parameterization=sphere"))
     with pytest.raises(InputError, match="recalibration"):
         GHGS.from_config(config("+recalibration.neighbours=3"))
 
 
+@pytest.mark.parametrize(
+    ("overrides", "found"),
+    [
+        (["model=paper", "bounds=none"], "NoBounds with bounded_inverse"),
+        (["model=hull", "depth_head.parameterization=inverse_linear"], "consistency_depths"),
+        (["model=paper", "depth_head.parameterization=inverse_linear"], "SubjectBox with inverse_linear"),
+        (
+            ["model=hull", "compat=release", "encoder.bounds_input=true"],
+            "encoder.bounds_input: expected false",
+        ),
+    ],
+)
+def test_bounds_that_do_not_fit_the_depths_are_refused(overrides, found):
+    """Depths between bounds that nobody computes would fail in the first forward pass only."""
+    with pytest.raises(InputError, match=found):
+        GHGS.from_config(config(*overrides))
+
+
+def test_an_unknown_precision_is_refused_when_it_is_set():
+    """A typing error must not wait for the first forward pass."""
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match="precision: expected one of inherit"):
+        model.precision = "half"
+    assert model.precision == "inherit"
+
+
 def test_importing_the_package_does_not_import_torch():
+    """`ghgs --help` must not wait for PyTorch."""
     code = (
         "import sys, ghgs_lit; assert 'torch' not in sys.modules; from ghgs_lit import GHGS, Batch, Gaussians"
     )
@@ -290,7 +337,7 @@ def test_windows_give_gaussians_of_the_same_pixels(size):
         assert torch.equal(getattr(part.gaussians, name), getattr(whole.gaussians, name)), name
     assert part.gaussians.splits == whole.gaussians.splits
     for name in ("near", "far"):
-        near = (getattr(prediction.depth_maps, name)[batch.masks] for prediction in (part, whole))
+        near = (getattr(prediction.depth_maps.bounds, name)[batch.masks] for prediction in (part, whole))
         assert torch.equal(*near)
     # Points of the pasted maps lie on the rays of their pixels in the whole photograph.
     camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
@@ -334,16 +381,19 @@ def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
 
 
 def test_padding_is_what_a_black_border_does_by_hand():
+    """model.pad must give exactly what a padded photograph gives."""
     batch = make_batch(1, 3, 50, 64)
     border = nn.functional.pad(batch.images, (3, 3, 3, 3))
     masks = nn.functional.pad(batch.masks, (3, 3, 3, 3))
     by_hand = Batch(border, masks, batch.cameras.cropped(-3, -3, 56, 70))
     model = make_model("model=paper", *PADS)
-    # The box is carved from the photographs: a border would say that nothing lies beyond them.
-    expected = model._predict(by_hand, tuple(
-        nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in model.depth_head.interval(batch)
-    ))  # fmt: skip
     found = model(batch)
+    # The box is carved from the photographs: a border would say that nothing lies beyond them.
+    bounds = model.bounds(batch)
+    near, far = (nn.functional.pad(bound, (3, 3, 3, 3), value=1.0) for bound in (bounds.near, bounds.far))
+    model.bounds = lambda _: DepthBounds(near, far)
+    expected = model(by_hand)
+    model.bounds = SubjectBox()
     close(found.gaussians, expected.gaussians, 0)
     assert torch.equal(found.depth, expected.depth[..., 3:-3, 3:-3])
     assert torch.equal(found.points.tokens, expected.points.tokens)

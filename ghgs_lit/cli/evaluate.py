@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.inputs import build_data, choices, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
-from ghgs_lit.encoder import attach_cache
+from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
@@ -30,6 +30,7 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
     if path is not None:
         model = GHGS.from_checkpoint(path)
         model.precision = config["precision"]
+        model.feature_cache = open_cache(config["feature_cache"], model.recalibration.tokens)
         trained = read_checkpoint(path)["config"]
         facts["checkpoint_config"] = trained
         facts["parameters"] = {"total": sum(p.numel() for p in model.parameters())}
@@ -49,7 +50,7 @@ def run(cfg: DictConfig) -> None:
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     methods, facts = _methods(config, device)
-    cache = attach_cache(methods["model"].model, config["feature_cache"]) if "model" in methods else None
+    cache = methods["model"].model.feature_cache if "model" in methods else None
     data = build_data(config)
     data.prepare_data()
     facts |= {"verb": "evaluate", "choices": choices()}

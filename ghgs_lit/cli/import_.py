@@ -14,7 +14,7 @@ from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
 
 #: Nodes of the configuration that describe the model; a checkpoint stores these.
-MODEL_NODES = (*STAGES, "points", "skip", "model", "compat", "ablation")
+MODEL_NODES = (*STAGES, "skip", "model", "compat", "ablation")
 
 
 def initial_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:

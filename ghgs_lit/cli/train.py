@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.inputs import build_data, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
-from ghgs_lit.encoder import attach_cache
+from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
@@ -100,7 +100,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     L.seed_everything(config["seed"], workers=True, verbose=False)
     data = build_data(config)
     model = GHGS.from_config(config)
-    attach_cache(model, config.get("feature_cache"))
+    model.feature_cache = open_cache(config.get("feature_cache"), model.recalibration.tokens)
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")

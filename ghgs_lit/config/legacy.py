@@ -21,7 +21,12 @@ TARGETS = {
 
 #: Keys that moved: old dotted key, new one (whole nodes too).
 KEYS: dict[str, str] = {
+    "depth_head.agreement": "depth_head.consistency_depths",
+    "encoder.interval_input": "encoder.bounds_input",
+    "feature_cache.ring": "feature_cache.margin",
+    "gaussian_head.agreement": "gaussian_head.photo_consistency",
     "optimizer.hold": "optimizer.freeze_until",
+    "points": "unprojection",
 }
 
 #: Values that changed their name: (key of today, old value) to the new one.
@@ -32,8 +37,47 @@ OPTIONS = {
     ("optimizer", "pilot"): "from_scratch",
 }
 
-#: Changes that no table can express, applied last: each changes the configuration in place.
-STEPS: list[Callable[[dict[str, Any]], None]] = []
+
+def _bounds_become_a_stage(config: dict[str, Any]) -> None:
+    """``depth_head.bounds`` and ``depth_head.search`` are the node ``bounds``."""
+    head = config.get("depth_head")
+    if not isinstance(head, dict) or "bounds" in config:
+        return
+    kind, search = head.pop("bounds", "box"), head.pop("search", None) or {}
+    if kind == "none":
+        search = {}
+    elif kind == "box":
+        search = {name: value for name, value in search.items() if name != "samples"}
+    target = {"box": "SubjectBox", "hull": "VisualHull", "none": "NoBounds"}[kind]
+    config["bounds"] = {"_target_": f"ghgs_lit.bounds.{target}", **search}
+
+
+def _unprojection_names_its_class(config: dict[str, Any]) -> None:
+    """The node ``unprojection`` has a ``_target_``, and every model has the node."""
+    if "depth_head" in config:
+        node = config.setdefault("unprojection", {})
+        node.setdefault("_target_", "ghgs_lit.geometry.unprojection.Unprojection")
+
+
+def _heads_name_what_they_skip(config: dict[str, Any]) -> None:
+    """The heads have their own copies of ``skip.views`` and ``skip.pixels``."""
+    skip, head, recalibration = (config.get(name) for name in ("skip", "depth_head", "recalibration"))
+    if not (isinstance(skip, dict) and isinstance(head, dict) and isinstance(recalibration, dict)):
+        return
+    if "views" in skip:
+        views = skip.setdefault("depth_views", {"subject": skip["views"], "all": "all"})
+        head.setdefault("views", views[recalibration.get("tokens", "subject")])
+    for name in ("pixels", "views"):
+        if name in skip and isinstance(config.get("gaussian_head"), dict):
+            config["gaussian_head"].setdefault(name, skip[name])
+
+
+#: Changes that no table can express, applied last: each takes the configuration and changes it in place.
+STEPS: list[Callable[[dict[str, Any]], None]] = [
+    _bounds_become_a_stage,
+    _heads_name_what_they_skip,
+    _unprojection_names_its_class,
+]
 
 
 def upgrade(config: Mapping[str, Any]) -> dict[str, Any]:

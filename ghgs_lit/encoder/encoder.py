@@ -1,24 +1,23 @@
 """The encode stage: photographs and masks to tokens."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ghgs_lit.bounds.visual_hull import Interval
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
-from ghgs_lit.encoder.cache import FeatureCache
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.geometry.relative_depth import INTERVAL_CHANNELS, relative_interval
-from ghgs_lit.types import Tokens
+from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
+from ghgs_lit.types import DepthBounds, Tokens
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
+#: Options of each kind of patch embedding (``encoder.vit``).
 VIT_OPTIONS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
 
 
@@ -26,16 +25,22 @@ class VGGTEncoder(nn.Module):
     """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
 
     Args:
-        width, heads, depth: of the aggregator; ``depth`` counts pairs of a frame and a global block.
+        width: of the aggregator's tokens.
+        heads: of its attention.
+        depth: pairs of a frame block and a global block.
         vit: ``{kind: conv}`` one convolution per patch; ``{kind: stem, channels}`` a small convolutional
             stem; ``{kind: dinov2, depth, heads}`` a DINOv2 ViT with registers.
-        layers: pairs whose tokens are read out, ascending; the last must be the last of all.
-        image_size: side of the square image whose patch positions a DINOv2 ViT stores.
-        mask_input: the mask is a further image channel.
-        interval_input: where a pixel's interval of depths begins and how long it is are two more.
+        layers: indices of the pairs whose tokens are read out, ascending; the last pair must be among them.
+        patch_size: side of a patch in pixels.
+        registers: register tokens of each view.
+        image_size: side of the square image whose patch positions a DINOv2 ViT stores, in pixels.
+        mask_input: add the mask to the input channels.
+        bounds_input: add two maps of the depth bounds (:func:`relative_bounds`) to the input channels.
         layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
         trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
         checkpointing: recompute activations in the backward pass instead of keeping them.
+        weights: name of the published weights that the encoder started from, or None. A note for checkpoints
+            and tables; nothing is loaded.
     """
 
     def __init__(
@@ -49,14 +54,14 @@ class VGGTEncoder(nn.Module):
         registers: int = 4,
         image_size: int = 518,
         mask_input: bool = False,
-        interval_input: bool = False,
+        bounds_input: bool = False,
         layer_scale: float = 0.01,
         trainable: str = "all",
         checkpointing: bool = False,
+        weights: str | None = None,
     ):
         super().__init__()
-        #: Set it to keep the tokens of photographs on disk.
-        self.cache: FeatureCache | None = None
+        #: All that the tokens depend on, the weights apart.
         self.options = {
             "width": width,
             "heads": heads,
@@ -66,13 +71,14 @@ class VGGTEncoder(nn.Module):
             "patch_size": patch_size,
             "registers": registers,
             "mask_input": mask_input,
-            "interval_input": interval_input,
+            "bounds_input": bounds_input,
         }
-        self.patch_size, self.mask_input, self.interval_input = patch_size, mask_input, interval_input
+        self.weights = weights
+        self.patch_size, self.mask_input, self.bounds_input = patch_size, mask_input, bounds_input
         self.dim_latent, self.dim_semantic = 2 * width, width
         mean, std = (*IMAGENET_MEAN, *[0.5] * mask_input), (*IMAGENET_STD, *[0.5] * mask_input)
-        channels = len(mean) + INTERVAL_CHANNELS * interval_input
-        # Not in a checkpoint, so real even in a model that is built on the meta device and then assigned.
+        channels = len(mean) + BOUNDS_CHANNELS * bounds_input
+        # No part of a checkpoint, so they need storage even in a model that is built on the meta device.
         for name, values in (("mean", mean), ("std", std)):
             constant = torch.tensor(values, device="cpu").view(-1, 1, 1)
             self.register_buffer(name, constant, persistent=False)
@@ -98,27 +104,27 @@ class VGGTEncoder(nn.Module):
         self,
         images: Float[Tensor, "b v c H W"],
         masks: Bool[Tensor, "..."],
-        interval: Interval | None = None,
+        bounds: DepthBounds | None = None,
+        cache: Callable[..., Tokens] | None = None,
     ) -> Tokens:
-        """Tokens of all views: of all patches, or of those that a feature cache keeps.
+        """Tokens of all views: of all patches, or of those that ``cache`` keeps.
 
         Args:
-            images: ``[B, V, 3, H, W]``, RGB in [0, 1], sides divisible by the patch size.
-            masks: ``[B, V, H, W]``; read where ``mask_input`` or ``interval_input`` is set.
-            interval: near and far, each ``[B, V, H, W]``; read where ``interval_input`` is set.
+            images: [B, V, 3, H, W], RGB in [0, 1], sides divisible by the patch size.
+            masks: [B, V, H, W]; read with ``mask_input`` or ``bounds_input``.
+            bounds: read with ``bounds_input``.
+            cache: a :class:`ghgs_lit.encoder.FeatureCache` to look the tokens up in; None: compute them.
         """
         self._check(images, masks)
-        if self.cache is not None:
-            return self.cache(self, images, masks, interval)
-        return self.encode(images, masks, interval)
+        return self.encode(images, masks, bounds) if cache is None else cache(self, images, masks, bounds)
 
     def encode(
-        self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."], interval: Interval | None
+        self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."], bounds: DepthBounds | None
     ) -> Tokens:
-        """All patches of all views, computed."""
+        """Compute the tokens of all patches of all views; arguments as in :meth:`forward`."""
         b, v, _, height, width = images.shape
         grid = (b, v, height // self.patch_size, width // self.patch_size)
-        pairs, patches = self.aggregator(self._normalized(images, masks, interval))
+        pairs, patches = self.aggregator(self._normalized(images, masks, bounds))
         first = self.aggregator.special
         axes = (torch.arange(n, device=images.device) for n in (b * v, *grid[2:]))
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
@@ -140,20 +146,20 @@ class VGGTEncoder(nn.Module):
         require(divisible, "images", expected, f"{height} x {width}")
         require(masks.shape == (b, v, height, width), "masks", str((b, v, height, width)), tuple(masks.shape))
 
-    def _normalized(self, images: Tensor, masks: Tensor, interval: Interval | None) -> Tensor:
-        """Channels to zero mean and unit spread, in the precision of the weights."""
+    def _normalized(self, images: Tensor, masks: Tensor, bounds: DepthBounds | None) -> Tensor:
+        """Input channels with zero mean and unit standard deviation, in the precision of the weights."""
         x = at_least_float32(images)
         if self.mask_input:
             x = torch.cat((x, masks.to(x.dtype)[:, :, None]), dim=2)
         x = (x - self.mean) / self.std
-        if self.interval_input:
-            require(interval is not None, "encoder.interval_input", "depths that are bounded", "no bounds")
-            x = torch.cat((x, relative_interval(interval, masks).to(x.dtype)), dim=2)
+        if self.bounds_input:
+            require(bounds is not None, "encoder.bounds_input", "depths that are bounded", "no bounds")
+            x = torch.cat((x, relative_bounds(bounds, masks).to(x.dtype)), dim=2)
         return x.to(self.aggregator.camera_token.dtype)
 
 
 def _joined(pairs: list[Pair], first: int) -> Iterator[Float[Tensor, "N C"]]:
-    """Tokens from ``first`` on of the frame and the global block side by side; ``pairs`` is used up."""
+    """Tokens from ``first`` on of frame and global block, concatenated; empties ``pairs`` to free memory."""
     while pairs:
         yield torch.cat([tokens[:, first:] for tokens in pairs.pop(0)], dim=-1).flatten(0, 1)
 

@@ -17,10 +17,15 @@ KINDS = ("squared", "huber", "truncated")
 def nearest(
     queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], chunk: int = 2048
 ) -> Int[Tensor, " n"]:
-    """Index of the nearest reference of each query; ``m`` must not be 0, coordinates must be finite.
+    """Index of the nearest reference of each query.
 
-    On the CPU by k-d tree in float64; on an accelerator by explicit differences, ``chunk`` queries at a
-    time (the matrix-product form of the distance is off by a millimetre at two metres).
+    On the CPU by a k-d tree in float64; on an accelerator by explicit differences (the matrix-product form of
+    the distance is off by a millimetre at two metres).
+
+    Args:
+        queries: finite coordinates.
+        references: finite coordinates, one point at least.
+        chunk: queries that are compared at once on an accelerator.
     """
     queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
     if queries.device.type == "cpu":
@@ -33,9 +38,12 @@ def nearest(
 
 
 def penalty(offsets: Float[Tensor, "n 3"], kind: str, scale: float) -> Float[Tensor, " n"]:
-    """What a pair at ``offsets`` metres from each other costs; all kinds are d^2 within ``scale``.
+    """The cost of pairs at a distance d: d^2 up to ``scale``.
 
-    Beyond it ``huber`` grows as 2 scale d - scale^2 and ``truncated`` stays at scale^2.
+    Args:
+        offsets: differences of the pairs, in metres.
+        kind: beyond ``scale``: ``squared``, d^2; ``huber``, 2 scale d - scale^2; ``truncated``, scale^2.
+        scale: in metres.
     """
     squared = offsets.square().sum(-1)
     if kind == "squared":
@@ -49,7 +57,7 @@ def penalty(offsets: Float[Tensor, "n 3"], kind: str, scale: float) -> Float[Ten
 
 
 def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, "m 3"]:
-    """At most ``limit`` of the points, evenly spaced in memory from a random start."""
+    """At most ``limit`` of the points (None: all), evenly spaced in memory from a random start."""
     if limit is None or len(points) <= limit:
         return points
     steps = torch.arange(limit, dtype=torch.float64) + torch.rand((), dtype=torch.float64)
@@ -64,10 +72,18 @@ def chamfer(
     scale: float = 0.1,
     limit: int | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean penalty from each point to its nearest reference plus the mean the other way round.
+    """Mean penalty from each point to its nearest reference, plus the mean the other way round.
 
-    With ``limit`` at most so many of each set are matched (to all of the other set, so that the mean stays
-    unbiased). 0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
+    Args:
+        points: the prediction, in metres.
+        references: the surface, in metres.
+        kind: of :func:`penalty`.
+        scale: of :func:`penalty`, in metres.
+        limit: points of each set that are matched at most (to all of the other set, so that the mean stays
+            unbiased); None: all.
+
+    Returns:
+        0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
     """
     choice("chamfer.kind", kind, KINDS)
     require(scale > 0, "chamfer.scale", "a positive number of metres", scale)

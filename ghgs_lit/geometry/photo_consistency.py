@@ -1,7 +1,7 @@
-"""How well the photographs agree about each depth that the visual hull leaves possible.
+"""How well the photographs agree about depths of each pixel.
 
-A plane sweep (Collins, CVPR 1996) within each pixel's own interval: a point on the surface has the same
-colour in the views that see it.
+A plane sweep (Collins, CVPR 1996) within each pixel's own bounds: a point on the surface has the same colour
+in the views that see it.
 """
 
 import torch
@@ -9,26 +9,31 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.bounds.visual_hull import Interval
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers
-from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.types import Batch, Cameras, DepthBounds
 
-#: Mean difference of two colours at which they agree by 1 / e.
+#: Mean absolute difference of two colours at which the consistency is 1 / e.
 TOLERANCE = 0.1
 
-#: Cosine of the angle between two views' axes from which on they hardly see a common surface (127 degrees).
+#: Least cosine of the angle between the axes of two views that are compared (127 degrees): beyond it they
+#: hardly see a common surface.
 WIDEST = -0.6
 
 
 @torch.no_grad()
-def photo_consistency(batch: Batch, interval: Interval, steps: int) -> Float[Tensor, "B V S H W"]:
-    """Agreement of each pixel of the subject with its best other view, in [0, 1].
+def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
+    """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient.
 
-    At ``steps`` depths, the middles of as many equal parts of ``near`` to ``far``. 0 outside the subject
-    and where no other view has the point inside its mask. Without a gradient.
+    Args:
+        batch: images, masks and cameras are read.
+        bounds: near and far of each pixel, in metres.
+        steps: S, how many depths are compared: the middles of S equal parts of near to far.
+
+    Returns:
+        0 outside the subject, and where no other view has the point inside its mask.
     """
     b, v, height, width = batch.masks.shape
-    near, far = (at_least_float32(bound) for bound in interval)
+    near, far = at_least_float32(bounds.near), at_least_float32(bounds.far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     colors = _smooth(batch.images.to(near), batch.masks)
     centers = pixel_centers(height, width, near)
@@ -64,7 +69,7 @@ def _match(other: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tenso
 
 
 def _smooth(images: Tensor, masks: Tensor) -> Tensor:
-    """Colours averaged over the subject's pixels among 3 x 3, and the mask as a fourth channel."""
+    """Colours averaged over the subject's pixels in 3 x 3, and the mask as a fourth channel."""
     inside = masks.to(images.dtype)[:, :, None]
     both = F.avg_pool2d(torch.cat((images * inside, inside), 2).flatten(0, 1), 3, 1, 1)
     both = both.unflatten(0, masks.shape[:2])
@@ -73,7 +78,7 @@ def _smooth(images: Tensor, masks: Tensor) -> Tensor:
 
 
 def _relations(cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
-    """From pixels of view j to pixels of view k: ``z_k p_k = z_j turn p_j + shift``; cosine of their axes."""
+    """From pixels of view j to pixels of view k, ``z_k p_k = z_j turn p_j + shift``; cosine of their axes."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     rotation, translation = extrinsics[..., :3, :3], extrinsics[..., :3, 3:]
     with torch.autocast(intrinsics.device.type, enabled=False):

@@ -11,14 +11,18 @@ from ghgs_lit.types import Cameras
 
 
 def at_least_float32(tensor: Tensor) -> Tensor:
-    """``tensor`` in float32 or wider: what all geometry is computed in."""
+    """``tensor`` in float32 or wider, the precision of all geometry."""
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
 def pixel_centers(height: int, width: int, like: Tensor, stride: int = 1) -> Float[Tensor, "h w 2"]:
-    """Centres ``(u, v)`` in pixels of the ``stride`` x ``stride`` cells of an image.
+    """Centres ``(u, v)`` of the cells of an image, in pixels.
 
-    ``stride=1`` gives pixel centres, ``stride=patch_size`` the true centres of the patches.
+    Args:
+        height: of the image in pixels.
+        width: of the image in pixels.
+        like: gives device and dtype.
+        stride: side of a cell; 1 gives pixel centres, the patch size the centres of the patches.
     """
     rows = (torch.arange(height // stride, device=like.device, dtype=like.dtype) + 0.5) * stride
     columns = (torch.arange(width // stride, device=like.device, dtype=like.dtype) + 0.5) * stride
@@ -46,7 +50,7 @@ def unproject(
 def unproject_maps(
     depth: Float[Tensor, "*batch h w"], cameras: Cameras, stride: int = 1
 ) -> Float[Tensor, "*batch h w 3"]:
-    """World points of a depth map whose cells are ``stride`` pixels wide."""
+    """World points of a depth map in metres whose cells are ``stride`` pixels wide."""
     centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth), stride)
     return unproject(
         centers.expand(*depth.shape, 2),
@@ -69,7 +73,7 @@ def project(
     intrinsics: Float[Tensor, "*#batch 3 3"],
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
-    """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 mean nothing."""
+    """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 are meaningless."""
     camera = world_to_camera(points, extrinsics)
     intrinsics = at_least_float32(intrinsics)
     z = camera[..., 2]

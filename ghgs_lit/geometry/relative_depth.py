@@ -1,38 +1,50 @@
-"""Depths told from the middle of the subject, as maps that a network can look at."""
+"""Depths relative to the middle of the subject, as input maps of a network."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.bounds.visual_hull import Interval
+from ghgs_lit.types import DepthBounds
 
 #: Metres that become 1: about the depth of a body.
 UNIT = 0.25
 
-#: Channels of :func:`relative_interval`.
-INTERVAL_CHANNELS = 2
+#: Channels of :func:`relative_bounds`.
+BOUNDS_CHANNELS = 2
 
 
-def subject_mean(values: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]) -> Tensor:
-    """Mean over the subject's pixels of each view, [B, V, 1, 1]; 0 for a view without any."""
+def subject_mean(
+    values: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
+) -> Float[Tensor, "B V 1 1"]:
+    """Mean over the subject's pixels of each view; 0 for a view without any."""
     count = masks.sum((-2, -1), keepdim=True)
     return torch.where(masks, values, 0).sum((-2, -1), keepdim=True) / count.clamp(min=1)
 
 
-def relative_interval(interval: Interval, masks: Bool[Tensor, "B V H W"]) -> Float[Tensor, "B V 2 H W"]:
-    """Where a pixel's interval of depths begins, from the middle of its view's, and how long it is.
+def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Float[Tensor, "B V 2 H W"]:
+    """The bounds as two maps: what masks and cameras say about the shape, not about the distance.
 
-    In units of :data:`UNIT`, 0 outside the subject: what masks and cameras say about the shape.
+    Args:
+        bounds: near and far in metres.
+        masks: of the subject.
+
+    Returns:
+        ``near`` minus the mean middle of the view's bounds, and ``far - near``, in units of :data:`UNIT`;
+        0 outside the subject.
     """
-    near, far = interval
-    middle = subject_mean((near + far) / 2, masks)
-    maps = torch.stack((near - middle, far - near), dim=2) / UNIT
+    middle = subject_mean((bounds.near + bounds.far) / 2, masks)
+    maps = torch.stack((bounds.near - middle, bounds.far - bounds.near), dim=2) / UNIT
     return torch.where(masks[:, :, None], maps, 0)
 
 
 def relative_depth(
     depth: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 H W"]:
-    """Depth from its mean over the view's subject, in units of :data:`UNIT`; without a gradient."""
+    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient.
+
+    Args:
+        depth: in metres.
+        masks: of the subject; the map is 0 outside.
+    """
     depth = depth.detach()
     return torch.where(masks, (depth - subject_mean(depth, masks)) / UNIT, 0)[:, :, None]

@@ -16,22 +16,23 @@ from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 class Unprojection:
     """``unprojection(depth_maps, tokens, batch) -> Points``, without parameters, in float32 or wider.
 
-    ``tokens`` says where a token lies:
-
-    * ``subject``: at the mean pixel and mean depth of the valid pixels of its patch. The mean of both
-      keeps the point on the surface: at a silhouette the patch's centre may lie beside the subject,
-      and a depth of the subject there is a point that nothing occupies. A patch without a valid
-      pixel lies at its centre and mean depth, and is not valid.
-    * ``release``: what the authors' code does: a 2 x 2 sample of inverse depth, at the centres of a
-      grid laid over the image without its ``border`` pixels. Tokens count as valid all the same.
+    Args:
+        tokens: where a token lies.
+            ``subject``: at the mean pixel and mean depth of the valid pixels of its patch. The mean of both
+            keeps the point on the surface: at a silhouette the patch's centre may lie beside the subject, and
+            the subject's depth there is a point that nothing occupies. A patch without a valid pixel lies at
+            its centre and mean depth, and is not valid.
+            ``release``: as in the authors' code, at a 2 x 2 sample of inverse depth and at the centres of a
+            grid over the image without its ``border``. Validity is that of ``subject``.
+        border: pixels on each side of the image that the grid of ``release`` leaves out.
     """
 
     tokens: str = "subject"
     border: int = 0
 
     def __post_init__(self) -> None:
-        choice("points.tokens", self.tokens, ("subject", "release"))
-        require(self.border >= 0, "points.border", "0 or more pixels", self.border)
+        choice("unprojection.tokens", self.tokens, ("subject", "release"))
+        require(self.border >= 0, "unprojection.border", "0 or more pixels", self.border)
 
     def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> Points:
         locate = subject_tokens if self.tokens == "subject" else self._release_tokens

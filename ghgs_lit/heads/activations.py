@@ -1,4 +1,4 @@
-"""From the raw channels of a dense head to values and a confidence."""
+"""Activations that turn the raw channels of a dense head into values and a confidence."""
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +15,7 @@ def inverse_log(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def unit(x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-    """``x`` over its length; 0 stays 0, with a zero gradient."""
+    """``x`` divided by its length; 0 stays 0, with a zero gradient."""
     squared = x.square().sum(-1, keepdim=True)
     return torch.where(squared > 0, x * torch.where(squared > 0, squared, 1.0).rsqrt(), 0.0)
 
@@ -46,10 +46,15 @@ CONFIDENCES = {"expp1": lambda c: 1 + c.exp(), "expp0": torch.exp, "sigmoid": to
 def split_activated(
     raw: Float[Tensor, "n c h w"], value: str, confidence: str = "expp1"
 ) -> tuple[Float[Tensor, "n h w c-1"], Float[Tensor, "n h w"]]:
-    """Values (all channels but the last) and confidence (the last), float32 or wider.
+    """Activated values and confidence, float32 or wider.
 
-    ``value`` is one of :data:`VALUES`, ``confidence`` one of :data:`CONFIDENCES`. Published depth heads
-    use ``exp``, point heads ``inv_log``, the release of the paper ``linear``; all with ``expp1``.
+    Published depth heads use ``exp``, point heads ``inv_log``, the release of the paper ``linear``; all with
+    ``expp1``.
+
+    Args:
+        raw: channels of a dense head, the last one for the confidence.
+        value: one of :data:`VALUES`.
+        confidence: one of :data:`CONFIDENCES`.
     """
     choice("value activation", value, tuple(VALUES))
     choice("confidence activation", confidence, tuple(CONFIDENCES))

@@ -1,4 +1,4 @@
-"""A dense head in the published proportions to its encoder, on the views that are wanted."""
+"""Dense heads whose widths follow the encoder's, run on some of the views."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,10 +18,14 @@ def proportioned_dpt(
     out_channels: Sequence[int] | None = None,
     **options,
 ) -> DPTHead:
-    """A :class:`DPTHead` for tokens of width ``dim_latent``.
+    """A :class:`DPTHead` whose widths keep the published proportions to its tokens.
 
-    Widths that are not given follow the published ones, which are fractions of the tokens' 2048:
-    features 1/8 (256), levels 1/8, 1/4, 1/2 and 1/2 (256, 512, 1024, 1024).
+    Args:
+        dim_latent: width of the tokens, 2048 as published.
+        output_dim: channels of the result.
+        features: None for 1/8 of the tokens' width (256 as published).
+        out_channels: None for 1/8, 1/4, 1/2 and 1/2 of it (256, 512, 1024, 1024 as published).
+        options: further options of :class:`DPTHead`.
     """
     if features is None:
         features = _multiple(dim_latent / 8, 8)
@@ -36,23 +40,21 @@ def decode_views(
     guide: Float[Tensor, "b v k H W"] | None,
     wanted: Bool[Tensor, "b v"],
 ) -> Float[Tensor, "bv o H W"]:
-    """What ``dpt`` makes of the images that are ``wanted``; 0 for the others, which it does not see.
+    """Maps of the images that are ``wanted``; 0 for the others, which ``dpt`` does not see.
 
-    Where none is wanted all are decoded: a shape for what follows, and gradients of 0.
+    Args:
+        dpt: the dense head.
+        tokens: of all images.
+        guide: of all images, for a head with a guide.
+        wanted: where none is, all images are decoded: the maps keep their shape and a gradient of 0.
     """
     flat = wanted.flatten()
     if flat.all() or not flat.any():
         return dpt(tokens, guide)
     kept = flat.nonzero()[:, 0]
-    chosen = flat[tokens.image]
+    part = tokens.select(flat[tokens.image])
     part = dataclasses.replace(
-        tokens,
-        latent=tuple(layer[chosen] for layer in tokens.latent),
-        semantic=tokens.semantic[chosen],
-        image=(flat.cumsum(0) - 1)[tokens.image[chosen]],
-        row=tokens.row[chosen],
-        column=tokens.column[chosen],
-        grid=(1, len(kept), *tokens.grid[2:]),
+        part, image=(flat.cumsum(0) - 1)[part.image], grid=(1, len(kept), *tokens.grid[2:])
     )
     maps = dpt(part, None if guide is None else guide.flatten(0, 1)[kept][None])
     return torch.zeros(len(flat), *maps.shape[1:], dtype=maps.dtype, device=maps.device).index_copy(

@@ -16,7 +16,7 @@ from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
-#: Values of the largest map that are held where no gradient is kept.
+#: Values of the largest map that are held at once where no gradient is kept (128 MB in float32).
 _LARGEST = 1 << 25
 NORM_EPS = 1e-5
 
@@ -26,7 +26,7 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 
 
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
-    """A 1x1 convolution as a linear of pixels: no copy where channels are innermost, as they are here."""
+    """A 1x1 convolution as a linear layer of pixels: no copy, since channels are innermost here."""
     return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
 
 
@@ -46,7 +46,7 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         rectified = F.relu(x)
-        # In place where no gradient needs what was there: what a convolution gave.
+        # In place: no gradient needs the result of a convolution.
         return self.conv2(F.relu_(self.conv1(rectified))).add_(rectified)
 
 
@@ -97,8 +97,6 @@ class DPTHead(nn.Module):
         hidden: channels before the last convolution (32 as published).
         guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
             sharp; 0: none, as published.
-        images_per_step: images that go through the head together where no gradient is kept; by itself as
-            many as keep the largest map within 128 MB in float32.
     """
 
     def __init__(
@@ -109,7 +107,6 @@ class DPTHead(nn.Module):
         output_dim: int,
         hidden: int = 32,
         guide_channels: int = 0,
-        images_per_step: int | None = None,
     ):
         super().__init__()
         require(features % 8 == 0, "features", "a multiple of 8", features)
@@ -119,9 +116,7 @@ class DPTHead(nn.Module):
             "four multiples of 4",
             list(out_channels),
         )
-        positive = images_per_step is None or images_per_step > 0
-        require(positive, "images_per_step", "a positive number", images_per_step)
-        self.images_per_step, self.full_channels = images_per_step, features // 2
+        self.full_channels = features // 2
         c0, c1, _, c3 = out_channels
         self.norm = nn.LayerNorm(dim_in, eps=NORM_EPS)
         self.projects = nn.ModuleList(nn.Conv2d(dim_in, c, 1) for c in out_channels)
@@ -139,7 +134,14 @@ class DPTHead(nn.Module):
     def forward(
         self, tokens: Tokens, guide: Float[Tensor, "b v k H W"] | None = None
     ) -> Float[Tensor, "bv o H W"]:
-        """Raw maps of all images, float32 or wider; ``guide`` is wanted where ``guide_channels`` is set."""
+        """Raw maps of all images, float32 or wider.
+
+        Without a gradient the images go through the head in parts of equal size, to save memory.
+
+        Args:
+            tokens: of four layers.
+            guide: where ``guide_channels`` is not 0.
+        """
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
         expected = "none" if self.guide is None else "a map"
         require((guide is None) == (self.guide is None), "guide", expected, guide is not None)
@@ -149,9 +151,8 @@ class DPTHead(nn.Module):
         if torch.is_grad_enabled():
             return self._decode(levels, tokens.patch_size, flat)
         height, width = (n * tokens.patch_size for n in tokens.grid[2:])
-        step = self.images_per_step or max(1, _LARGEST // (self.full_channels * height * width))
         maps = None
-        for part in even_parts(count, step):
+        for part in even_parts(count, _LARGEST // (self.full_channels * height * width)):
             guides = None if flat is None else flat[part]
             found = self._decode([level[part] for level in levels], tokens.patch_size, guides)
             if len(found) == count:
@@ -162,7 +163,7 @@ class DPTHead(nn.Module):
         return maps
 
     def _levels(self, tokens: Tokens) -> list[Float[Tensor, "bv c h w"]]:
-        """Normalised and projected tokens on the grid; a 1x1 convolution of a map is a linear of tokens."""
+        """Normalised and projected tokens on the grid (a 1x1 convolution is a linear layer of tokens)."""
         levels = []
         for latent, project in zip(tokens.latent, self.projects, strict=True):
             projected = linear(self.norm(latent), project.weight.flatten(1), project.bias)
@@ -196,7 +197,7 @@ class DPTHead(nn.Module):
         if guide is not None:
             x = x + full
         x = s.output_conv2[:-1](x)
-        # The last projection stays wide under autocast: depths and offsets of millimetres hang on it.
+        # The last projection stays in float32 under autocast: depths and offsets of millimetres depend on it.
         last = s.output_conv2[-1]
         with torch.autocast(x.device.type, enabled=False):
             return _pointwise(last, x.to(last.weight.dtype))

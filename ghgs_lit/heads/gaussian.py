@@ -16,13 +16,13 @@ from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.heads.activations import unit
 from ghgs_lit.heads.dense import decode_views, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
-from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Tokens
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def _logit(share: float) -> float:
-    return log(share / (1 - share))
+def _logit(probability: float) -> float:
+    return log(probability / (1 - probability))
 
 
 def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
@@ -32,20 +32,26 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _wide_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
-    """``mlp(x)``, its last projection wide under autocast: offsets of millimetres hang on it."""
+def _float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
+    """``mlp(x)``, its last projection in float32 under autocast: offsets of millimetres depend on it."""
     hidden, last = mlp[:-1](x), mlp[-1]
     with torch.autocast(x.device.type, enabled=False):
         return at_least_float32(last(hidden.to(last.weight.dtype)))
 
 
 class FootprintAttributes:
-    """Raw values to attributes in units of what one pixel sees; raw zeros give a splat on the surface.
+    """Raw values to attributes in units of a pixel's footprint; raw zeros give a splat on the surface.
 
-    A pixel's footprint is ``z / f`` metres. Scales lie between ``scale_floor`` and ``scale_cap`` footprints
-    (log scale), starting at ``scale_start``; the floor leaves no holes when the splat is rendered at a higher
-    resolution. Opacities lie above ``opacity_floor``, starting at ``opacity_start``: below 1/255 a splat
-    has no gradient left. Offsets lie within ``offset_limit`` metres along each axis.
+    A pixel's footprint is ``z / f`` metres.
+
+    Args:
+        offset_limit: largest offset along each axis, in metres.
+        scale_floor: least scale in footprints; it leaves no holes when splats are rendered at a higher
+            resolution.
+        scale_cap: largest scale in footprints.
+        scale_start: scale in footprints at which training starts.
+        opacity_floor: least opacity: below 1/255 a splat has no gradient left.
+        opacity_start: opacity at which training starts.
     """
 
     def __init__(
@@ -110,25 +116,25 @@ def release_attributes(
 class GaussianHead(nn.Module):
     """A dense head over the recalibrated tokens, then four small networks for each pixel of the subject.
 
-    Colours are the input pixels', unless ``color_limit`` lets them change. Published names:
-    ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, linears at 0, 2 and 4.
+    Colours are the input pixels', unless ``color_limit`` lets them change. Published names of the networks:
+    ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, with linear layers 0, 2 and 4.
 
     Args:
         dim_latent: width of the tokens (from the encoder).
         dpt: options of the dense head; widths that are not given follow the encoder's.
-        channels: of the dense head's result, a descriptor for each pixel.
-        hidden: widths inside the four networks.
+        channels: of the dense head's result, a descriptor of each pixel.
+        hidden: two widths inside the four networks.
         parameterization: ``footprint`` (:class:`FootprintAttributes`, raw values start at 0) or
             ``release`` (:func:`release_attributes`, PyTorch's initialisation).
         attributes: options of :class:`FootprintAttributes`.
         pixels: ``subject`` runs the four networks on the subject's pixels, ``all`` on every pixel and
-            selects after; the Gaussians are the same.
-        views: ``subject`` decodes views with a pixel of the subject only, ``all`` every view.
+            selects afterwards; the Gaussians are the same.
+        views: ``subject`` decodes only views with a pixel of the subject, ``all`` every view.
         guide: let the dense head see photographs, masks and depths at full resolution.
-        agreement: the guide also tells how well the photographs agree at the depth that was found
-            (:func:`photo_consistency`): a splat off the surface can become transparent.
-        color_limit: how far a colour may leave its pixel's, in each channel, which makes up for the blur of
-            splats and for dark rims; 0: not at all (the paper).
+        photo_consistency: the guide also shows the :func:`photo_consistency` at the predicted depth: a splat
+            off the surface can become transparent.
+        color_limit: largest change of a colour from its pixel's, in each channel, which makes up for the blur
+            of splats and for dark rims; 0: none (the paper).
     """
 
     def __init__(
@@ -142,7 +148,7 @@ class GaussianHead(nn.Module):
         pixels: str = "subject",
         views: str = "subject",
         guide: bool = False,
-        agreement: bool = False,
+        photo_consistency: bool = False,
         color_limit: float = 0.0,
     ):
         super().__init__()
@@ -150,11 +156,12 @@ class GaussianHead(nn.Module):
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
         choice("gaussian_head.views", views, ("subject", "all"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
-        require(guide or not agreement, "gaussian_head.agreement", "false where there is no guide", agreement)
+        allowed = guide or not photo_consistency
+        require(allowed, "gaussian_head.photo_consistency", "false where there is no guide", True)
         require(color_limit >= 0, "gaussian_head.color_limit", "0 or more", color_limit)
         self.pixels, self.views = pixels, views
-        self.agreement, self.color_limit = agreement, color_limit
-        guided = PHOTO_CHANNELS + 1 + agreement if guide else 0
+        self.photo_consistency, self.color_limit = photo_consistency, color_limit
+        guided = PHOTO_CHANNELS + 1 + photo_consistency if guide else 0
         self.decoder = proportioned_dpt(dim_latent, channels, guide_channels=guided, **(dpt or {}))
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
@@ -175,7 +182,14 @@ class GaussianHead(nn.Module):
             nn.init.zeros_(header[-1].bias)
 
     def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """Gaussians of the valid pixels in the order of element, view, row, column."""
+        """Gaussians of the valid pixels in the order of element, view, row, column.
+
+        Args:
+            tokens: recalibrated.
+            batch: images, masks and cameras are read.
+            points: of the pixels.
+            depth_maps: of the same pixels.
+        """
         wanted = points.valid.flatten(2).any(-1) | (self.views == "all")
         maps = decode_views(self.decoder, tokens, self._guide(batch, points, depth_maps), wanted)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
@@ -191,7 +205,7 @@ class GaussianHead(nn.Module):
             at_least_float32(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
         )
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
-        # Without a gradient: a splat that is too large must not come nearer to become smaller.
+        # Without a gradient: a splat that is too large must not move nearer to become smaller.
         footprint = depth.detach() / focal
         offset, scales, quaternions, opacities = self.activate(offset, scale, rotation, opacity, footprint)
         colors = at_least_float32(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
@@ -212,15 +226,15 @@ class GaussianHead(nn.Module):
         if self.decoder.guide is None:
             return None
         maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]
-        if self.agreement:
+        if self.photo_consistency:
             depth = at_least_float32(depth_maps.depth.detach())
-            maps.append(photo_consistency(batch, (depth, depth), 1))
+            maps.append(photo_consistency(batch, DepthBounds(depth, depth), 1))
         return photo_guide(batch, *maps)
 
     def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:
-        """What the networks say: offset, scale, rotation, opacity and, where there is one, color."""
+        """Raw offset, scale, rotation, opacity and, where there is a network for it, color."""
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.color_limit > 0:
             headers.append(self.color_header)
-        offset, scale, rotation, opacity, *color = (_wide_last(header, descriptors) for header in headers)
+        offset, scale, rotation, opacity, *color = (_float32_last(header, descriptors) for header in headers)
         return offset, scale, rotation, opacity[..., 0], *color

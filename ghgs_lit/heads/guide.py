@@ -1,6 +1,6 @@
-"""What a dense head may look at beside its tokens: photographs, masks and depths at full resolution.
+"""Further input of a dense head beside its tokens: photographs, masks and depths at full resolution.
 
-A patch is one token, so that a head on tokens alone draws soft edges. Published weights use no guide.
+A patch is one token, so a head that sees tokens alone draws soft edges. Published weights use no guide.
 """
 
 import torch
@@ -16,7 +16,7 @@ PHOTO_CHANNELS = 4
 
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Float[Tensor, "B V k H W"]:
-    """Photographs, masks and further ``maps`` as the channels of one map."""
+    """Photographs, masks and further ``maps`` as channels of one map."""
     images = at_least_float32(batch.images)
     return torch.cat((images, batch.masks.to(images.dtype)[:, :, None], *maps), dim=2)
 
@@ -24,7 +24,11 @@ def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Float[Tensor
 class GuidePyramid(nn.Module):
     """A guide at full, half and quarter resolution, by three convolutions.
 
-    Gives maps of ``features / 2``, ``features`` and ``features`` channels, to be added to a dense head's.
+    The maps have ``features / 2``, ``features`` and ``features`` channels and are added to a dense head's.
+
+    Args:
+        channels: of the guide.
+        features: of the dense head.
     """
 
     def __init__(self, channels: int, features: int):

@@ -21,7 +21,7 @@ def axis_coordinates(count: int, half_extent: float, dtype: torch.dtype, device=
 def _axis_waves(
     channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "c n"]:
-    """Sines, then cosines of one axis, float64 inside, float32 outside, in units of ``SCALE``."""
+    """Sines, then cosines along one axis times ``SCALE``; computed in float64, returned in float32."""
     quarter = channels // 2
     exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
     omega = 1.0 / BASE**exponents
@@ -34,8 +34,15 @@ def position_embedding(
 ) -> Float[Tensor, "c rows columns"]:
     """``0.1 E``: waves of x in the first half of the channels, of y in the second.
 
-    The unit is half the diagonal of an image of ``aspect`` width / height; samples are cell centres.
-    Waves of the two axes are cached (a few kilobytes each), their outer layout is not.
+    The unit is half the diagonal of the image; samples are cell centres. The waves of the two axes are cached
+    (a few kilobytes each), the map is not.
+
+    Args:
+        channels: of the map, a multiple of 4.
+        rows: of the map.
+        columns: of the map.
+        aspect: width / height of the image.
+        like: gives the device; float64 gives float64 coordinates.
     """
     x, y = _waves(channels, rows, columns, aspect, like)
     return torch.cat((x.expand(-1, rows, -1), y.expand(-1, -1, columns)))

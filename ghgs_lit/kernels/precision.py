@@ -1,4 +1,4 @@
-"""Half precision where it is safe: products of networks; geometry and last projections stay float32."""
+"""Half precision where it is safe: products of networks; geometry and last projections stay in float32."""
 
 from contextlib import AbstractContextManager, nullcontext
 
@@ -10,7 +10,7 @@ PRECISIONS = ("inherit", "float32", "bfloat16", "float16", "auto")
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether the device multiplies in bfloat16 by itself; elsewhere it would be slower than float32."""
+    """Whether the device has bfloat16 instructions; without them bfloat16 is slower than float32."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if device.type == "cpu" else {}
@@ -18,10 +18,12 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
-    """The autocast of a forward pass.
+    """The autocast context of a forward pass.
 
-    ``inherit`` leaves the caller's; ``auto`` is bfloat16 where the device has it, else float16 on CUDA and
-    float32 on a CPU.
+    Args:
+        name: one of :data:`PRECISIONS`. ``inherit`` keeps the caller's; ``auto`` is bfloat16 where the device
+            has it, else float16 on CUDA and float32 on a CPU.
+        device: where the pass runs.
 
     Raises:
         InputError: float16 on a CPU, or bfloat16 where the device has none.

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32
 
 REGIONS = ("image", "box", "subject")
@@ -51,8 +52,7 @@ def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n 
 
     def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
         index = torch.arange(hit.shape[1], device=hit.device)
-        first = torch.where(hit, index, hit.shape[1]).amin(-1, keepdim=True)
-        last = torch.where(hit, index, -1).amax(-1, keepdim=True)
+        first, last = (end[:, None] for end in first_and_last(hit))
         grow = (margin * (last - first + 1)).round()
         return (index >= first - grow) & (index <= last + grow) & hit.any(-1, keepdim=True)
 

@@ -27,15 +27,16 @@ class Recalibration(nn.Module):
 
     Args:
         dim_latent: width of the tokens (from the encoder).
-        k: number of neighbours of a token; all tokens where there are fewer.
-        num_heads, similarity, s_min: see :class:`SemanticAttention`.
-        neighborhood: the space in which neighbours are searched: ``xyz``, the token points; ``image_plane``,
+        k: neighbours of a token, or all there are if they are fewer.
+        num_heads: see :class:`SemanticAttention`.
+        similarity: see :class:`SemanticAttention`.
+        s_min: see :class:`SemanticAttention`.
+        neighborhood: where distances are measured: ``xyz``, between token points; ``image_plane``, between
             token centres in units of the image's longer side, shared by all views (the paper without
-            unprojection); ``feature``, directions of the semantic features.
-        neighbors: views of the neighbours: ``all``, ``other_views`` or ``mixed`` (see
-            :func:`nearest_neighbors`).
-        tokens: ``subject``, tokens with a valid point (the others pass unchanged); ``all`` (the authors'
-            release).
+            unprojection); ``feature``, between directions of the semantic features.
+        neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
+        tokens: which tokens take part: ``subject``, those with a valid point, others pass unchanged; ``all``,
+            as in the release.
     """
 
     def __init__(
@@ -58,7 +59,13 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, num_heads, similarity, s_min)
 
     def forward(self, tokens: Tokens, points: Points, batch: Batch) -> Tokens:
-        """Tokens with recalibrated layers; their order and the semantic features do not change."""
+        """Tokens with recalibrated layers; the semantic features and the order stay.
+
+        Args:
+            tokens: from the encoder.
+            points: of the same tokens.
+            batch: the number of elements and views is read.
+        """
         batch_size, views = batch.masks.shape[:2]
         chosen = self.takes_part(points).nonzero()[:, 0]
 

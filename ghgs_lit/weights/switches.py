@@ -13,6 +13,10 @@ from ghgs_lit.config import conf_dir
 def release_switches() -> dict[tuple[str, ...], Any]:
     """The release's value of each switch of the model, by (group, key)."""
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "compat" / "release.yaml"))
+    for choice in node["defaults"]:
+        ((group, option),) = ((key.removeprefix("override /"), value) for key, value in choice.items())
+        if group != "metrics":
+            node[group] = OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{option}.yaml"))
     return {
         (group, key): value
         for group, values in node.items()

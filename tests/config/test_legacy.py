@@ -1,7 +1,48 @@
-"""Configurations of earlier versions are read in today's names."""
+"""Configurations of earlier versions describe the same models and name classes that exist."""
 
-from ghgs_lit.config import compose, legacy, resolve
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from ghgs_lit.config import compose, conf_dir, legacy, resolve
 from ghgs_lit.config.build import _targets
+from ghgs_lit.config.keys import flatten, lookup
+from ghgs_lit.config.legacy import KEYS, TARGETS, VALUES, upgrade
+from ghgs_lit.model import GHGS, STAGES
+from tests.helpers.models import config
+
+OLD = OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[1] / "fixtures" / "old_configs.yaml"))
+TODAY = {
+    "demo": ["experiment=demo"],
+    "release": ["experiment=thuman2", "encoder=vggt_nano", "compat=release"],
+}
+
+
+def nested(key, value):
+    """A configuration of one dotted key."""
+    for name in reversed(key.split(".")):
+        value = {name: value}
+    return value
+
+
+def targets(node):
+    """Every ``_target_`` in a configuration."""
+    return {value for key, value in flatten(node).items() if key.endswith("_target_")}
+
+
+def shipped_keys():
+    """Every key, of any option, that the shipped configurations have, and the nodes above it."""
+    found = set()
+    for path in conf_dir().rglob("*.yaml"):
+        is_global = "@package _global_" in path.read_text().splitlines()[0]
+        group = () if is_global else path.relative_to(conf_dir()).parts[:-1]
+        for key in flatten(OmegaConf.to_container(OmegaConf.load(path))):
+            parts = (*group, *key.split("."))
+            found |= {".".join(parts[:end]) for end in range(1, len(parts) + 1)}
+    return found
 
 
 def test_keys_classes_and_values_are_renamed(monkeypatch):
@@ -34,3 +75,101 @@ def test_todays_configuration_is_unchanged():
     config = resolve(compose("train"))
     assert legacy.upgrade(config) == config
     assert not {target for _, target in _targets(config)} & set(legacy.TARGETS)
+
+
+@pytest.mark.parametrize("name", list(OLD))
+def test_an_old_configuration_builds_the_same_model(name):
+    """Checkpoints of earlier versions must still load: same tensors, and the same choices without tensors."""
+    with torch.device("meta"):
+        old, new = (GHGS.from_config(c) for c in (upgrade(OLD[name]), config(*TODAY[name])))
+    shapes = [{key: value.shape for key, value in model.state_dict().items()} for model in (old, new)]
+    assert shapes[0] == shapes[1]
+    assert shapes[0]
+    assert (type(old.bounds), old.unprojection) == (type(new.bounds), new.unprojection)
+    assert vars(old.bounds) == vars(new.bounds)
+    assert (old.crops, old.depth_head.views) == (new.crops, new.depth_head.views)
+    assert (old.gaussian_head.views, old.gaussian_head.pixels) == ("subject", "subject")
+
+
+@pytest.mark.parametrize("name", list(OLD))
+def test_an_upgraded_configuration_is_todays(name):
+    """A run of today that resumes an old one must find no difference but those that were made."""
+    old, today = upgrade(OLD[name]), config(*TODAY[name])
+    nodes = (*STAGES, "skip", "model", "compat", "ablation")
+    changed = {
+        key: (flatten(old).get(key), value)
+        for node in nodes
+        for key, value in flatten(today[node], node).items()
+        if flatten(old).get(key) != value
+    }
+    assert changed == {}
+    assert upgrade(old) == old
+    assert upgrade(today) == today
+
+
+@pytest.mark.parametrize("name", list(OLD))
+def test_every_class_of_an_old_configuration_exists(name):
+    """Data and callbacks of an old checkpoint are built from its configuration, too."""
+    for target in targets(upgrade(OLD[name])):
+        module, attribute = target.rsplit(".", 1)
+        assert hasattr(import_module(module), attribute), target
+
+
+def test_an_upgrade_leaves_its_argument_alone():
+    """The configuration of a checkpoint is read more than once."""
+    before = flatten(OLD["demo"])
+    assert upgrade(OLD["demo"]) != OLD["demo"]
+    assert flatten(OLD["demo"]) == before
+
+
+@pytest.mark.parametrize(("old", "new"), KEYS.items())
+def test_a_key_moves_to_one_that_exists(old, new):
+    """An entry that names no key of today would lose the value in silence."""
+    keys = shipped_keys()
+    assert new in keys
+    assert old not in keys
+    value = {"x": 1}
+    upgraded = upgrade(nested(old, value))
+    assert lookup(upgraded, new)["x"] == 1
+    assert lookup(upgraded, old) is None
+
+
+@pytest.mark.parametrize(("old", "new"), TARGETS.items())
+def test_a_class_moves_to_one_that_exists(old, new):
+    """A ``_target_`` that cannot be imported makes a checkpoint unreadable."""
+    module, name = new.rsplit(".", 1)
+    assert hasattr(import_module(module), name)
+    assert targets(upgrade({"a": {"b": {"_target_": old}}})) == {new}
+
+
+@pytest.mark.parametrize(("place", "new"), VALUES.items())
+def test_a_value_gets_its_new_name(place, new):
+    """An option that was renamed must not be refused as unknown."""
+    key, old = place
+    assert lookup(upgrade(nested(key, old)), key) == new
+    assert lookup(upgrade(nested(key, "other")), key) == "other"
+
+
+@pytest.mark.parametrize(
+    ("bounds", "search", "expected"),
+    [
+        ("box", {"dilation": 0.02, "samples": 48}, {"_target_": "SubjectBox", "dilation": 0.02}),
+        ("hull", {"samples": 32}, {"_target_": "VisualHull", "samples": 32}),
+        ("none", {"samples": 48}, {"_target_": "NoBounds"}),
+    ],
+)
+def test_bounds_of_the_depth_head_become_a_stage(bounds, search, expected):
+    """The search of an old depth head belongs to the stage that does it now."""
+    upgraded = upgrade({"depth_head": {"start": 0.5, "bounds": bounds, "search": search}})
+    assert upgraded["depth_head"] == {"start": 0.5}
+    assert upgraded["bounds"] == {**expected, "_target_": f"ghgs_lit.bounds.{expected['_target_']}"}
+    assert upgraded["unprojection"]["_target_"].endswith("Unprojection")
+
+
+@pytest.mark.parametrize(("tokens", "views"), [("subject", "subject"), ("all", "all")])
+def test_heads_get_what_skipping_said(tokens, views):
+    """With all tokens recalibrated, a view without the subject still needs its depth."""
+    old = {"skip": {"views": "subject", "pixels": "all"}, "depth_head": {}, "gaussian_head": {}}
+    upgraded = upgrade(old | {"recalibration": {"tokens": tokens}})
+    assert upgraded["depth_head"]["views"] == views
+    assert upgraded["gaussian_head"] == {"views": "subject", "pixels": "all"}

@@ -6,8 +6,9 @@ import multiprocessing
 import pytest
 import torch
 
-from ghgs_lit.encoder import FeatureCache, VGGTEncoder, attach_cache
+from ghgs_lit.encoder import FeatureCache, VGGTEncoder, open_cache
 from ghgs_lit.errors import InputError
+from ghgs_lit.types import DepthBounds
 from tests.helpers.models import close, make_model
 from tests.helpers.scenes import make_batch
 
@@ -36,14 +37,15 @@ def same(a, b):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
+    """A cached run must see exactly the tokens of an uncached one."""
     encoder = make().to(dtype)
     images, masks = views(b=2)
     expected = [encoder(images[b : b + 1], masks[b : b + 1]) for b in range(2)]
     stored = {torch.float64: "float32"}.get(dtype, str(dtype).removeprefix("torch."))
-    encoder.cache = FeatureCache(tmp_path, tokens="all", dtype=stored)
-    first, second = encoder(images, masks), encoder(images, masks)
+    cache = FeatureCache(tmp_path, tokens="all", dtype=stored)
+    first, second = (encoder(images, masks, cache=cache) for _ in range(2))
     same(first, second)
-    assert (encoder.cache.hits, encoder.cache.made) == (2, 2)
+    assert (cache.hits, cache.made) == (2, 2)
     if dtype != torch.float64:
         for b, one in enumerate(expected):
             mine = first.image // 2 == b
@@ -51,79 +53,82 @@ def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
     assert first.latent[0].dtype == dtype
 
 
-def test_the_subject_and_a_ring_are_kept(tmp_path):
+def test_the_subject_and_a_margin_are_kept(tmp_path):
+    """The kept tokens must be those at and around the subject, unchanged."""
     encoder = make()
     images, masks = views()
     everything = encoder(images, masks)
     # The subject lies in rows and columns 2 of 5 x 6 patches.
-    for ring, rows in ((0, {2}), (1, {1, 2, 3})):
-        encoder.cache = FeatureCache(tmp_path, ring=ring)
-        found = encoder(images, masks)
+    for margin, rows in ((0, {2}), (1, {1, 2, 3})):
+        found = encoder(images, masks, cache=FeatureCache(tmp_path, margin=margin))
         assert set(found.row.tolist()) == set(found.column.tolist()) == rows
         assert found.grid == everything.grid
         flat = (found.image * 5 + found.row) * 6 + found.column
         assert torch.equal(found.latent[1], everything.latent[1][flat])
         assert torch.equal(found.semantic, everything.semantic[flat])
-        encoder.cache = None
 
 
-@pytest.mark.parametrize("change", ["weight", "image", "mask", "interval", "option", "ring", "autocast"])
+@pytest.mark.parametrize("change", ["weight", "image", "mask", "bounds", "option", "margin", "autocast"])
 def test_whatever_changes_the_tokens_misses(tmp_path, change):
-    encoder = make(interval_input=change == "interval", mask_input=True)
+    """A hit for other weights or photographs would be a silent wrong result."""
+    encoder = make(bounds_input=change == "bounds", mask_input=True)
     images, masks = views()
-    interval = (torch.ones_like(masks, dtype=torch.float32), 2 * torch.ones_like(masks, dtype=torch.float32))
-    encoder.cache = FeatureCache(tmp_path)
-    encoder(images, masks, interval)
-    assert encoder(images, masks, interval) is not None
-    assert (encoder.cache.hits, encoder.cache.made) == (1, 1)
+    depth = torch.ones_like(masks, dtype=torch.float32)
+    bounds, cache = DepthBounds(depth, 2 * depth), FeatureCache(tmp_path)
+    encoder(images, masks, bounds, cache)
+    assert encoder(images, masks, bounds, cache) is not None
+    assert (cache.hits, cache.made) == (1, 1)
     if change == "weight":
         encoder.aggregator.frame_blocks[0].mlp.fc1.weight[0, 0] += 1e-3
     elif change == "image":
         images[0, 1, 2, 3, 4] += 1e-3
     elif change == "mask":
         masks[0, 0, 0, 0] = True
-    elif change == "interval":
-        interval[1][0, 1, 2, 3] += 1e-3
+    elif change == "bounds":
+        bounds.far[0, 1, 2, 3] += 1e-3
     elif change == "option":
-        encoder.cache, encoder.options["heads"] = FeatureCache(tmp_path), 4
-    elif change == "ring":
-        encoder.cache = FeatureCache(tmp_path, ring=2)
-    made = encoder.cache.made
+        cache, encoder.options["heads"] = FeatureCache(tmp_path), 4
+    elif change == "margin":
+        cache = FeatureCache(tmp_path, margin=2)
+    made = cache.made
     with torch.autocast("cpu", torch.bfloat16, enabled=change == "autocast"):
-        encoder(images, masks, interval)
-    assert encoder.cache.made == made + 1
+        encoder(images, masks, bounds, cache)
+    assert cache.made == made + 1
 
 
 def test_masks_that_nothing_reads_do_not_miss(tmp_path):
+    """A mask that has no influence must not make the cache encode again."""
     encoder = make()
     images, masks = views()
-    encoder.cache = FeatureCache(tmp_path, tokens="all")
-    encoder(images, masks)
-    encoder(images, ~masks)
-    assert (encoder.cache.hits, encoder.cache.made) == (1, 1)
+    cache = FeatureCache(tmp_path, tokens="all")
+    encoder(images, masks, cache=cache)
+    encoder(images, ~masks, cache=cache)
+    assert (cache.hits, cache.made) == (1, 1)
 
 
 @pytest.mark.parametrize("left", [0, 7, 2000])
-def test_a_truncated_file_is_made_anew(tmp_path, left, capsys):
+def test_a_truncated_file_is_written_again(tmp_path, left, capsys):
+    """A file that a crash cut off must be replaced, with a message."""
     encoder = make()
     images, masks = views()
-    encoder.cache = FeatureCache(tmp_path)
-    expected = encoder(images, masks)
+    cache = FeatureCache(tmp_path)
+    expected = encoder(images, masks, cache=cache)
     (path,) = tmp_path.glob("*/*.safetensors")
     path.write_bytes(path.read_bytes()[:left])
-    same(encoder(images, masks), expected)
+    same(encoder(images, masks, cache=cache), expected)
     assert str(path) in capsys.readouterr().out
-    same(encoder(images, masks), expected)
-    assert (encoder.cache.hits, encoder.cache.made) == (1, 2)
-    assert not list(tmp_path.glob("*/*.aside"))
+    same(encoder(images, masks, cache=cache), expected)
+    assert (cache.hits, cache.made) == (1, 2)
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_half_precision_files_give_the_same_twice(tmp_path):
+    """The first run must see the rounded tokens that later runs see."""
     encoder = make()
     images, masks = views()
     exact = encoder(images, masks)
-    encoder.cache = FeatureCache(tmp_path, tokens="all", dtype="bfloat16")
-    first, second = encoder(images, masks), encoder(images, masks)
+    cache = FeatureCache(tmp_path, tokens="all", dtype="bfloat16")
+    first, second = (encoder(images, masks, cache=cache) for _ in range(2))
     same(first, second)
     assert first.latent[0].dtype == torch.float32
     error = (first.latent[0] - exact.latent[0]).abs().max()
@@ -132,13 +137,13 @@ def test_half_precision_files_give_the_same_twice(tmp_path):
 
 def _work(directory, queue):
     torch.set_num_threads(1)
-    encoder = make()
-    encoder.cache = FeatureCache(directory)
-    found = [encoder(*views(seed=seed)).latent[1].sum().item() for seed in range(6)]
-    queue.put((found, encoder.cache.hits + encoder.cache.made))
+    encoder, cache = make(), FeatureCache(directory)
+    found = [encoder(*views(seed=seed), cache=cache).latent[1].sum().item() for seed in range(6)]
+    queue.put((found, cache.hits + cache.made))
 
 
 def test_two_processes_share_a_directory(tmp_path):
+    """Runs of a sweep must not corrupt each other's files."""
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     workers = [context.Process(target=_work, args=(tmp_path, queue)) for _ in range(2)]
@@ -154,52 +159,55 @@ def test_two_processes_share_a_directory(tmp_path):
 
 
 def test_an_encoder_that_learns_is_refused(tmp_path):
-    encoder = make(trainable="last_1")
-    encoder.cache = FeatureCache(tmp_path)
+    """Tokens from disk carry no gradient: a trained encoder would not learn."""
+    encoder, cache = make(trainable="last_1"), FeatureCache(tmp_path)
     with pytest.raises(InputError, match="feature_cache: expected a frozen encoder"):
-        encoder(*views())
+        encoder(*views(), cache=cache)
     with torch.no_grad():
-        encoder(*views())
-    assert encoder.cache.made == 1
+        encoder(*views(), cache=cache)
+    assert cache.made == 1
 
 
 def test_the_report_says_how_much_there_is(tmp_path):
-    encoder = make()
-    encoder.cache = FeatureCache(tmp_path / "new", tokens="all")
+    """The user must see whether the cache worked and what it takes on disk."""
+    encoder, cache = make(), FeatureCache(tmp_path / "new", tokens="all")
     images, masks = views()
-    encoder(images, masks)
-    encoder(images, masks)
+    encoder(images, masks, cache=cache)
+    encoder(images, masks, cache=cache)
     size = sum(path.stat().st_size for path in tmp_path.glob("new/*/*"))
-    assert encoder.cache.report() == (
+    assert cache.report() == (
         f"feature cache {tmp_path / 'new'}: 1 found, 1 made ({size / 1e6:.1f} MB; all tokens, float32);"
         f" 1 files, {size / 1e6:.1f} MB in all"
     )
 
 
-@pytest.mark.parametrize("option", [{"tokens": "most"}, {"ring": -1}, {"dtype": "int8"}])
+@pytest.mark.parametrize("option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}])
 def test_impossible_options_are_refused(tmp_path, option):
+    """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=f"feature_cache.{next(iter(option))}"):
         FeatureCache(tmp_path, **option)
 
 
 def test_tokens_of_a_hit_need_no_encoder(tmp_path, monkeypatch):
+    """A hit must not run the encoder, which is the point of the cache."""
     encoder = make()
     images, masks = views()
-    encoder.cache = FeatureCache(tmp_path)
-    expected = encoder(images, masks)
+    cache = FeatureCache(tmp_path)
+    expected = encoder(images, masks, cache=cache)
     monkeypatch.setattr(encoder, "encode", lambda *_: pytest.fail("encoded"))
-    same(encoder(images, masks), expected)
+    same(encoder(images, masks, cache=cache), expected)
     assert dataclasses.asdict(expected)["grid"] == (1, 2, 5, 6)
 
 
 @pytest.mark.parametrize(("recalibrated", "kept"), [("subject", "subject"), ("all", "all")])
 def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, kept):
+    """Recalibration of all tokens must not see a subset of them."""
     model = make_model("model=paper", f"recalibration.tokens={recalibrated}").eval()
     batch = make_batch(height=140, width=112, views=3)
-    options = {"directory": str(tmp_path), "tokens": "subject", "ring": 1, "dtype": "float32"}
+    options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "float32"}
     with torch.no_grad():
         expected = model(batch)
-        cache = attach_cache(model, options)
+        model.feature_cache = cache = open_cache(options, model.recalibration.tokens)
         first, second = model(batch), model(batch)
     assert cache.tokens == kept
     assert (cache.hits, cache.made) == (1, 1)
@@ -208,8 +216,8 @@ def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, 
 
 
 def test_no_directory_is_no_cache():
-    model = make_model("model=paper")
-    assert (
-        attach_cache(model, {"directory": None, "tokens": "subject", "ring": 1, "dtype": "float32"}) is None
-    )
-    assert model.encoder.cache is None
+    """Without a directory nothing is written, and a model has no cache of its own."""
+    options = {"directory": None, "tokens": "subject", "margin": 1, "dtype": "float32"}
+    assert open_cache(options, "subject") is None
+    assert open_cache(None, "subject") is None
+    assert make_model("model=paper").feature_cache is None

@@ -40,6 +40,7 @@ def _options(name: str) -> dict:
 
 @pytest.mark.parametrize(("name", "most"), [("vggt_nano", 1.2e6), ("vggt_small", 6.5e6)])
 def test_small_encoders_fit_their_size(name, most):
+    """The small encoders must stay small and train in every parameter."""
     encoder = VGGTEncoder(**_options(name))
     assert sum(p.numel() for p in encoder.parameters()) < most
     assert len(encoder.aggregator.layers) == 4
@@ -50,6 +51,7 @@ def test_small_encoders_fit_their_size(name, most):
 
 
 def test_every_shipped_size_builds():
+    """Every option of conf/encoder must be a valid encoder."""
     names = sorted(path.stem for path in CONF.glob("*.yaml"))
     assert names == ["vggt_1b", "vggt_nano", "vggt_small"]
     with torch.device("meta"):
@@ -60,6 +62,7 @@ def test_every_shipped_size_builds():
 @pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
 @pytest.mark.parametrize("mask_input", [False, True])
 def test_any_patch_size_and_shape(patch_size, mask_input):
+    """Tokens must be complete, in order, and see the mask only with mask_input."""
     encoder = _encoder(patch_size=patch_size, mask_input=mask_input)
     images, masks = _views(2, 3, 2 * patch_size, 3 * patch_size)
     tokens = encoder(images, masks)
@@ -73,6 +76,7 @@ def test_any_patch_size_and_shape(patch_size, mask_input):
 
 
 def test_batch_elements_are_independent():
+    """A result must not depend on the other subjects of its batch."""
     encoder = _encoder().double()
     images, masks = _views(2, 3, 28, 42)
     images = images.double()
@@ -85,6 +89,7 @@ def test_batch_elements_are_independent():
 
 
 def test_only_the_first_view_is_special():
+    """The order of the later views must not change their tokens."""
     encoder = _encoder().double()
     images, masks = _views(1, 3, 28, 42)
     images = images.double()
@@ -96,6 +101,7 @@ def test_only_the_first_view_is_special():
 
 
 def test_one_view_sees_only_itself():
+    """Frame attention must stay within a view; global attention must not."""
     encoder = _encoder().double()
     images, masks = _views(1, 3, 28, 28)
     images = images.double()
@@ -107,12 +113,14 @@ def test_one_view_sees_only_itself():
 
 
 def test_semantic_features_carry_no_gradient():
+    """Semantic features weight the attention; they are not trained through it."""
     tokens = _encoder()(*_views(1, 2, 28, 28))
     assert not tokens.semantic.requires_grad
     assert tokens.latent[0].requires_grad
 
 
 def test_checkpointing_changes_nothing():
+    """Saving memory must not change a gradient."""
     gradients = []
     for checkpointing in (False, True):
         encoder = _encoder(
@@ -126,6 +134,7 @@ def test_checkpointing_changes_nothing():
 
 @pytest.mark.parametrize(("trainable", "pairs"), [("none", 0), ("last_1", 1), ("all", 2)])
 def test_trainable_part(trainable, pairs):
+    """Exactly the named blocks may be trained."""
     encoder = _encoder(trainable=trainable)
     for blocks in (encoder.aggregator.frame_blocks, encoder.aggregator.global_blocks):
         trained = [all(p.requires_grad for p in block.parameters()) for block in blocks]
@@ -147,6 +156,7 @@ def test_low_precision_stays_near_float32():
 
 
 def test_rotation_depends_on_differences_of_positions():
+    """Rotary positions must be relative."""
     g = torch.Generator().manual_seed(0)
     q, k = torch.randn(2, 1, 16, generator=g, dtype=torch.float64)
 
@@ -160,6 +170,7 @@ def test_rotation_depends_on_differences_of_positions():
 
 
 def test_angles_are_float32_whatever_the_tokens():
+    """Angles in half precision would shift positions."""
     positions = token_positions(37, 37, special=5)
     exact = rotary_tables(positions, 64, torch.zeros(1))
     for dtype in (torch.bfloat16, torch.float16):
@@ -172,6 +183,7 @@ def test_angles_are_float32_whatever_the_tokens():
 
 
 def test_half_precision_weights_run():
+    """An encoder with bfloat16 weights must give finite tokens in bfloat16."""
     encoder = _encoder().bfloat16()
     tokens = encoder(*_views(1, 2, 28, 28))
     assert tokens.latent[0].dtype == torch.bfloat16
@@ -179,6 +191,7 @@ def test_half_precision_weights_run():
 
 
 def test_weights_can_be_assigned_to_a_model_without_storage():
+    """Checkpoints are loaded without a second copy of the weights."""
     encoder = _encoder()
     with torch.device("meta"):
         empty = VGGTEncoder(**SMALL)
@@ -188,10 +201,12 @@ def test_weights_can_be_assigned_to_a_model_without_storage():
 
 
 def test_normalisation_is_no_part_of_a_checkpoint():
+    """Published weights have no such tensors."""
     assert all(key.startswith("aggregator.") for key in _encoder().state_dict())
 
 
 def test_stored_positions_serve_any_grid():
+    """Other image sizes must resample the stored positions as published."""
     encoder = _encoder(vit={"kind": "dinov2", "depth": 1, "heads": 2}, image_size=56)
     vit = encoder.aggregator.patch_embed
     assert vit.positions(4, 4, torch.float32) is vit.pos_embed
@@ -212,6 +227,7 @@ def test_stored_positions_serve_any_grid():
     ],
 )
 def test_bad_inputs_are_refused(shape, masks, message):
+    """Images that the patches do not fit must be named."""
     with pytest.raises(InputError, match=message):
         _encoder()(torch.rand(shape), torch.ones(masks, dtype=torch.bool))
 
@@ -231,5 +247,6 @@ def test_bad_inputs_are_refused(shape, masks, message):
     ],
 )
 def test_impossible_options_are_refused(options, message):
+    """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=message):
         VGGTEncoder(**{**SMALL, **options})

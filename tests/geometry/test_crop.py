@@ -1,9 +1,9 @@
-"""Windows around the subject keep geometry and lose nothing."""
+"""Crops around the subject and padding keep geometry and lose nothing."""
 
 import pytest
 import torch
 
-from ghgs_lit.geometry.crop import patch_padding, subject_windows
+from ghgs_lit.geometry.crop import crop_to_subject, pad_to_patches
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, Cameras
 
@@ -25,37 +25,40 @@ def boxes(b, v, height, width, seed=0):
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("size", [(70, 56), (42, 98)])
-def test_windows_hold_the_masks_at_a_multiple_of_the_patch(size, seed):
+def test_crops_hold_the_masks_at_a_multiple_of_the_patch(size, seed):
+    """A crop must keep every pixel of the subject and fit the patches."""
     masks = boxes(2, 3, *size, seed)
-    windows = subject_windows(masks, 14)
-    assert windows.height % 14 == windows.width % 14 == 0
-    assert windows.height < size[0]
-    assert windows.width < size[1]
-    assert torch.equal(windows.cut(masks).flatten(2).sum(-1), masks.flatten(2).sum(-1))
-    assert torch.equal(windows.paste(windows.cut(masks), False), masks)
+    crop = crop_to_subject(masks, 14)
+    assert crop.height % 14 == crop.width % 14 == 0
+    assert crop.height < size[0]
+    assert crop.width < size[1]
+    assert torch.equal(crop.cut(masks).flatten(2).sum(-1), masks.flatten(2).sum(-1))
+    assert torch.equal(crop.paste(crop.cut(masks), False), masks)
 
 
 def test_points_of_a_cut_batch_are_those_of_the_whole():
+    """The cameras of a crop must see the same world points."""
     masks = boxes(2, 2, 70, 56)
     depths = torch.rand(2, 2, 70, 56) + 1
     images = torch.rand(2, 2, 3, 70, 56)
     whole = Batch(images, masks, cameras(2, 2, 70, 56), depths=depths)
-    windows = subject_windows(masks, 7)
-    part = windows.cut_batch(whole)
-    points = windows.paste(unproject_maps(part.depths, part.cameras), 0.0)
+    crop = crop_to_subject(masks, 7)
+    part = crop.cut_batch(whole)
+    points = crop.paste(unproject_maps(part.depths, part.cameras), 0.0)
     expected = unproject_maps(depths, whole.cameras)
     assert torch.allclose(points[masks], expected[masks], atol=1e-5)
-    pasted = windows.paste(part.images.movedim(2, -1), 0.0)
+    pasted = crop.paste(part.images.movedim(2, -1), 0.0)
     assert torch.equal(pasted[masks], images.movedim(2, -1)[masks])
 
 
 def test_an_empty_mask_and_a_full_one():
+    """The extreme masks must still give a valid crop."""
     masks = torch.zeros(1, 2, 28, 28, dtype=torch.bool)
-    assert subject_windows(masks, 14, margin=2).height == 14
+    assert crop_to_subject(masks, 14, margin=2).height == 14
     masks[0, 1] = True
-    windows = subject_windows(masks, 14)
-    assert (windows.height, windows.width) == (28, 28)
-    assert windows.top.eq(0).all()
+    crop = crop_to_subject(masks, 14)
+    assert (crop.height, crop.width) == (28, 28)
+    assert crop.top.eq(0).all()
 
 
 @pytest.mark.parametrize(
@@ -65,7 +68,7 @@ def test_an_empty_mask_and_a_full_one():
 def test_padding_is_centred_and_undone(size, top, left, padded):
     """512 gets 3 pixels on each side as in the authors' release; a single pixel goes below and right."""
     batch = Batch(torch.rand(1, 2, 3, *size), boxes(1, 2, *size), cameras(1, 2, *size))
-    padding = patch_padding(batch.masks, 14)
+    padding = pad_to_patches(batch.masks, 14)
     assert (padding.top, padding.left) == (top, left)
     part = padding.cut_batch(batch)
     assert tuple(part.images.shape[3:]) == tuple(part.masks.shape[2:]) == padded
@@ -77,4 +80,4 @@ def test_padding_is_centred_and_undone(size, top, left, padded):
     depth = torch.rand(1, 2, *padded) + 1
     inside = unproject_maps(padding.paste(depth, 0.0), batch.cameras)
     assert torch.allclose(padding.paste(unproject_maps(depth, part.cameras), 0.0), inside, atol=1e-4)
-    assert patch_padding(part.masks, 14) is None
+    assert pad_to_patches(part.masks, 14) is None

@@ -7,16 +7,17 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates, uniform_filter
 
-from ghgs_lit.bounds.visual_hull import SubjectBounds
+from ghgs_lit.bounds import VisualHull
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.photo_consistency import TOLERANCE, photo_consistency
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.heads.depth import DepthHead
+from ghgs_lit.types import DepthBounds
 from tests.heads.test_gaussian import make_head, run, shake
 from tests.helpers.scenes import make_batch, ring
 
 
-def by_hand(batch, interval, b, v, row, column, steps):
+def by_hand(batch, bounds, b, v, row, column, steps):
     """Agreement at one pixel in float64; views face each other less than the limit in these scenes."""
     masks = batch.masks[b].double().numpy()
     images = batch.images[b].double().numpy() * masks[:, None]
@@ -26,7 +27,7 @@ def by_hand(batch, interval, b, v, row, column, steps):
     weight = np.stack([uniform_filter(m, 3, mode="constant") for m in masks])
     smooth = np.stack([[uniform_filter(c, 3, mode="constant") for c in image] for image in images])
     smooth = smooth / np.where(weight > 1e-9, weight, 1)[:, None]
-    near, far = (float(bound[b, v, row, column]) for bound in interval)
+    near, far = (float(bound[b, v, row, column]) for bound in (bounds.near, bounds.far))
     found = []
     for step in range(steps):
         z = near + (far - near) * (step + 0.5) / steps
@@ -48,13 +49,14 @@ def by_hand(batch, interval, b, v, row, column, steps):
 
 @pytest.mark.parametrize("size", [(42, 56), (56, 42)])
 def test_agreement_is_that_of_each_ray(size):
+    """The batched plane sweep must equal a pixel-by-pixel version."""
     batch = make_batch(2, 3, *size, spread=150.0)
-    interval = SubjectBounds(kind="hull")(batch.masks, batch.cameras)
-    maps = photo_consistency(batch, interval, 5)
+    bounds = VisualHull()(batch)
+    maps = photo_consistency(batch, bounds, 5)
     assert maps.shape == (2, 3, 5, *size)
     places = batch.masks.nonzero()
     for b, v, row, column in places[:: max(1, len(places) // 25)].tolist():
-        expected = by_hand(batch, interval, b, v, row, column, 5)
+        expected = by_hand(batch, bounds, b, v, row, column, 5)
         np.testing.assert_allclose(maps[b, v, :, row, column].numpy(), expected, atol=2e-4)
 
 
@@ -66,30 +68,34 @@ def test_the_surface_agrees_more_than_what_lies_behind_it():
     colors = (points * 9).sin() / 2 + 0.5
     images = colors.movedim(-1, 2) * batch.masks[:, :, None]
     batch = dataclasses.replace(batch, images=images)
-    at = photo_consistency(batch, (batch.depths, batch.depths), 1)[:, :, 0][batch.masks]
-    behind = photo_consistency(batch, (batch.depths + 0.15, batch.depths + 0.15), 1)[:, :, 0][batch.masks]
+    at = photo_consistency(batch, DepthBounds(batch.depths, batch.depths), 1)[:, :, 0][batch.masks]
+    deeper = DepthBounds(batch.depths + 0.15, batch.depths + 0.15)
+    behind = photo_consistency(batch, deeper, 1)[:, :, 0][batch.masks]
     assert at.mean() > 0.75
     assert behind.mean() < at.mean() - 0.25
 
 
 def test_opposite_views_say_nothing():
+    """Views from opposite sides see no common surface and must not vote."""
     batch = make_batch(1, 2)
-    interval = SubjectBounds(kind="hull")(batch.masks, batch.cameras)
-    assert not photo_consistency(batch, interval, 4).any()
+    bounds = VisualHull()(batch)
+    assert not photo_consistency(batch, bounds, 4).any()
 
 
 def test_empty_masks_and_points_behind_cameras_are_defined():
+    """Degenerate input must give finite values in [0, 1]."""
     batch = make_batch(1, 3)
     empty = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks))
     depth = batch.depths.clamp(min=1)
-    assert not photo_consistency(empty, (depth, depth), 2).any()
+    assert not photo_consistency(empty, DepthBounds(depth, depth), 2).any()
     far = torch.full_like(depth, 50.0)
-    found = photo_consistency(batch, (-far, far), 4)
+    found = photo_consistency(batch, DepthBounds(-far, far), 4)
     assert found.isfinite().all()
     assert ((found >= 0) & (found <= 1)).all()
 
 
 def test_the_order_of_views_does_not_matter():
+    """The best other view must not depend on the order of views."""
     batch = make_batch(1, 3, spread=250.0)
     order = [2, 0, 1]
     turned = dataclasses.replace(
@@ -103,32 +109,35 @@ def test_the_order_of_views_does_not_matter():
             extrinsics=batch.cameras.extrinsics[:, order],
         ),
     )
-    first = photo_consistency(batch, (batch.depths, batch.depths + 0.2), 3)
-    second = photo_consistency(turned, (turned.depths, turned.depths + 0.2), 3)
+    first = photo_consistency(batch, DepthBounds(batch.depths, batch.depths + 0.2), 3)
+    second = photo_consistency(turned, DepthBounds(turned.depths, turned.depths + 0.2), 3)
     torch.testing.assert_close(first[:, order], second)
 
 
-def test_precision_is_that_of_the_interval():
+def test_precision_is_that_of_the_bounds():
+    """Double-precision bounds must not be computed in single precision."""
     batch = make_batch(1, 3, spread=150.0)
-    interval = (batch.depths, batch.depths + 0.2)
-    single = photo_consistency(batch, interval, 2)
-    double = photo_consistency(batch, tuple(bound.double() for bound in interval), 2)
+    bounds = DepthBounds(batch.depths, batch.depths + 0.2)
+    single = photo_consistency(batch, bounds, 2)
+    double = photo_consistency(batch, bounds.to(torch.float64), 2)
     assert double.dtype == torch.float64
     torch.testing.assert_close(single.double(), double, atol=1e-4, rtol=0)
 
 
-def test_heads_ask_for_what_agreement_needs():
-    for options in ({"guide": False, "agreement": 4}, {"guide": True, "agreement": -1}):
-        with pytest.raises(InputError, match=r"depth_head\.agreement"):
-            DepthHead(64, bounds="hull", **options)
-    with pytest.raises(InputError, match=r"gaussian_head\.agreement"):
-        make_head(agreement=True)
+def test_heads_ask_for_what_photo_consistency_needs():
+    """Photo-consistency without a guide would be computed and never seen."""
+    for options in ({"guide": False, "consistency_depths": 4}, {"guide": True, "consistency_depths": -1}):
+        with pytest.raises(InputError, match=r"depth_head\.consistency_depths"):
+            DepthHead(64, **options)
+    with pytest.raises(InputError, match=r"gaussian_head\.photo_consistency"):
+        make_head(photo_consistency=True)
 
 
-def test_splats_see_agreement_and_colors_leave_their_pixels_within_the_limit():
+def test_splats_see_photo_consistency_and_colors_leave_their_pixels_within_the_limit():
+    """The guide must reach the opacities, and colours must stay within their limit."""
     batch = make_batch(1, 3, spread=250.0)
     other = dataclasses.replace(batch, cameras=ring(1, 3, 56, 56, spread=200.0))
-    head = shake(make_head(guide=True, agreement=True, color_limit=0.25))
+    head = shake(make_head(guide=True, photo_consistency=True, color_limit=0.25))
     pixels = batch.images.permute(0, 1, 3, 4, 2)[batch.masks]
     assert torch.equal(run(head, batch).colors, pixels)
     torch.nn.init.normal_(head.color_header[-1].weight)

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.heads import dpt
 from ghgs_lit.heads.activations import split_activated, unit
 from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
 from ghgs_lit.heads.position import position_embedding
@@ -22,11 +23,6 @@ def _tokens(b=1, v=2, h=3, w=2, patch_size=14, width=16, dtype=torch.float32, se
     return Tokens(latent, latent[0], image, row, column, (b, v, h, w), patch_size)
 
 
-def _select(tokens: Tokens, kept: torch.Tensor) -> Tokens:
-    packed = {name: getattr(tokens, name)[kept] for name in ("semantic", "image", "row", "column")}
-    return dataclasses.replace(tokens, latent=tuple(x[kept] for x in tokens.latent), **packed)
-
-
 def _head(seed=0, **options) -> DPTHead:
     torch.manual_seed(seed)
     return DPTHead(**{"dim_in": 16, "features": 8, "out_channels": (4, 8, 8, 12), "output_dim": 3, **options})
@@ -35,31 +31,40 @@ def _head(seed=0, **options) -> DPTHead:
 @pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
 @pytest.mark.parametrize("grid", [(1, 1), (3, 2), (2, 5)])
 def test_any_patch_size_and_grid(patch_size, grid):
+    """The head must serve encoders of other patch sizes."""
     tokens = _tokens(2, 2, *grid, patch_size=patch_size)
     raw = _head()(tokens)
     assert raw.shape == (4, 3, patch_size * grid[0], patch_size * grid[1])
     assert raw.isfinite().all()
 
 
-def test_images_are_independent_and_steps_change_nothing():
-    head = _head(images_per_step=2).double()
+def test_images_are_independent_and_steps_change_nothing(monkeypatch):
+    """Decoding in parts to save memory must not change a value."""
+    head = _head().double()
     tokens = _tokens(v=5, dtype=torch.float64)
     together = head(tokens)
+    seen, decode = [], head._decode
+    monkeypatch.setattr(
+        head, "_decode", lambda levels, *rest: seen.append(len(levels[0])) or decode(levels, *rest)
+    )
+    monkeypatch.setattr(dpt, "_LARGEST", 2 * 4 * 42 * 28)  # two images of 4 channels
     with torch.no_grad():
         in_steps = head(tokens)
+    assert seen == [1, 2, 2]
     torch.testing.assert_close(in_steps, together, rtol=1e-12, atol=1e-12)
     kept = tokens.image == 3
-    one = _select(tokens, kept)
+    one = tokens.select(kept)
     one = dataclasses.replace(one, image=torch.zeros_like(one.image), grid=(1, 1, 3, 2))
     torch.testing.assert_close(head(one), together[3:4], rtol=1e-12, atol=1e-12)
 
 
 def test_tokens_that_were_not_kept_are_blank():
+    """Missing tokens must be 0, not the bias of a projection."""
     head = _head()
     tokens = _tokens(h=4, w=4)
     kept = torch.ones(32, dtype=torch.bool)
     kept[[3, 17]] = False
-    fewer = _select(tokens, kept)
+    fewer = tokens.select(kept)
     levels = head._levels(fewer)
     for level, full in zip(levels, head._levels(tokens), strict=True):
         blank = (level == 0).all(dim=1).flatten()
@@ -71,6 +76,7 @@ def test_tokens_that_were_not_kept_are_blank():
 
 
 def test_residual_unit_rectifies_its_skip():
+    """Published weights expect a rectified skip, and the input must stay unchanged."""
     block = ResidualUnit(8)
     nn.init.zeros_(block.conv2.weight)
     nn.init.zeros_(block.conv2.bias)
@@ -81,6 +87,7 @@ def test_residual_unit_rectifies_its_skip():
 
 
 def test_pointwise_is_the_convolution():
+    """The fast 1x1 convolution must equal the convolution in any memory layout."""
     conv = nn.Conv2d(6, 4, 1)
     for layout in (torch.contiguous_format, torch.channels_last):
         x = torch.randn(2, 6, 5, 3).contiguous(memory_format=layout)
@@ -88,6 +95,7 @@ def test_pointwise_is_the_convolution():
 
 
 def test_a_guide_keeps_images_apart_and_is_local():
+    """A guide must act on its own image, near its pixel, and add tensors only where it is used."""
     head = _head(guide_channels=4)
     tokens = _tokens(b=1, v=2, h=2, w=3)
     guide = torch.rand(1, 2, 4, 28, 42)
@@ -103,6 +111,7 @@ def test_a_guide_keeps_images_apart_and_is_local():
 
 
 def test_last_projection_is_wide_under_autocast():
+    """Half precision in the last projection would cost centimetres."""
     head = _head(features=32, hidden=32)
     tokens = _tokens(v=2, h=5, w=5)
     with torch.no_grad():
@@ -114,6 +123,7 @@ def test_last_projection_is_wide_under_autocast():
 
 
 def test_gradients_reach_every_layer_and_agree_with_finite_differences():
+    """In-place operations must not corrupt a gradient."""
     head = _head().double()
     tokens = _tokens(v=1, h=2, w=2, patch_size=8, dtype=torch.float64)
 
@@ -127,14 +137,19 @@ def test_gradients_reach_every_layer_and_agree_with_finite_differences():
 
 
 def test_positions_made_for_inference_serve_training():
+    """Cached waves of an inference pass must not be inference tensors, which training refuses."""
     head = _head()
     tokens = _tokens(h=5, w=7)
     with torch.inference_mode():
-        head(tokens)
-    head(tokens).sum().backward()
+        expected = head(tokens).clone()
+    found = head(tokens)
+    torch.testing.assert_close(found, expected)
+    found.sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in head.parameters())
 
 
 def test_positions_are_centred():
+    """Position embeddings must be symmetric about the middle of the image."""
     e = position_embedding(8, 4, 6, 1.5, torch.zeros(1, dtype=torch.float64))
     sine = [0, 1, 4, 5]
     cosine = [2, 3, 6, 7]
@@ -146,6 +161,7 @@ def test_positions_are_centred():
 
 
 def test_unit_of_zero_is_zero_with_a_finite_gradient():
+    """Normalising 0 must not give NaN, forward or backward."""
     x = torch.tensor([[0.0, 0, 0], [3, 0, 4]], requires_grad=True)
     y = unit(x)
     torch.testing.assert_close(y.detach(), torch.tensor([[0.0, 0, 0], [0.6, 0, 0.8]]))
@@ -154,6 +170,7 @@ def test_unit_of_zero_is_zero_with_a_finite_gradient():
 
 
 def test_activations_are_wide():
+    """exp of a half-precision value must not overflow."""
     raw = torch.full((1, 2, 1, 1), 30.0, dtype=torch.float16)
     value, confidence = split_activated(raw, "exp")
     assert value.dtype == torch.float32
@@ -167,20 +184,22 @@ def test_activations_are_wide():
         ({"features": 12}, "features: expected a multiple of 8; found 12"),
         ({"out_channels": (4, 8, 8)}, "out_channels: expected four multiples of 4"),
         ({"out_channels": (4, 8, 8, 10)}, "out_channels: expected four multiples of 4"),
-        ({"images_per_step": 0}, "images_per_step"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
+    """Widths that the head cannot divide are named when it is built."""
     with pytest.raises(InputError, match=message):
         _head(**options)
 
 
 def test_wrong_number_of_layers_is_refused():
+    """An encoder that reads out other layers must be refused by name."""
     tokens = _tokens()
     with pytest.raises(InputError, match=r"tokens.latent: expected four layers; found 3"):
         _head()(dataclasses.replace(tokens, latent=tokens.latent[:3]))
 
 
 def test_unknown_activation_is_refused():
+    """A misspelt activation must be refused by name."""
     with pytest.raises(InputError, match="value activation"):
         split_activated(torch.zeros(1, 2, 1, 1), "tan")

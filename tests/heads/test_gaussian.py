@@ -1,3 +1,5 @@
+"""Gaussians: attributes, their bounds and their start."""
+
 import dataclasses
 
 import pytest
@@ -33,6 +35,7 @@ def shake(head, scale=1.0):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_attributes_match_the_release(dtype):
+    """Attributes of the authors' checkpoints must be those of their code."""
     head = make_head(parameterization="release").to(dtype)
     state = fixture("attribute_heads", "state", dtype)
     missing, unexpected = head.load_state_dict(state, strict=False)
@@ -48,6 +51,7 @@ def test_attributes_match_the_release(dtype):
 
 
 def test_training_starts_with_small_opaque_splats_on_the_surface():
+    """A start off the surface or transparent has no useful gradient."""
     batch = make_batch(2, 3)
     gaussians = run(make_head(), batch)
     maps = DepthMaps(batch.depths, batch.masks, batch.depths)
@@ -61,6 +65,7 @@ def test_training_starts_with_small_opaque_splats_on_the_surface():
 
 
 def test_gaussians_name_their_pixels_in_order():
+    """Tables, pictures and pasting rely on the pixel of each Gaussian."""
     batch = make_batch(2, 3, 56, 42)
     gaussians = run(make_head(), batch)
     assert gaussians.splits == tuple(batch.masks.flatten(1).sum(1).tolist())
@@ -72,6 +77,7 @@ def test_gaussians_name_their_pixels_in_order():
 
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_attributes_stay_within_their_bounds(scale):
+    """No raw value may give a giant, transparent or distant splat."""
     batch = make_batch()
     gaussians = run(shake(make_head(), scale), batch)
     start = run(make_head(), batch)
@@ -85,6 +91,7 @@ def test_attributes_stay_within_their_bounds(scale):
 
 
 def test_every_parameter_gets_a_finite_gradient():
+    """A parameter without a gradient would never be trained."""
     batch = make_batch()
     head = shake(make_head())
     gaussians = run(head, batch)
@@ -96,6 +103,7 @@ def test_every_parameter_gets_a_finite_gradient():
 
 
 def test_scale_does_not_pull_on_the_depth():
+    """A splat that is too large must not move nearer to become smaller."""
     batch = make_batch()
     depth = batch.depths.clone().requires_grad_()
     gaussians = run(make_head(), dataclasses.replace(batch, depths=depth))
@@ -103,6 +111,7 @@ def test_scale_does_not_pull_on_the_depth():
 
 
 def test_heads_on_every_pixel_give_the_same_gaussians():
+    """skip=exact must not change the Gaussians of skip=none."""
     batch = make_batch(2, 3)
     subject, every = (run(shake(make_head(pixels=pixels)), batch) for pixels in ("subject", "all"))
     for name in ("means", "quaternions", "scales", "opacities", "colors"):
@@ -112,6 +121,7 @@ def test_heads_on_every_pixel_give_the_same_gaussians():
 
 @pytest.mark.parametrize("parameterization", ["footprint", "release"])
 def test_no_valid_pixel_gives_no_gaussians(parameterization):
+    """A batch without a valid pixel must give an empty result with finite gradients."""
     batch = make_batch(2, 2)
     head = make_head(parameterization=parameterization)
     gaussians = run(head, batch, torch.zeros_like(batch.masks))
@@ -122,6 +132,7 @@ def test_no_valid_pixel_gives_no_gaussians(parameterization):
 
 
 def test_attributes_are_wide_under_autocast():
+    """Means and scales in half precision would be off by centimetres."""
     batch = make_batch()
     head = shake(make_head())
     expected = run(head, batch)
@@ -144,11 +155,13 @@ def test_attributes_are_wide_under_autocast():
     ],
 )
 def test_impossible_options_are_refused(options, key):
+    """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=key):
         make_head(**options)
 
 
 def test_the_last_projection_is_wide_under_autocast():
+    """Half precision in the last projection would round offsets of millimetres."""
     head = shake(make_head())
     descriptors = torch.rand(50, 32)
     hidden = head.offset_header[:-1]

@@ -5,12 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.bounds.visual_hull import SubjectBounds
+from ghgs_lit.bounds import VisualHull
 from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.relative_depth import UNIT, relative_depth, relative_interval
+from ghgs_lit.geometry.relative_depth import UNIT, relative_bounds, relative_depth
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.guide import GuidePyramid, photo_guide
+from ghgs_lit.types import DepthBounds
 from tests.helpers.scenes import make_batch
 
 
@@ -22,10 +23,12 @@ def make_encoder(**options):
 
 
 def test_relative_maps_know_shape_and_not_distance():
+    """Moving the subject away from the camera must not change what the network sees."""
     batch = make_batch(2, 3)
-    near, far = SubjectBounds(kind="hull")(batch.masks, batch.cameras)
-    maps = relative_interval((near, far), batch.masks)
-    moved = relative_interval((near + 5, far + 5), batch.masks)
+    bounds = VisualHull()(batch)
+    near, far = bounds.near, bounds.far
+    maps = relative_bounds(bounds, batch.masks)
+    moved = relative_bounds(DepthBounds(near + 5, far + 5), batch.masks)
     assert torch.allclose(maps, moved, atol=1e-4)
     start, length = maps.unbind(2)
     assert torch.allclose(length[batch.masks], ((far - near) / UNIT)[batch.masks])
@@ -35,6 +38,7 @@ def test_relative_maps_know_shape_and_not_distance():
 
 
 def test_relative_depth_has_no_gradient_and_no_mean():
+    """The Gaussian head must not train the depth through its guide."""
     depth = make_batch().depths.requires_grad_()
     masks = depth > 0
     maps = relative_depth(depth, masks)
@@ -43,14 +47,16 @@ def test_relative_depth_has_no_gradient_and_no_mean():
 
 
 def test_an_empty_mask_gives_empty_maps():
+    """A view without the subject must give 0, not NaN."""
     masks = torch.zeros(1, 2, 8, 8, dtype=torch.bool)
     depth = torch.rand(1, 2, 8, 8)
     assert not relative_depth(depth, masks).any()
-    assert not relative_interval((depth, depth + 1), masks).any()
+    assert not relative_bounds(DepthBounds(depth, depth + 1), masks).any()
 
 
 @pytest.mark.parametrize("size", [(28, 42), (35, 21)])
 def test_pyramid_halves_twice(size):
+    """Odd image sides must give maps of the expected sizes."""
     full, half, quarter = GuidePyramid(6, 16)(torch.rand(2, 6, *size))
     assert full.shape == (2, 8, *size)
     assert half.shape == (2, 16, *((n + 1) // 2 for n in size))
@@ -64,14 +70,15 @@ def test_depth_follows_the_guide():
     tokens = make_encoder()(batch.images, batch.masks)
     for guided in (True, False):
         torch.manual_seed(1)
-        head = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, bounds="hull", guide=guided)
+        head = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, guide=guided)
         torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
-        interval = head.interval(batch)
-        same = torch.equal(head(tokens, batch, interval).depth, head(tokens, other, interval).depth)
+        bounds = VisualHull()(batch)
+        same = torch.equal(head(tokens, batch, bounds).depth, head(tokens, other, bounds).depth)
         assert same == (not guided)
 
 
 def test_the_guide_is_asked_for_and_refused():
+    """A guide that is missing or unexpected must be named."""
     batch = make_batch()
     tokens = make_encoder()(batch.images, batch.masks)
     guided = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, guide=True).dpt
@@ -82,12 +89,14 @@ def test_the_guide_is_asked_for_and_refused():
         plain(tokens, photo_guide(batch))
 
 
-def test_the_encoder_sees_intervals_where_it_is_told_to():
+def test_the_encoder_sees_bounds_where_it_is_told_to():
+    """encoder.bounds_input must reach the tokens, and ask for bounds."""
     batch = make_batch()
-    interval = SubjectBounds(kind="hull")(batch.masks, batch.cameras)
-    encoder = make_encoder(mask_input=True, interval_input=True)
-    tokens = encoder(batch.images, batch.masks, interval)
-    deeper = encoder(batch.images, batch.masks, (interval[0], interval[1] + 0.1 * interval[0]))
+    bounds = VisualHull()(batch)
+    encoder = make_encoder(mask_input=True, bounds_input=True)
+    tokens = encoder(batch.images, batch.masks, bounds)
+    thicker = DepthBounds(bounds.near, bounds.far + 0.1 * bounds.near)
+    deeper = encoder(batch.images, batch.masks, thicker)
     assert not torch.allclose(tokens.latent[-1], deeper.latent[-1])
-    with pytest.raises(InputError, match=r"encoder\.interval_input"):
+    with pytest.raises(InputError, match=r"encoder\.bounds_input"):
         encoder(batch.images, batch.masks)

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from ghgs_lit.config import compose
-from ghgs_lit.model import GHGS
+from ghgs_lit.model import GHGS, STAGES
 
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8"]
@@ -16,19 +16,19 @@ TINY += ["recalibration.k=8", "recalibration.num_heads=2"]
 
 
 def config(*overrides):
+    """The nodes that describe a tiny model, as plain data."""
     return copy.deepcopy(_composed(overrides))
 
 
 @functools.cache  # composing costs more than the tiny models
 def _composed(overrides):
     composed = compose("train", [*TINY, *overrides])
-    stages = ("encoder", "depth_head", "recalibration", "gaussian_head", "skip", "points", "ablation")
-    stages += ("model", "compat")
-    return OmegaConf.to_container(OmegaConf.masked_copy(composed, list(stages)), resolve=True)
+    nodes = [*STAGES, "skip", "ablation", "model", "compat"]
+    return OmegaConf.to_container(OmegaConf.masked_copy(composed, nodes), resolve=True)
 
 
 def make_model(*overrides, seed=0):
-    """A model that has left its initial state, in which many outputs are constant."""
+    """A tiny model that has left its initial state, in which many outputs are constant."""
     torch.manual_seed(seed)
     model = GHGS.from_config(config(*overrides))
     for last in (
@@ -43,6 +43,7 @@ def make_model(*overrides, seed=0):
 
 
 def close(a, b, limit=1e-5):
+    """Assert that two sets of Gaussians differ by ``limit`` of an attribute's largest value at most."""
     for name in ATTRIBUTES:
         x, y = getattr(a, name), getattr(b, name)
         assert (x - y).abs().max() <= limit * y.abs().max(), name

@@ -24,7 +24,7 @@ def fixture(name, part, dtype=torch.float32):
 
 
 def ring(batch, views, height, width, spread=360.0, radius=2.0, zoom=0.8):
-    """Cameras that look at the subject; elements are turned against one another."""
+    """Cameras around the subject that look at it; elements differ by a rotation."""
     focal = zoom * max(height, width)
     intrinsics = torch.tensor([[focal, 0, width / 2 + 1], [0, focal, height / 2 - 1], [0, 0, 1]])
     extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
@@ -57,6 +57,7 @@ def ellipsoid(cameras, center=CENTER, radii=RADII):
 
 
 def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
+    """An ellipsoid with noise as colours; ``kwargs`` go to :func:`ring`."""
     cameras = ring(batch, views, height, width, **kwargs)
     masks, depths = ellipsoid(cameras)
     images = torch.rand(batch, views, 3, height, width, generator=torch.Generator().manual_seed(3))

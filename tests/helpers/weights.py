@@ -32,7 +32,7 @@ def config(*overrides, tiny=True):
 @cache
 def _composed(overrides):
     composed = compose("import", overrides)
-    return json.dumps({key: OmegaConf.to_container(composed[key]) for key in MODEL_NODES})
+    return json.dumps({key: OmegaConf.to_container(composed[key], resolve=True) for key in MODEL_NODES})
 
 
 def import_weights(config, out, vggt, release=None, *args, **kwargs):

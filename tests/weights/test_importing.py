@@ -294,8 +294,8 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
 def test_switches_that_differ_from_the_releases_are_listed():
     """Users must learn which parts of a model differ from the authors' code."""
     assert differences(config()) == []
-    found = differences(config("points.tokens=subject"))
-    assert found == ["points.tokens=subject for release"]
+    found = differences(config("unprojection.tokens=subject"))
+    assert found == ["unprojection.tokens=subject for release"]
     assert any("depth_head.parameterization" in line for line in differences(config("compat=none")))
     assert differences(config(), config()) == []
 
@@ -323,8 +323,8 @@ def test_training_from_imported_weights_says_where_they_come_from(tmp_path, file
     run = {**settings, "resume": None, "init_from": out}
     assert start.with_origin(run, model)["encoder"]["weights"] == "vggt.safetensors"
     assert start.switched(run) == []
-    assert "weights" not in run["encoder"]
+    assert run["encoder"]["weights"] is None
     assert start.with_origin({**run, "init_from": None}, model) == {**run, "init_from": None}
     wider = config("compat=none", "encoder.mask_input=true")
-    assert "weights" not in start.with_origin({**run, **wider}, GHGS.from_config(wider))["encoder"]
+    assert start.with_origin({**run, **wider}, GHGS.from_config(wider))["encoder"]["weights"] is None
     assert start.switched({**run, **config()}) != []

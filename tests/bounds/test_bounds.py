@@ -1,13 +1,27 @@
+"""Bounds hold the truth, stay finite, and are as tight as masks and cameras allow."""
+
 import dataclasses
 
 import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.bounds.visual_hull import SubjectBounds, box_interval, dilate, subject_box
+from ghgs_lit.bounds import NoBounds, SubjectBox, VisualHull
+from ghgs_lit.bounds.box import subject_box
+from ghgs_lit.bounds.rays import depths_in_box
+from ghgs_lit.bounds.silhouettes import dilate
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.types import Batch
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, ring
+
+STAGES = [SubjectBox, VisualHull]
+
+
+def near_and_far(stage, batch, **changes):
+    """Both bounds of a batch, some of whose fields are replaced."""
+    bounds = stage(dataclasses.replace(batch, **changes))
+    return bounds.near, bounds.far
 
 
 def inside(near, far, batch, slack=1e-4):
@@ -16,11 +30,12 @@ def inside(near, far, batch, slack=1e-4):
     return good[batch.masks].float().mean().item()
 
 
-@pytest.mark.parametrize("kind", ["box", "hull"])
+@pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.parametrize(("views", "size"), [(2, (56, 56)), (3, (70, 42)), (4, (42, 56)), (5, (56, 56))])
-def test_true_depth_is_within_the_bounds(kind, views, size):
+def test_true_depth_is_within_the_bounds(stage, views, size):
+    """Bounds that exclude the surface would make the true depth unreachable."""
     batch = make_batch(2, views, *size, spread=180.0 if views == 2 else 360.0)
-    near, far = SubjectBounds(kind=kind)(batch.masks, batch.cameras)
+    near, far = near_and_far(stage(), batch)
     assert near.shape == far.shape == batch.masks.shape
     assert (near > 0).all()
     assert (far - near > 0.0199).all()
@@ -29,25 +44,28 @@ def test_true_depth_is_within_the_bounds(kind, views, size):
 
 @pytest.mark.parametrize("resolution", [30, 50, 160])
 def test_a_coarse_search_stays_conservative(resolution):
+    """A low resolution of the search may widen the bounds, never cut the subject off."""
     batch = make_batch(1, 4, 112, 112)
-    near, far = SubjectBounds(resolution=resolution)(batch.masks, batch.cameras)
+    near, far = near_and_far(VisualHull(resolution=resolution), batch)
     assert inside(near, far, batch) == 1
-    box = SubjectBounds(kind="box", resolution=resolution)(batch.masks, batch.cameras)
+    box = near_and_far(SubjectBox(resolution=resolution), batch)
     assert (near >= box[0] - 0.0101).all()  # half the least thickness
     assert (far <= box[1] + 0.0201).all()
 
 
 def test_the_hull_is_tighter_than_the_box_and_close_to_the_subject():
+    """A hull as wide as the box would cost its time for nothing."""
     batch = make_batch(1, 5, 112, 112)
     lengths = {}
-    for kind in ("box", "hull"):
-        near, far = SubjectBounds(kind=kind, dilation=0.0)(batch.masks, batch.cameras)
-        lengths[kind] = (far - near)[batch.masks].mean()
-    assert lengths["hull"] < 0.7 * lengths["box"]
-    assert lengths["hull"] < 0.55  # the mean chord of the ellipsoid is about 0.3 m
+    for stage in STAGES:
+        near, far = near_and_far(stage(dilation=0.0), batch)
+        lengths[stage] = (far - near)[batch.masks].mean()
+    assert lengths[VisualHull] < 0.7 * lengths[SubjectBox]
+    assert lengths[VisualHull] < 0.55  # the mean chord of the ellipsoid is about 0.3 m
 
 
 def test_the_box_holds_the_subject_and_little_more():
+    """The carved box must neither cut the subject nor keep the empty space around it."""
     batch = make_batch(2, 4, 112, 112)
     lower, upper = subject_box(batch.masks, batch.cameras, radius=1)
     assert (lower <= CENTER - RADII).all()
@@ -57,18 +75,20 @@ def test_the_box_holds_the_subject_and_little_more():
 
 
 def test_a_subject_that_the_frame_cuts_keeps_its_bounds():
+    """What lies outside a view's frame must not count as empty."""
     batch = make_batch(1, 4, 56, 56, zoom=1.6)
     assert batch.masks[:, :, 0].any(), "the head must touch the border in this test"
-    for kind in ("box", "hull"):
-        assert inside(*SubjectBounds(kind=kind)(batch.masks, batch.cameras), batch) == 1
+    for stage in STAGES:
+        assert inside(*near_and_far(stage(), batch), batch) == 1
 
 
-@pytest.mark.parametrize("kind", ["box", "hull"])
-def test_an_empty_mask_does_not_vote(kind):
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_empty_mask_does_not_vote(stage):
+    """A view without the subject would otherwise carve everything away."""
     batch = make_batch(2, 3, 56, 56)
     masks = batch.masks.clone()
     masks[0, 1] = False
-    near, far = SubjectBounds(kind=kind)(masks, batch.cameras)
+    near, far = near_and_far(stage(), batch, masks=masks)
     assert near.isfinite().all()
     assert far.isfinite().all()
     assert (
@@ -84,17 +104,18 @@ def test_an_empty_mask_does_not_vote(kind):
         )
         == 1
     )
-    near, far = SubjectBounds(kind=kind)(torch.zeros_like(masks), batch.cameras)
+    near, far = near_and_far(stage(), batch, masks=torch.zeros_like(masks))
     assert near.isfinite().all()
     assert (far > near).all()
 
 
 def test_tolerance_outvotes_a_wrong_mask():
+    """One wrong mask must not cut off what the other views see."""
     batch = make_batch(1, 5, 56, 56)
     wrong = batch.masks.clone()
     wrong[0, 2, 20:] = False  # one view has lost everything below the head
     others = [0, 1, 3, 4]
-    near, far = SubjectBounds(tolerance=1)(wrong, batch.cameras)
+    near, far = near_and_far(VisualHull(tolerance=1), batch, masks=wrong)
     good = (near <= batch.depths) & (batch.depths <= far)
     assert good[:, others][batch.masks[:, others]].all()
     feet = [subject_box(wrong, batch.cameras, 1, tolerance)[0][0, 1] for tolerance in (0, 1)]
@@ -102,20 +123,22 @@ def test_tolerance_outvotes_a_wrong_mask():
 
 
 def test_masks_that_contradict_one_another_fall_back_to_the_box():
+    """An empty hull must give finite bounds, not NaN."""
     batch = make_batch(1, 3, 56, 56)
     masks = torch.zeros_like(batch.masks)
     masks[0, 0, :6, :6] = masks[0, 1, -6:, -6:] = masks[0, 2, :6, -6:] = True
-    hull = SubjectBounds(dilation=0.0)(masks, batch.cameras)
+    hull = near_and_far(VisualHull(dilation=0.0), batch, masks=masks)
     assert all(value.isfinite().all() for value in hull)
     assert (hull[1] > hull[0]).all()
 
 
-def test_box_interval_ends_on_the_faces():
+def test_depths_in_a_box_end_on_its_faces():
+    """Entry and exit of a ray must lie on the box."""
     cameras = ring(2, 3, 28, 42)
     lower, upper = torch.tensor([[-0.3, 0.2, -0.4]] * 2), torch.tensor([[0.5, 1.6, 0.3]] * 2)
-    near, far = box_interval(cameras, lower, upper)
+    bounds = depths_in_box(cameras, lower, upper)
     hits = ellipsoid(cameras, radii=torch.tensor([0.1, 0.5, 0.1]))[0]  # rays that surely hit
-    for depth in (near, far):
+    for depth in (bounds.near, bounds.far):
         points = unproject_maps(depth, cameras)[hits]
         beyond = torch.maximum(lower[0] - points, points - upper[0]).amax(-1)
         torch.testing.assert_close(beyond, torch.zeros_like(beyond), atol=1e-5, rtol=0)
@@ -123,6 +146,7 @@ def test_box_interval_ends_on_the_faces():
 
 @pytest.mark.parametrize("radius", [0, 1, 3, 40])
 def test_dilation_is_a_maximum_over_a_square(radius):
+    """The fast dilation must equal its definition at every radius."""
     masks = torch.rand(2, 3, 17, 23, generator=torch.Generator().manual_seed(0)) > 0.97
     padded = F.pad(masks.float(), (radius,) * 4)
     expected = padded.unfold(-2, 2 * radius + 1, 1).unfold(-2, 2 * radius + 1, 1).amax((-1, -2)).bool()
@@ -131,40 +155,51 @@ def test_dilation_is_a_maximum_over_a_square(radius):
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
 def test_cameras_of_absurd_sizes_give_finite_bounds(factor):
+    """Cameras in other units must not overflow into NaN bounds."""
     batch = make_batch(1, 3)
     cameras = batch.cameras
     for name, index in (("intrinsics", (..., [0, 1], [0, 1])), ("extrinsics", (..., slice(3), 3))):
         changed = getattr(cameras, name).clone()
         changed[index] *= factor
         odd = dataclasses.replace(cameras, **{name: changed})
-        for kind in ("box", "hull"):
-            near, far = SubjectBounds(kind=kind)(batch.masks, odd)
+        for stage in STAGES:
+            near, far = near_and_far(stage(), batch, cameras=odd)
             assert near.isfinite().all()
             assert far.isfinite().all()
             assert ((near > 0) & (far >= near)).all()
 
 
 def test_autocast_changes_nothing():
+    """Geometry in half precision would be off by centimetres."""
     batch = make_batch(1, 3)
-    expected = SubjectBounds()(batch.masks, batch.cameras)
+    expected = near_and_far(VisualHull(), batch)
     with torch.autocast("cpu", torch.bfloat16):
-        found = SubjectBounds()(batch.masks, batch.cameras)
+        found = near_and_far(VisualHull(), batch)
     assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
 
 
 def test_elements_of_a_batch_do_not_mix():
+    """A result must not depend on the other subjects of its batch."""
     batch = make_batch(2, 3)
-    together = SubjectBounds()(batch.masks, batch.cameras)
+    together = near_and_far(VisualHull(), batch)
     for b in range(2):
-        alone = SubjectBounds()(batch.masks[b : b + 1], batch.cameras[b : b + 1])
+        part = slice(b, b + 1)
+        one = Batch(batch.images[part], batch.masks[part], batch.cameras[part])
+        alone = near_and_far(VisualHull(), one)
         for x, y in zip(together, alone, strict=True):
             torch.testing.assert_close(x[b], y[0], atol=1e-3, rtol=0)
 
 
+def test_no_bounds_are_none():
+    """Depths of the release's model must not be bounded by accident."""
+    assert NoBounds()(make_batch()) is None
+
+
 @pytest.mark.parametrize(
     ("option", "key"),
-    [({"kind": "sphere"}, "kind"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
+    [({"cells": 1}, "cells"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
 )
 def test_impossible_options_are_refused(option, key):
-    with pytest.raises(InputError, match=f"depth_head.*{key}"):
-        SubjectBounds(**option)
+    """A bad value is found when the configuration is read, by its key."""
+    with pytest.raises(InputError, match=rf"bounds\.{key}"):
+        VisualHull(**option)

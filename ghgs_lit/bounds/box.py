@@ -1,0 +1,182 @@
+"""Near and far of each pixel from an axis-aligned box around the subject.
+
+The box is found by carving a coarse grid with the masks. Masks are dilated, because real ones are noisy.
+Nothing here has a gradient.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.bounds.rays import depths_in_box, pixel_axes, projection_matrices
+from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, silhouettes, votes_outside
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.masks import first_and_last
+from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.types import Batch, Cameras, DepthBounds
+
+#: The largest bound, in metres: cameras of absurd sizes overflow.
+_FARTHEST = 1e6
+
+
+@dataclass(frozen=True)
+class SubjectBox:
+    """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box.
+
+    A ray that misses the box gets the range of depths of the whole box. Views with an empty mask do not vote.
+
+    Args:
+        dilation: of the masks, as a fraction of the image's longer side.
+        tolerance: a point counts as inside while at most this many views that see it say "outside".
+        resolution: cells along the longer side of the masks that are searched.
+        cells: cells along each side of the grid that is carved.
+        margin: around the box, in metres.
+        min_depth: least near, in metres.
+        min_thickness: least far - near, in metres.
+    """
+
+    dilation: float = 0.02
+    tolerance: int = 0
+    resolution: int = 160
+    cells: int = 32
+    margin: float = 0.03
+    min_depth: float = 0.1
+    min_thickness: float = 0.02
+
+    least: ClassVar[dict[str, int]] = {"tolerance": 0, "margin": 0, "resolution": 8, "cells": 8}
+
+    def __post_init__(self) -> None:
+        require(0 <= self.dilation < 0.5, "bounds.dilation", "a fraction of the image", self.dilation)
+        for name, least in self.least.items():
+            value = getattr(self, name)
+            require(value >= least, f"bounds.{name}", f"{least} or more", value)
+        for name in ("min_depth", "min_thickness"):
+            require(getattr(self, name) > 0, f"bounds.{name}", "above 0", getattr(self, name))
+
+    @torch.no_grad()
+    def __call__(self, batch: Batch) -> DepthBounds:
+        """Bounds of all pixels; reads masks and cameras."""
+        with torch.autocast(batch.masks.device.type, enabled=False):
+            coarse = silhouettes(batch, self.resolution, self.dilation)
+            lower, upper = subject_box(
+                coarse.masks, coarse.cameras, coarse.dilation, self.tolerance, self.cells
+            )
+            return self._within(batch, coarse, lower - self.margin, upper + self.margin)
+
+    def _within(self, batch: Batch, coarse: Silhouettes, lower: Tensor, upper: Tensor) -> DepthBounds:
+        """Bounds in the box from ``lower`` to ``upper``."""
+        return self._valid(depths_in_box(batch.cameras, lower, upper))
+
+    def _valid(self, bounds: DepthBounds) -> DepthBounds:
+        """Bounds in front of the camera, at least ``min_thickness`` apart (widened about their middle)."""
+        near, far = (x.nan_to_num(nan=0.0).clamp(max=_FARTHEST) for x in (bounds.near, bounds.far))
+        missing = (self.min_thickness - (far - near)).clamp(min=0) / 2
+        near = (near - missing).clamp(min=self.min_depth)
+        return DepthBounds(near, torch.maximum(far + missing, near + self.min_thickness))
+
+
+def subject_box(
+    masks: Bool[Tensor, "B V h w"], cameras: Cameras, radius: int, tolerance: int = 0, cells: int = 32
+) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
+    """The axis-aligned box of the space that masks and cameras leave to the subject.
+
+    Carved twice: the second grid fills the box that the first one found. Where nothing is left (masks that
+    contradict one another) the box of the previous pass stays.
+
+    Args:
+        masks: of the views.
+        cameras: [B, V], of the masks' size.
+        radius: dilation of the masks in pixels.
+        tolerance: how many views may say "outside" of a point that is kept.
+        cells: cells along each side of the grid.
+
+    Returns:
+        The corners with the smallest and with the largest coordinates, in metres.
+    """
+    center = _center(masks, cameras)
+    reach = _reach(masks, cameras, center)[:, None]
+    lower, upper = center - reach, center + reach
+    focal = at_least_float32(cameras.intrinsics)[..., [0, 1], [0, 1]].amax(-1)
+    for _ in range(2):
+        cell = (upper - lower) / cells
+        depth = _project_one((lower + upper) / 2, cameras)[1]
+        # Half a cell's diagonal in pixels, for subjects that come up to 0.6 of the distance of their middle.
+        pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
+        grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int().tolist()
+        grown = torch.stack([dilate(mask, radius + more) for mask, more in zip(masks, grow, strict=True)])
+        kept = _carve(votes_outside(grown, masks), cameras, lower, cell, cells, tolerance)
+        found = kept.flatten(1).any(-1)[:, None]
+        # Along each axis, whether any cell of the slice is kept.
+        slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
+        first, last = first_and_last(slices)
+        corner = lower
+        lower = torch.where(found, corner + first * cell, lower)
+        upper = torch.where(found, corner + (last + 1) * cell, upper)
+    return lower, upper
+
+
+def _carve(
+    outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, cells: int, tolerance: int
+) -> Bool[Tensor, "B n n n"]:
+    """Which cells of a grid at most ``tolerance`` views place outside the subject."""
+    steps = torch.arange(cells, device=lower.device, dtype=lower.dtype) + 0.5
+    position = lower[..., None] + cell[..., None] * steps
+    matrices = projection_matrices(cameras)
+    kept = []
+    for b in range(outside.shape[0]):
+        votes = torch.zeros(3 * (cells,), dtype=torch.uint8, device=lower.device)
+        for v in range(outside.shape[1]):
+            x, y, z = (matrices[b, v, :, axis, None] * position[b, axis] for axis in range(3))
+            z = z + matrices[b, v, :, 3, None]
+            pixel = (x[:, :, None] + y[:, None, :])[..., None] + z[:, None, None, :]
+            votes += look_up(outside[b, v], *pixel.unbind(0))
+        kept.append(votes <= tolerance)
+    return torch.stack(kept)
+
+
+def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Pixel [B, V, 2] and depth [B, V] of one point of each element in all of its cameras."""
+    points = points[:, None].expand(*cameras.shape, 3)
+    return project(points, cameras.intrinsics, cameras.extrinsics)
+
+
+def _center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
+    """The point nearest to the rays through the masks' centroids, by least squares.
+
+    The optical axes take part with a small weight, so that one mask, or none, is enough; a still smaller
+    pull towards the cameras keeps parallel rays solvable.
+    """
+    intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
+    u, v = pixel_axes(cameras)
+    counts = masks.sum((-2, -1))
+    sums = torch.stack(((masks.sum(-2) * u).sum(-1), (masks.sum(-1) * v).sum(-1)), -1)
+    axis = intrinsics[..., :2, 2]
+    centroid = torch.where(counts[..., None] > 0, sums / counts.clamp(min=1)[..., None], axis)
+    rays = torch.stack((centroid, axis), dim=-2)
+    rays = torch.cat((rays, torch.ones_like(rays[..., :1])), -1)
+    to_world = extrinsics[..., :3, :3].mT @ torch.linalg.inv(intrinsics)
+    directions = F.normalize(torch.einsum("bvij,bvrj->bvri", to_world, rays), dim=-1)
+    weights = torch.stack((counts > 0, torch.full_like(counts, 1e-3, dtype=rays.dtype)), -1)
+    identity = torch.eye(3, device=rays.device, dtype=rays.dtype)
+    across = identity - directions[..., :, None] * directions[..., None, :]
+    across = (weights[..., None, None] * across).sum(2)
+    origin = cameras.centers.mean(1)
+    offsets = (cameras.centers - origin[:, None])[..., None]
+    matrix = across.sum(1) + 1e-4 * identity
+    return torch.linalg.solve(matrix, (across @ offsets).sum(1))[..., 0] + origin
+
+
+def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
+    """A generous radius of the subject about ``center``, in metres."""
+    pixel, depth = _project_one(center, cameras)
+    extents = [
+        torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
+        for dim, line in enumerate(pixel_axes(cameras))
+    ]
+    extent = torch.stack(extents, -1) / at_least_float32(cameras.intrinsics)[..., [0, 1], [0, 1]]
+    # More than what is seen: what reaches away from a camera looks smaller than it is.
+    return 1.4 * (extent.norm(dim=-1) * depth.clamp(min=NEAREST)).amax(1).clamp(min=0.05)

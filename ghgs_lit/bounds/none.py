@@ -1,0 +1,11 @@
+"""Depths without bounds."""
+
+from ghgs_lit.types import Batch
+
+
+class NoBounds:
+    """The stage of a model whose depths are not bounded, as in the authors' release."""
+
+    def __call__(self, batch: Batch) -> None:
+        """None: there are no bounds."""
+        return None
