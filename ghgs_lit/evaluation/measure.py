@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.data.sampling import CAMERAS, TargetProtocol
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
 from ghgs_lit.runs.results import Row
@@ -128,7 +129,9 @@ def measure_all(
     rows: list[Row] = []
     for count in views:
         for kind in targets:
-            loader = data.evaluation_loader(views=count, targets=kind, split=split)
+            known = {CAMERAS.name: CAMERAS, data.targets.name: data.targets}
+            protocol = known.get(kind) or TargetProtocol(kind)
+            loader = data.evaluation_loader(views=count, targets=protocol, split=split)
             for name, method in methods.items():
                 rows += measure(method, name, loader, kind, metrics, device, pictures, picture_count)
     return rows
