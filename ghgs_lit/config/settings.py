@@ -36,6 +36,7 @@ def from_flat(key: str, owner: str, values: Mapping[str, Any], *classes: type) -
     Raises:
         InputError: a key that is a field of none of them.
     """
+    require(isinstance(values, Mapping), key, f"a mapping of the settings of {owner}", values)
     known = [{f.name for f in fields(cls) if f.init} for cls in classes]
     everything = sorted(set().union(*known))
     for name in values:

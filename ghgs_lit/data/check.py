@@ -131,12 +131,8 @@ class _Inspections(Dataset):
 
 
 def _read_all(items: Dataset, workers: int, label: str) -> list:
-    loader = DataLoader(items, batch_size=None, collate_fn=_as_is, num_workers=min(workers, len(items)))
+    loader = DataLoader(items, batch_size=None, num_workers=min(workers, len(items)))
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
-
-
-def _as_is(item):
-    return item
 
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:

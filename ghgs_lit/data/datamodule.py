@@ -131,9 +131,6 @@ class PhotographsDataModule(LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         return self.evaluation_loader()
 
-    def test_dataloader(self) -> DataLoader:
-        return self.evaluation_loader()
-
     def _possible(self, targets: TargetProtocol) -> TargetProtocol:
         """``targets``, unless they are views between static cameras."""
         if self.dataset.static_cameras and targets.view_numbers != {RING_VIEW}:
@@ -147,14 +144,8 @@ class PhotographsDataModule(LightningDataModule):
         return DataLoader(
             batches,
             batch_size=None,
-            collate_fn=_as_is,
             num_workers=self.options.workers,
             persistent_workers=self.options.workers > 0,
             pin_memory=self.options.pin_memory and torch.cuda.is_available(),
             **options,
         )
-
-
-def _as_is(batch: Batch) -> Batch:
-    """Items are batches already."""
-    return batch

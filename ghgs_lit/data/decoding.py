@@ -79,7 +79,7 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
         shapes: the shapes that are accepted; None is any length.
 
     Raises:
-        InputError: it is no array of numbers, has another shape, or is not finite.
+        InputError: it is not an array of numbers, has another shape, or is not finite.
     """
     try:
         array = np.asarray(array).astype(np.float64)

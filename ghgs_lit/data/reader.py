@@ -4,15 +4,20 @@ A data set is a :class:`Reader`, which finds and decodes its files. Resizing and
 (:class:`Photographs`), sampling and batching are the same for all data sets.
 """
 
+import contextlib
+import logging
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError, require
+
+log = logging.getLogger(__name__)
 
 PHASES = ("train", "val")
 
@@ -64,11 +69,46 @@ class Reader(ABC):
         """How messages refer to a photograph: preferably the path of its mask."""
         return f"{name}, camera {position}, view {view}"
 
+    @contextlib.contextmanager
+    def collecting(self) -> Iterator[None]:
+        """Leave the block at an InputError; it is a problem of the data set, to be raised or collected."""
+        try:
+            yield
+        except InputError as error:
+            if self.strict:
+                raise
+            self.problems.append(str(error))
+
     def problem(self, line: str) -> None:
-        """Raise or collect a problem that makes a part of the data set unusable."""
-        if self.strict:
+        """Raise or collect a problem of the data set."""
+        with self.collecting():
             raise InputError(line)
-        self.problems.append(line)
+
+
+class FrameReader(Reader):
+    """A reader whose subjects are frames of sequences; ``frames[subject].folder`` is the folder of one."""
+
+    def __init__(self, strict: bool = True) -> None:
+        super().__init__(strict)
+        self.frames: dict[str, Any] = {}
+
+    @property
+    def sequences(self) -> set[str]:
+        """Names of the sequences that the subjects are frames of."""
+        return {self.frames[name].folder.name for name in self.subjects}
+
+    @property
+    def people(self) -> int:
+        return len(self.sequences)
+
+    def existing(self, folder: Path, names: Sequence[str], example: str) -> list[str]:
+        """Those of the sequences ``names`` that exist; none is a problem, whose line shows ``example``."""
+        there = [name for name in names if (folder / name).is_dir()]
+        if len(there) < len(names):
+            log.warning("%s: %d of %d sequences are there", folder, len(there), len(names))
+        if not there:
+            self.problem(f"{folder}: expected sequences such as {example}; found none of the split")
+        return there
 
 
 class Photographs:

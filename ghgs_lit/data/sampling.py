@@ -179,7 +179,7 @@ class TargetProtocol:
             raise InputError(f"targets.positions: expected some of {list(available)}; found {lacking[0]}")
         taken = ring_photos(inputs)
         photos = [photo for position in listed if (photo := (position, self.view)) not in taken]
-        require(len(photos) > 0, "targets.positions", "a camera that is no input", list(listed))
+        require(len(photos) > 0, "targets.positions", "a camera that is not an input", list(listed))
         return tuple(photos if self.per_subject == "all" else photos[: int(self.per_subject)])
 
 

@@ -22,11 +22,6 @@ from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
 
 
-def default_cache_dir() -> Path:
-    """``$GHGS_CACHE``, or ``~/.cache/ghgs_lit``."""
-    return Path(os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit").expanduser()
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Renderable(Rendered):
     """A data set that this package can render; its ring of cameras is the rig's.
@@ -73,8 +68,8 @@ class Synthetic(_Renderable):
             require(0 < count < self.FIRST_VAL, f"data.people.{phase}", "at least 1", count)
         settings = {**identity(self.rig, self.render, self.people_seed), "people": people_version()}
         key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
-        cache = Path(self.cache_dir).expanduser() if self.cache_dir else default_cache_dir()
-        set_fields(self, root=str(cache / f"synthetic-{key}"))
+        cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
+        set_fields(self, root=str(Path(cache).expanduser() / f"synthetic-{key}"))
 
     def subject_names(self, phase: str) -> list[str]:
         first = 0 if phase == "train" else self.FIRST_VAL

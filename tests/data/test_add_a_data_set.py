@@ -50,7 +50,7 @@ def project(tmp_path):
 
 @pytest.fixture(autouse=True)
 def clean(monkeypatch):
-    """Every test admits and imports anew."""
+    """Each test starts without admitted or imported modules."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(plugins.VARIABLE, raising=False)
     plugins._installed.cache_clear()
@@ -91,7 +91,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
     content = json.loads(Path("run/metrics.json").read_text())
     assert content["provenance"]["data"] == {"name": "my_people", "split": "val"}
     assert content["provenance"]["training"]["steps"] == 2
-    # One subject; every camera that is no input is a target.
+    # One subject; every camera that is not an input is a target.
     before = {row["target"]: row["psnr"] for row in content["rows"]}
     assert {row["subject"] for row in content["rows"]} == {"c"}
     assert len(before) == CAMERAS - 3

@@ -135,7 +135,7 @@ def test_views_between_ring_cameras(rendered):
 
 
 def test_files_are_of_the_published_types(rendered):
-    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` is no view."""
+    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` files are not views."""
     train = rendered / "train"
     mask = np.asarray(Image.open(train / "mask/0000_004/2.png"))
     assert mask.shape == (SIZE, SIZE, 3)

@@ -18,7 +18,7 @@ from ghgs_lit.data.decoding import check_center, check_name, read_image, read_ma
 from ghgs_lit.data.humman.cameras import KINECTS, Calibration, read_calibration
 from ghgs_lit.data.humman.depth import surface_points
 from ghgs_lit.data.humman.smpl import Body, read_parameters
-from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.errors import InputError
 
@@ -34,7 +34,7 @@ class _Frame:
     number: int
 
 
-class HuMManReader(Reader):
+class HuMManReader(FrameReader):
     """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
 
     Args:
@@ -65,55 +65,26 @@ class HuMManReader(Reader):
     ) -> None:
         super().__init__(strict)
         self.masks, self.body_kind = masks, body
-        self._frames: dict[str, _Frame] = {}
         self._body: Body | None = None
         if body == "smpl":
-            self._load_model(smpl_model)
-        there = [path for name in sequences if (path := folder / name).is_dir()]
-        if len(there) < len(sequences):
-            log.warning("%s: %d of %d sequences are there", folder, len(there), len(sequences))
-        if not there:
-            self.problem(f"{folder}: expected sequences such as p000455_a000986; found none of the split")
-        for path in there:
-            self._add(path, frames)
+            with self.collecting():
+                self._body = _load_model(smpl_model)
+        for name in self.existing(folder, sequences, "p000455_a000986"):
+            with self.collecting():
+                self._add(folder / name, frames)
         self.subjects = dict(list(self.subjects.items())[:limit])
-
-    @property
-    def sequences(self) -> set[str]:
-        """Names of the sequences that the subjects are frames of."""
-        return {self._frames[name].folder.name for name in self.subjects}
-
-    @property
-    def people(self) -> int:
-        return len(self.sequences)
-
-    def _load_model(self, path: Path | None) -> None:
-        try:
-            if path is None:
-                raise InputError(
-                    "data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl for body=smpl; found null "
-                    "(body=depth takes points of the depth cameras in its place; body=none with "
-                    "loss.weights.chamfer=0 trains without)"
-                )
-            self._body = Body(path)
-        except InputError as error:
-            self.problem(str(error))
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
         """Add the frames of one sequence that exist, with the cameras that have them."""
-        try:
-            cameras = read_calibration(path / "cameras.json", "color")
-            there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
-            found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
-            found = {number: positions for number, positions in found.items() if positions}
-            if not found:
-                raise InputError(
-                    f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "
-                    f"{len(frames)} (frame numbers are multiples of 6)"
-                )
-        except InputError as error:
-            self.problem(str(error))
-            return
+        cameras = read_calibration(path / "cameras.json", "color")
+        there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
+        found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
+        found = {number: positions for number, positions in found.items() if positions}
+        if not found:
+            raise InputError(
+                f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "
+                f"{len(frames)} (frame numbers are multiples of 6)"
+            )
         if len(found) < len(frames):
             log.info("%s: %d of %d frames are there", path, len(found), len(frames))
         for number, positions in found.items():
@@ -121,11 +92,11 @@ class HuMManReader(Reader):
                 lacking = sorted(set(KINECTS) - set(positions))
                 log.warning("%s: frame %06d lacks kinects %s, left out", path, number, lacking)
             name = check_name(f"{path.name}_{number:06d}")
-            self._frames[name] = _Frame(path, cameras, number)
+            self.frames[name] = _Frame(path, cameras, number)
             self.subjects[name] = positions
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        frame = self._frames[name]
+        frame = self.frames[name]
         path = _file(frame.folder, "kinect_color", position, frame.number)
         image = to_rgb(read_image(path))
         mask = self._mask(frame, position, image.shape[:2])
@@ -134,7 +105,7 @@ class HuMManReader(Reader):
         return opencv_view(image, mask, intrinsics, frame.cameras.extrinsics[position])
 
     def read_body(self, name: str) -> np.ndarray | None:
-        frame = self._frames[name]
+        frame = self.frames[name]
         if self.body_kind == "depth":
             masks = {position: self._mask(frame, position) for position in self.subjects[name]}
             depth_cameras = read_calibration(frame.folder / "cameras.json", "depth")
@@ -144,7 +115,7 @@ class HuMManReader(Reader):
         return self._body.vertices(read_parameters(frame.folder / "smpl_params" / f"{frame.number:06d}.npz"))
 
     def place(self, name: str, position: int, view: int) -> str:
-        frame = self._frames[name]
+        frame = self.frames[name]
         return str(_file(frame.folder, self.masks, position, frame.number))
 
     def _mask(self, frame: _Frame, position: int, size: tuple[int, int] | None = None) -> np.ndarray:
@@ -154,6 +125,16 @@ class HuMManReader(Reader):
             image = read_image(path)
             size = (image.height, image.width)
         return read_map(path, size) != 0
+
+
+def _load_model(path: Path | None) -> Body:
+    if path is None:
+        raise InputError(
+            "data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl for body=smpl; found null "
+            "(body=depth takes points of the depth cameras in its place; body=none with "
+            "loss.weights.chamfer=0 trains without)"
+        )
+    return Body(path)
 
 
 def _file(folder: Path, kind: str, kinect: int, number: int) -> Path:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ghgs_lit.config.settings import set_fields
 from ghgs_lit.data.decoding import check_center, check_name, read_array, read_image, read_map, to_rgb
-from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
@@ -58,7 +58,7 @@ class _Frame:
         return frame_number(self.folder / self.annotations.frames[self.index][0])
 
 
-class ZJUMoCapReader(Reader):
+class ZJUMoCapReader(FrameReader):
     """Frames of ``splits``, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
 
     Missing sequences are left out (``ghgs prepare task=check`` counts them).
@@ -90,52 +90,36 @@ class ZJUMoCapReader(Reader):
     ) -> None:
         super().__init__(strict)
         self.undistorted, self.masks, self.bodies = undistorted, tuple(masks), tuple(bodies)
-        self._frames: dict[str, _Frame] = {}
-        wanted = [(folder / f"CoreView_{s}", split.frames) for split in splits for s in split.sequences]
-        there = [(path, frames) for path, frames in wanted if path.is_dir()]
-        if len(there) < len(wanted):
-            log.warning("%s: %d of %d sequences are there", folder, len(there), len(wanted))
-        if not there:
-            self.problem(f"{folder}: expected sequences such as {wanted[0][0].name}; found none of the split")
-        for path, frames in there:
-            self._add(path, frames, cameras)
+        wanted = [(f"CoreView_{s}", split.frames) for split in splits for s in split.sequences]
+        there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
+        for name, frames in wanted:
+            if name in there:
+                with self.collecting():
+                    self._add(folder / name, frames, cameras)
         self.subjects = dict(list(self.subjects.items())[:limit])
-
-    @property
-    def sequences(self) -> set[str]:
-        """Names of the sequences that the subjects are frames of."""
-        return {self._frames[name].folder.name for name in self.subjects}
-
-    @property
-    def people(self) -> int:
-        return len(self.sequences)
 
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
         """Add the chosen frames of one sequence."""
-        try:
-            annotations = read_annotations(path / "annots.npy")
-            count = len(annotations.intrinsics)
-            if cameras is not None and cameras > count:
-                raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
-            wanted = range(*frames)
-            chosen = [index for index in wanted if index < len(annotations.frames)]
-            if not chosen:
-                raise InputError(
-                    f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
-                    f"found {len(annotations.frames)} frames"
-                )
-            found = [_Frame(path, annotations, index) for index in chosen]
-            named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in found}
-        except InputError as error:
-            self.problem(str(error))
-            return
+        annotations = read_annotations(path / "annots.npy")
+        count = len(annotations.intrinsics)
+        if cameras is not None and cameras > count:
+            raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
+        wanted = range(*frames)
+        chosen = [index for index in wanted if index < len(annotations.frames)]
+        if not chosen:
+            raise InputError(
+                f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
+                f"found {len(annotations.frames)} frames"
+            )
+        found = [_Frame(path, annotations, index) for index in chosen]
+        named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in found}
         if len(chosen) < len(wanted):
             log.info("%s: %d of %d frames (the sequence is shorter)", path, len(chosen), len(wanted))
-        self._frames |= named
+        self.frames |= named
         self.subjects |= dict.fromkeys(named, tuple(range(count if cameras is None else cameras)))
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        frame = self._frames[name]
+        frame = self.frames[name]
         photograph = frame.annotations.frames[frame.index][position]
         path = _find(frame.folder, photograph, photograph.suffix)
         image = to_rgb(read_image(path))
@@ -148,14 +132,14 @@ class ZJUMoCapReader(Reader):
         return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[position])
 
     def read_body(self, name: str) -> np.ndarray | None:
-        frame = self._frames[name]
+        frame = self.frames[name]
         folder = next((f for b in self.bodies if (f := frame.folder / b).is_dir()), None)
         if folder is None:
             return None
         return read_array(folder / f"{frame.number}.npy", [(BODY_VERTICES, 3)]).astype(np.float32)
 
     def place(self, name: str, position: int, view: int) -> str:
-        frame = self._frames[name]
+        frame = self.frames[name]
         photograph = frame.annotations.frames[frame.index][position]
         return str(_find(self._mask_folders(frame.folder)[0], photograph, ".png"))
 
