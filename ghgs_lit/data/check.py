@@ -198,11 +198,8 @@ def _pictured(reader: Reader) -> set[Photograph]:
         return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))]
 
     names = some(list(reader.subjects), _PICTURED_SUBJECTS) if reader.subjects else []
-    return {
-        (name, position, RING_VIEW)
-        for name in names
-        for position in some(reader.subjects[name], _PICTURED_VIEWS)
-    }
+    chosen = {name: some(reader.subjects[name], _PICTURED_VIEWS) for name in names}
+    return {(name, position, RING_VIEW) for name, positions in chosen.items() for position in positions}
 
 
 def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> list[str]:
@@ -263,14 +260,6 @@ def show(report: Report) -> None:
             rich.print(table)
 
 
-def _plain(phase: Phase) -> dict:
-    """As plain data, without pictures."""
-    content = asdict(phase)
-    for seen in content["seen"]:
-        del seen["tile"]
-    return content
-
-
 def write(report: Report, folder: Path) -> Path:
     """Write ``check.json`` and, if there are photographs, ``contact.png``; returns ``folder``."""
     keys = ("place", "expected", "found")
@@ -278,8 +267,11 @@ def write(report: Report, folder: Path) -> Path:
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],
         "notes": report.notes,
         "inspections": report.inspections,
-        "phases": {name: _plain(phase) for name, phase in report.phases.items()},
+        "phases": {name: asdict(phase) for name, phase in report.phases.items()},
     }
+    for phase in content["phases"].values():
+        for seen in phase["seen"]:
+            del seen["tile"]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "check.json").write_text(json.dumps(content, indent=1))
     rows: dict[str, list[Tile]] = {}

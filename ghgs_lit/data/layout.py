@@ -66,16 +66,8 @@ class Rendered(DataSet):
         return None
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
-        return Layout(
-            self.folder,
-            phase,
-            self.subject_names(phase),
-            self.limit[phase],
-            self.pixel_centers,
-            self.body_models,
-            self.further_bodies(),
-            strict,
-        )
+        names, limit, further = self.subject_names(phase), self.limit[phase], self.further_bodies()
+        return Layout(self.folder, phase, names, limit, self.pixel_centers, self.body_models, further, strict)
 
 
 class Layout(Reader):

@@ -37,8 +37,8 @@ class _Renderable(Rendered):
     render_workers: int | None = None
 
     def __post_init__(self) -> None:
-        rig = from_config(Rig, "data.rig", self.rig)
-        render = from_config(RenderSettings, "data.render", self.render)
+        rig = from_config(Rig, "data.rig", self.rig or {})
+        render = from_config(RenderSettings, "data.render", self.render or {})
         set_fields(self, rig=rig, render=render, ring=rig.positions)
         super().__post_init__()
 

@@ -60,15 +60,10 @@ class HuMMan(DataSet):
         return sorted(set(names) - set(self.split["val"]))
 
     def reader(self, phase: str, strict: bool = True) -> HuMManReader:
+        names, limit = self.sequences(phase), self.limit[phase]
+        model = None if self.smpl_model is None else Path(self.smpl_model).expanduser()
         return HuMManReader(
-            self.folder,
-            self.sequences(phase),
-            range(*self.frames),
-            self.masks,
-            self.body,
-            None if self.smpl_model is None else Path(self.smpl_model).expanduser(),
-            self.limit[phase],
-            strict,
+            self.folder, names, range(*self.frames), self.masks, self.body, model, limit, strict
         )
 
     def inspections(self) -> Sequence[Callable[[], None]]:

@@ -43,13 +43,7 @@ class ZJUMoCap(DataSet):
         set_fields(self, splits=splits)
 
     def reader(self, phase: str, strict: bool = True) -> ZJUMoCapReader:
+        splits, limit = self.splits[phase], self.limit[phase]
         return ZJUMoCapReader(
-            self.folder,
-            self.splits[phase],
-            self.cameras,
-            self.undistorted,
-            self.masks,
-            self.bodies,
-            self.limit[phase],
-            strict,
+            self.folder, splits, self.cameras, self.undistorted, self.masks, self.bodies, limit, strict
         )
