@@ -29,9 +29,8 @@ def build_data(overrides: list[str]) -> PhotographsDataModule:
     return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
 
 
-def rate(data: PhotographsDataModule, workers: int, seconds: float) -> tuple[float, int]:
-    """Samples per second with a number of workers, and how many samples were counted."""
-    data.workers = workers
+def rate(data: PhotographsDataModule, seconds: float) -> tuple[float, int]:
+    """Samples per second, and how many samples were counted."""
     batches = iter(data.train_dataloader())
     next(batches)
     started, samples = time.perf_counter(), 0
@@ -53,12 +52,14 @@ def main() -> None:
         if not any(o.startswith("data.root=") for o in overrides):
             thuman2.make(Path(folder), {"train": 1}, arguments.size, 0, vids=(0, 2, 3, 4), positions=4)
             overrides = ["data=thuman2", f"data.root={folder}", *overrides]
-        data = build_data(overrides)
         table = Table("workers", "samples/s", "ms per sample", "samples")
         for workers in (int(n) for n in arguments.workers.split(",")):
-            measured, samples = rate(data, workers, arguments.seconds)
+            data = build_data([*overrides, f"data.workers={workers}"])
+            measured, samples = rate(data, arguments.seconds)
             table.add_row(str(workers), f"{measured:.1f}", f"{1000 / measured:.1f}", str(samples))
-    Console().print(f"{data.name}, {data.size[0]} x {data.size[1]}, {os.cpu_count()} cores")
+    Console().print(
+        f"{data.dataset.name}, {data.options.size[0]} x {data.options.size[1]}, {os.cpu_count()} cores"
+    )
     Console().print(table)
 
 

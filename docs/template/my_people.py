@@ -1,34 +1,31 @@
-"""A data set of your own: photographs on disk, a reader that finds them, a data module that names it.
+"""A data set of your own: a reader that finds photographs on disk, its settings, and a DataModule for them.
 
 Copy this file and ``conf/data/my_people.yaml``, then change what is marked. As it stands it reads
 ``<root>/<train|val>/<person>/<camera>.png`` (RGBA, alpha is the mask) with ``cameras.npz`` beside them:
 ``intrinsics`` [n, 3, 3] in pixels and ``extrinsics`` [n, 3 or 4, 4], world to camera, in metres, OpenCV axes.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.data.reader import (
-    Reader,
-    View,
-    check_extrinsics,
-    check_intrinsics,
-    check_name,
-    read_array,
-    read_image,
-)
+from ghgs_lit.data.dataset import DataSet
+from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics, check_name, read_array, read_image
+from ghgs_lit.data.reader import Reader
+from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 
 
 class MyReader(Reader):
-    """The photographs of one phase."""
+    """The photographs of one phase as they are stored."""
 
-    def __init__(self, folder: Path, limit: int | None = None, **options) -> None:
-        super().__init__(**options)
+    def __init__(self, folder: Path, limit: int | None = None, strict: bool = True) -> None:
+        super().__init__(strict)
         self.folder = folder
-        # CHANGE: every sample that can be drawn (a person, or a frame of one) and the numbers of its cameras.
+        # CHANGE: every subject (a person, or a frame of one) and the numbers of its cameras.
         people = sorted(p for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
         for person in people[:limit]:
             cameras = sorted(int(p.stem) for p in person.glob("*.png"))
@@ -36,10 +33,10 @@ class MyReader(Reader):
         if not self.subjects:
             raise InputError(f"{folder}: expected a folder for each person; found none")
 
-    def read_view(self, name: str, pid: int, vid: int, depth: bool) -> View:
-        # CHANGE: one photograph as it is stored. Resizing and caching are done for you.
-        require(vid == 0, "targets", "targets=cameras: there is no other view at a camera", vid)
-        path = self.folder / name / f"{pid}.png"
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        # CHANGE: one photograph as it is stored. Resizing and caching are done for you; `view` is 0 with
+        # static cameras.
+        path = self.folder / name / f"{position}.png"
         image = read_image(path)
         require(image.mode == "RGBA", str(path), "an image with an alpha channel", image.mode)
         pixels = np.asarray(image)
@@ -48,35 +45,38 @@ class MyReader(Reader):
         if not cameras.is_file():
             raise InputError(f"{cameras}: expected the cameras of {name}; found no such file")
         with np.load(cameras) as stored:
-            intrinsics = check_intrinsics(cameras, stored["intrinsics"][pid])
-            extrinsics = check_extrinsics(cameras, stored["extrinsics"][pid])
+            intrinsics = check_intrinsics(cameras, stored["intrinsics"][position])
+            extrinsics = check_extrinsics(cameras, stored["extrinsics"][position])
         # CHANGE: pixel centres lie at +0.5 here. A calibration made with OpenCV puts them at integers:
         # intrinsics[:2, 2] += 0.5
         return View(
             image=pixels[..., :3] * mask[..., None],  # on black
             mask=mask,
-            inverse_depth=None,  # CHANGE: uint16, 2^15 / metres, 0 where unknown (data.reader.encode_depth)
+            inverse_depth=None,  # CHANGE: uint16, 2^15 / metres, 0 where unknown (data.view.encode_depth)
             intrinsics=intrinsics.astype(np.float32),
             extrinsics=extrinsics.astype(np.float32),
         )
 
     def read_body(self, name: str) -> np.ndarray | None:
-        # CHANGE: vertices [n, 3] of any body model in the world, for the Chamfer term; None without one.
+        # CHANGE: vertices [n, 3] of any body model in the world, for the Chamfer loss; None without one.
         path = self.folder / name / "body.npy"
         return read_array(path, [(None, 3)]).astype(np.float32) if path.exists() else None
 
-    def place(self, name: str, pid: int, vid: int) -> str:
-        return str(self.folder / name / f"{pid}.png")
+    def place(self, name: str, position: int, view: int) -> str:
+        return str(self.folder / name / f"{position}.png")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MyPeople(DataSet):
+    """The settings. `name`, `root`, `limit` and `ring` are there already; CHANGE: add fields of your own."""
+
+    static_cameras: ClassVar[bool] = True  # CHANGE: False if there are views between the cameras
+
+    def reader(self, phase: str, strict: bool = True) -> MyReader:
+        return MyReader(self.folder / phase, self.limit[phase], strict)
 
 
 class MyDataModule(PhotographsDataModule):
-    """The reader under a name; views, targets, batches and loaders are those of all data sets."""
+    """Samples, batches and loaders are those of all data sets."""
 
-    def reader(self, phase: str, size: tuple[int, int] | None, strict: bool = True) -> MyReader:
-        return MyReader(
-            self.folder / phase,
-            limit=self.limit[phase],
-            size=size,
-            cache_mb=self.cache_images_mb,
-            strict=strict,
-        )
+    dataset_type = MyPeople

@@ -10,10 +10,12 @@ from typing import Any
 
 #: Classes that moved: old ``_target_``, new one.
 TARGETS = {
-    "ghgs_lit.data.RenderedDataModule": "ghgs_lit.synthesis.RenderedDataModule",
-    "ghgs_lit.data.ScansDataModule": "ghgs_lit.synthesis.ScansDataModule",
-    "ghgs_lit.data.SyntheticDataModule": "ghgs_lit.synthesis.SyntheticDataModule",
-    "ghgs_lit.data.THuman2DataModule": "ghgs_lit.synthesis.THuman2DataModule",
+    "ghgs_lit.data.HuMManDataModule": "ghgs_lit.data.datamodules.HuMManDataModule",
+    "ghgs_lit.data.RenderedDataModule": "ghgs_lit.data.datamodules.RenderedDataModule",
+    "ghgs_lit.data.ScansDataModule": "ghgs_lit.synthesis.datamodules.ScansDataModule",
+    "ghgs_lit.data.SyntheticDataModule": "ghgs_lit.synthesis.datamodules.SyntheticDataModule",
+    "ghgs_lit.data.THuman2DataModule": "ghgs_lit.synthesis.datamodules.THuman2DataModule",
+    "ghgs_lit.data.ZJUMoCapDataModule": "ghgs_lit.data.datamodules.ZJUMoCapDataModule",
     "ghgs_lit.training.watch.Attention": "ghgs_lit.training.validation_pictures.Attention",
     "ghgs_lit.training.watch.Pictures": "ghgs_lit.training.validation_pictures.Pictures",
     "ghgs_lit.training.watch.PointClouds": "ghgs_lit.training.validation_pictures.PointClouds",
@@ -21,12 +23,15 @@ TARGETS = {
 
 #: Keys that moved: old dotted key, new one (whole nodes too).
 KEYS: dict[str, str] = {
+    "data.render.vids": "data.render.views",
     "depth_head.agreement": "depth_head.consistency_depths",
     "encoder.interval_input": "encoder.bounds_input",
     "feature_cache.ring": "feature_cache.margin",
     "gaussian_head.agreement": "gaussian_head.photo_consistency",
     "optimizer.hold": "optimizer.freeze_until",
     "points": "unprojection",
+    "targets.training_vids": "targets.training_views",
+    "targets.vid": "targets.view",
 }
 
 #: Values that changed their name: (key of today, old value) to the new one.

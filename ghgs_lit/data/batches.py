@@ -1,6 +1,7 @@
-"""From draws to batches. An item of these data sets is a whole :class:`Batch`."""
+"""From sample specifications to batches. An item of the torch datasets here is a whole :class:`Batch`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
 
 import numpy as np
@@ -8,40 +9,78 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, DistributedSampler
 
-from ghgs_lit.data.reader import Reader, View
-from ghgs_lit.data.sampling import Draw, TrainingDraws, photo_name, subject_rng
+from ghgs_lit.config.settings import image_size, set_fields
+from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name, subject_rng
+from ghgs_lit.data.view import View
+from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras, Targets
 
 
-class Assembler:
-    """Reads the photographs of draws into a :class:`Batch`.
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """How photographs become batches; the same keys for every data set.
 
-    Rendered photographs lie on black with antialiased silhouettes: pixels at the rim carry their
-    share of the subject, on either side of the mask, as a splat's do. They are left as they are;
-    ``apply_mask`` blacks out everything outside the mask, for photographs with a background.
-    ``body_vertices`` (null: all) are drawn from each body, always the same ones.
-    ``depths``: whether depth maps of inputs are read.
+    Attributes:
+        size: side or (height, width) of the inputs in pixels.
+        target_size: the same of the targets (null: as ``size``).
+        batch_size: samples of one step in each process.
+        steps_per_epoch: null passes once over the subjects.
+        body_vertices: number of vertices drawn from each body, always the same ones (null: all).
+        depths: whether depth maps of the inputs are read, where the data has any.
+        apply_mask: make everything outside the masks black. Rendered photographs do not need it: they lie
+            on black, and pixels at the silhouette carry their share of the subject, as those of splats do.
+        cache_images_mb: MiB of decoded photographs kept in memory by each process.
+        evaluation_positions: input positions by number of views, where they are not evenly spaced.
+        workers: loading processes (0: none).
+        pin_memory: copy batches to the GPU through pinned memory.
     """
 
-    def __init__(
-        self,
-        inputs: Reader,
-        targets: Reader,
-        apply_mask: bool = False,
-        body_vertices: int | None = None,
-        depths: bool = True,
-    ) -> None:
-        self.inputs, self.targets = inputs, targets
-        self.apply_mask, self.body_vertices = apply_mask, body_vertices
-        self.depths = depths
+    size: int | Sequence[int]
+    target_size: int | Sequence[int] | None = None
+    batch_size: int = 1
+    steps_per_epoch: int | None = None
+    body_vertices: int | None = 4096
+    depths: bool = True
+    apply_mask: bool = False
+    cache_images_mb: float = 512
+    evaluation_positions: Mapping[int, Sequence[int]] | None = field(default_factory=dict)
+    workers: int = 0
+    pin_memory: bool = False
 
-    def batch(self, draws: Sequence[Draw]) -> Batch:
-        """Samples with equal numbers of inputs and of targets."""
-        inputs = [[self._input(d.subject, *photo) for photo in d.inputs] for d in draws]
-        targets = [[self.targets.view(d.subject, *photo, depth=False) for photo in d.targets] for d in draws]
+    def __post_init__(self) -> None:
+        require(self.batch_size >= 1, "data.batch_size", "at least 1", self.batch_size)
+        for key in ("steps_per_epoch", "body_vertices"):
+            value = getattr(self, key)
+            require(value is None or value >= 1, f"data.{key}", "at least 1 or null", value)
+        for key in ("workers", "cache_images_mb"):
+            require(getattr(self, key) >= 0, f"data.{key}", "at least 0", getattr(self, key))
+        size = image_size("data.size", self.size)
+        target = size if self.target_size is None else image_size("data.target_size", self.target_size)
+        positions = {int(k): list(v) for k, v in (self.evaluation_positions or {}).items()}
+        set_fields(self, size=size, target_size=target, evaluation_positions=positions)
+
+
+@dataclass(frozen=True)
+class BatchBuilder:
+    """Reads the photographs of samples into a :class:`Batch`.
+
+    ``apply_mask``, ``body_vertices`` and ``depths`` are those of :class:`BatchOptions`.
+    """
+
+    inputs: Photographs
+    targets: Photographs
+    apply_mask: bool = False
+    body_vertices: int | None = None
+    depths: bool = True
+
+    def batch(self, specs: Sequence[SampleSpec]) -> Batch:
+        """Samples with equal numbers of inputs and equal numbers of targets."""
+        inputs = [_views(self.inputs, s.subject, s.inputs, self.depths) for s in specs]
+        targets = [_views(self.targets, s.subject, s.targets, False) for s in specs]
         depths = [[view.depth for view in row] for row in inputs]
         known = all(depth is not None for row in depths for depth in row)
-        bodies = [self._body(d.subject) for d in draws]
+        bodies = [self._body(s.subject) for s in specs]
         return Batch(
             images=self._images(inputs),
             masks=_stack([[view.mask for view in row] for row in inputs]),
@@ -50,16 +89,13 @@ class Assembler:
                 images=self._images(targets),
                 masks=_stack([[view.mask for view in row] for row in targets]),
                 cameras=_cameras(targets),
-                names=tuple(tuple(photo_name(photo) for photo in d.targets) for d in draws),
+                names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
             ),
             body_vertices=None if any(body is None for body in bodies) else bodies,
             depths=_stack(depths) if known else None,
-            subjects=tuple(d.subject for d in draws),
-            views=tuple(tuple(photo_name(photo) for photo in d.inputs) for d in draws),
+            subjects=tuple(s.subject for s in specs),
+            views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
         )
-
-    def _input(self, name: str, pid: int, vid: int) -> View:
-        return self.inputs.view(name, pid, vid, depth=self.depths)
 
     def _images(self, views: list[list[View]]) -> Tensor:
         images = _stack([[view.image for view in row] for row in views])
@@ -77,6 +113,10 @@ class Assembler:
         return torch.from_numpy(vertices)
 
 
+def _views(photographs: Photographs, subject: str, photos: Sequence[Photo], depth: bool) -> list[View]:
+    return [photographs.view(subject, *photo, depth=depth) for photo in photos]
+
+
 def _stack(arrays: list[list[np.ndarray]]) -> Tensor:
     return torch.from_numpy(np.stack([np.stack(row) for row in arrays]))
 
@@ -91,48 +131,53 @@ def _cameras(views: list[list[View]]) -> Cameras:
     )
 
 
+@dataclass(frozen=True)
 class TrainingBatches(Dataset):
-    """Item ``step`` is this process's batch at that step of the run."""
+    """Item ``step`` is the batch of process ``rank`` of ``world`` at that step of the run."""
 
-    def __init__(
-        self, assembler: Assembler, draws: TrainingDraws, length: int, rank: int, world: int
-    ) -> None:
-        self.assembler, self.draws = assembler, draws
-        self.length, self.rank, self.world = length, rank, world
+    builder: BatchBuilder
+    sampler: TrainingSampler
+    length: int
+    rank: int = 0
+    world: int = 1
 
     def __len__(self) -> int:
         return self.length
 
     def __getitem__(self, step: int) -> Batch:
-        return self.assembler.batch(self.draws.batch(step, self.rank, self.world))
+        return self.builder.batch(self.sampler.batch(step, self.rank, self.world))
 
 
 class EvaluationBatches(Dataset):
-    """Fixed samples, up to ``batch_size`` neighbours with equal numbers of targets at a time."""
+    """Fixed samples; an item has up to ``batch_size`` neighbours with equal numbers of targets."""
 
-    def __init__(self, assembler: Assembler, draws: Sequence[Draw], batch_size: int) -> None:
-        self.assembler = assembler
-        self.draws = [
+    def __init__(self, builder: BatchBuilder, specs: Sequence[SampleSpec], batch_size: int) -> None:
+        self.builder = builder
+        self.specs = [
             alike[i : i + batch_size]
-            for alike in (list(group) for _, group in groupby(draws, lambda d: len(d.targets)))
+            for alike in (list(group) for _, group in groupby(specs, lambda s: len(s.targets)))
             for i in range(0, len(alike), batch_size)
         ]
 
     def __len__(self) -> int:
-        return len(self.draws)
+        return len(self.specs)
 
     def __getitem__(self, index: int) -> Batch:
-        return self.assembler.batch(self.draws[index])
+        return self.builder.batch(self.specs[index])
 
 
 class StepSampler(DistributedSampler):
-    """The steps of one epoch, counted from the run's beginning: ``first_step()`` is asked at its start.
+    """The steps of one epoch, counted from the beginning of the run.
 
-    Draws are divided among processes by step already; being a ``DistributedSampler`` says so to
-    Lightning, which otherwise puts its own in place.
+    Samples are already divided among processes by step. It is a ``DistributedSampler`` because Lightning
+    replaces any other sampler by its own when there are several processes.
+
+    Args:
+        dataset: its length is the number of steps.
+        first_step: gives the first step; called when the epoch starts.
     """
 
-    def __init__(self, dataset: TrainingBatches, first_step) -> None:
+    def __init__(self, dataset: Dataset, first_step: Callable[[], int]) -> None:
         super().__init__(dataset, num_replicas=1, rank=0, shuffle=False)
         self.first_step = first_step
 

@@ -1,4 +1,4 @@
-"""Reads all of a data set once and says what is there, what is missing and what is broken."""
+"""Reads all of a data set once and reports what is there, what is missing and what is broken."""
 
 import json
 import re
@@ -14,15 +14,17 @@ from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.data.contact import Tile, draw_tile, save_sheet
-from ghgs_lit.data.datamodule import PHASES, PhotographsDataModule
+from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.overlap import overlap
-from ghgs_lit.data.reader import Reader
-from ghgs_lit.data.sampling import CAMERAS
+from ghgs_lit.data.reader import PHASES, Photographs, Reader
+from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
 from ghgs_lit.errors import InputError
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
-# Rows of a table on the terminal; check.json has all of them.
+# Rows of a table on the terminal; check.json lists all of them.
 _SHOWN = 30
+# MiB of decoded files kept: a body is read once for all photographs of its subject.
+_CACHE_MB = 4
 _PICTURED_SUBJECTS, _PICTURED_VIEWS = 6, 8
 
 Photograph = tuple[str, int, int]
@@ -30,11 +32,18 @@ Photograph = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class Seen:
-    """What reading one photograph gave."""
+    """What reading one photograph gave.
+
+    Attributes:
+        name, position, view: the photograph.
+        iou, inside: how the body fits the mask (:class:`Overlap`), where there is a body.
+        problem: the line of the error, if there is one.
+        tile: picture for the contact sheet.
+    """
 
     name: str
-    pid: int
-    vid: int
+    position: int
+    view: int
     iou: float | None = None
     inside: float | None = None
     problem: str | None = None
@@ -43,7 +52,7 @@ class Seen:
 
 @dataclass
 class Phase:
-    """What a phase has."""
+    """What was found in a phase."""
 
     people: int
     subjects: int
@@ -51,13 +60,20 @@ class Phase:
     seen: list[Seen]
 
     def overlaps(self, key: str) -> list[float]:
+        """All known values of ``iou`` or ``inside``."""
         return [value for seen in self.seen if (value := getattr(seen, key)) is not None]
 
 
 @dataclass
 class Report:
-    """All of it: ``problems`` keep training from starting (each ``place: expected ...; found ...``),
-    ``notes`` do not."""
+    """The result of a check.
+
+    Attributes:
+        phases: what was found in ``train`` and ``val``.
+        problems: lines ``<place>: expected ...; found ...`` of what keeps training from starting.
+        notes: the same of what does not.
+        inspections: number of files that were checked beside the photographs.
+    """
 
     phases: dict[str, Phase] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
@@ -65,40 +81,43 @@ class Report:
     inspections: int = 0
 
 
-class _Photographs(Dataset):
+@dataclass(frozen=True)
+class _Readings(Dataset):
     """Item ``i`` is what reading photograph ``i`` gave."""
 
-    def __init__(
-        self, reader: Reader, photographs: Sequence[Photograph], pictured: set, least: float
-    ) -> None:
-        self.reader, self.photographs, self.pictured, self.least = reader, photographs, pictured, least
+    photographs: Photographs
+    listed: Sequence[Photograph]
+    pictured: set[Photograph]
+    min_iou: float
 
     def __len__(self) -> int:
-        return len(self.photographs)
+        return len(self.listed)
 
     def __getitem__(self, index: int) -> Seen:
-        name, pid, vid = self.photographs[index]
-        wanted = self.photographs[index] in self.pictured
+        photograph = self.listed[index]
+        wanted = photograph in self.pictured
         try:
-            view = self.reader.view(name, pid, vid)
-            body = self.reader.body(name)
+            view = self.photographs.view(*photograph)
+            body = self.photographs.body(photograph[0])
         except InputError as error:
-            return Seen(name, pid, vid, problem=str(error), tile=draw_tile(None, None) if wanted else None)
+            return Seen(*photograph, problem=str(error), tile=draw_tile(None, None) if wanted else None)
         tile = draw_tile(view, body) if wanted else None
         fit = None if body is None else overlap(body, view)
         if fit is None:
-            return Seen(name, pid, vid, tile=tile)
+            return Seen(*photograph, tile=tile)
         problem = None
-        if fit.iou < self.least:
-            place = self.reader.place(name, pid, vid)
-            expected = f"the body in its mask (IoU of {self.least:.2f} or more)"
+        if fit.iou < self.min_iou:
+            place = self.photographs.reader.place(*photograph)
+            expected = f"the body in its mask (IoU of {self.min_iou:.2f} or more)"
             problem = f"{place}: expected {expected}; found IoU {fit.iou:.2f}"
-        return Seen(name, pid, vid, fit.iou, fit.inside, problem, tile)
+        return Seen(*photograph, fit.iou, fit.inside, problem, tile)
 
 
+@dataclass(frozen=True)
 class _Inspections(Dataset):
-    def __init__(self, inspections: Sequence[Callable[[], None]]) -> None:
-        self.inspections = inspections
+    """Item ``i`` is the problem that inspection ``i`` found, or None."""
+
+    inspections: Sequence[Callable[[], None]]
 
     def __len__(self) -> int:
         return len(self.inspections)
@@ -112,61 +131,64 @@ class _Inspections(Dataset):
 
 
 def _read_all(items: Dataset, workers: int, label: str) -> list:
-    loader = DataLoader(items, batch_size=None, collate_fn=_as_is, num_workers=min(workers, len(items)))
+    loader = DataLoader(items, batch_size=None, num_workers=min(workers, len(items)))
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 
 
-def _as_is(item):
-    return item
+def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:
+    """Read everything that training and evaluation would read, once, with the workers of ``data``.
 
-
-def inspect(data: PhotographsDataModule, least_iou: float = 0.5) -> Report:
-    """Read everything that ``data`` would ever read, once, with its workers.
-
-    ``least_iou``: of the body's silhouette and a mask; below it a camera counts as wrong. Clothed people
-    reach 0.75 to 0.95, a camera that is off 0 to 0.4.
+    Args:
+        data: the data set with its protocols.
+        min_iou: least IoU of a body's silhouette and a mask; below it a camera counts as wrong. Clothed
+            people reach 0.75 to 0.95, a wrong camera 0 to 0.4.
     """
     report = Report()
-    if data.still:  # whatever targets the command line has: they are a matter of training
-        data.targets = CAMERAS
-    data.cache_images_mb = min(data.cache_images_mb, 4)  # a body is read once for all its photographs
-    inspections = data.inspections()
+    dataset, workers = data.dataset, data.options.workers
+    # With static cameras only one protocol is possible; the configured one matters in training only.
+    targets = CAMERAS if dataset.static_cameras else data.targets
+    inspections = dataset.inspections()
     report.inspections = len(inspections)
     if inspections:
-        found = _read_all(_Inspections(inspections), data.workers, "checking files")
+        found = _read_all(_Inspections(inspections), workers, "checking files")
         report.problems += [line for line in found if line is not None]
-    if data.root is None and inspections:
+    if dataset.root is None and inspections:
         return report
     for phase in PHASES:
         try:
-            reader = data.reader(phase, None, strict=False)
+            reader = dataset.reader(phase, strict=False)
         except InputError as error:
             report.problems.append(str(error))
             continue
         report.problems += reader.problems
-        report.phases[phase] = _inspect_phase(data, phase, reader, least_iou)
-        report.problems += [seen.problem for seen in report.phases[phase].seen if seen.problem]
-        report.notes += _notes(data, phase, reader, report.phases[phase])
+        cache_mb = min(data.options.cache_images_mb, _CACHE_MB)
+        found = _inspect_phase(phase, Photographs(reader, None, cache_mb), targets, min_iou, workers)
+        report.phases[phase] = found
+        report.problems += [seen.problem for seen in found.seen if seen.problem]
+        report.notes += _notes(dataset.published.get(phase), phase, reader, found)
     if not report.problems:
-        report.problems += _cannot_draw(data)
+        report.problems += _cannot_sample(data, targets)
     report.problems = list(dict.fromkeys(report.problems))
     return report
 
 
-def _inspect_phase(data: PhotographsDataModule, phase: str, reader: Reader, least_iou: float) -> Phase:
+def _inspect_phase(
+    phase: str, photographs: Photographs, targets: TargetProtocol, min_iou: float, workers: int
+) -> Phase:
+    reader = photographs.reader
     # Views that the protocol may ask for are read even where no file of theirs is there to be listed.
-    needed = {0} | data.targets.vids
-    photographs = [
-        (name, pid, vid)
-        for name, pids in reader.subjects.items()
-        for pid in pids
-        for vid in sorted(needed | set(reader.vids(name, pid)))
+    needed = {RING_VIEW} | targets.view_numbers
+    listed = [
+        (name, position, view)
+        for name, positions in reader.subjects.items()
+        for position in positions
+        for view in sorted(needed | set(reader.views_at(name, position)))
     ]
-    items = _Photographs(reader, photographs, _pictured(reader), least_iou)
-    seen = _read_all(items, data.workers, f"checking {phase}") if photographs else []
+    items = _Readings(photographs, listed, _pictured(reader), min_iou)
+    seen = _read_all(items, workers, f"checking {phase}") if listed else []
     unread = {s.name for s in seen if s.problem is not None and s.iou is None}
-    bodies = sum(name not in unread and reader.body(name) is not None for name in reader.subjects)
-    return Phase(data.people(reader), len(reader.subjects), bodies, seen)
+    bodies = sum(name not in unread and photographs.body(name) is not None for name in reader.subjects)
+    return Phase(reader.people, len(reader.subjects), bodies, seen)
 
 
 def _pictured(reader: Reader) -> set[Photograph]:
@@ -176,12 +198,12 @@ def _pictured(reader: Reader) -> set[Photograph]:
         return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))]
 
     names = some(list(reader.subjects), _PICTURED_SUBJECTS) if reader.subjects else []
-    return {(name, pid, 0) for name in names for pid in some(reader.subjects[name], _PICTURED_VIEWS)}
+    chosen = {name: some(reader.subjects[name], _PICTURED_VIEWS) for name in names}
+    return {(name, position, RING_VIEW) for name, positions in chosen.items() for position in positions}
 
 
-def _notes(data: PhotographsDataModule, phase: str, reader: Reader, read: Phase) -> list[str]:
+def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> list[str]:
     notes = []
-    published = data.published.get(phase)
     if published is not None and read.people != published:
         notes.append(f"{phase}: expected {published} people as published; found {read.people}")
     if read.bodies < read.subjects:
@@ -189,8 +211,8 @@ def _notes(data: PhotographsDataModule, phase: str, reader: Reader, read: Phase)
             f"{phase}: expected a body for each of {read.subjects} subjects; found {read.bodies} "
             "(no Chamfer term, and cameras without a body are not checked)"
         )
-    most = max((len(pids) for pids in reader.subjects.values()), default=0)
-    fewer = [name for name, pids in reader.subjects.items() if len(pids) < most]
+    most = max(map(len, reader.subjects.values()), default=0)
+    fewer = [name for name, positions in reader.subjects.items() if len(positions) < most]
     if fewer:
         notes.append(
             f"{phase}: expected {most} cameras of every subject; found fewer of {len(fewer)}, as {fewer[0]}"
@@ -198,25 +220,25 @@ def _notes(data: PhotographsDataModule, phase: str, reader: Reader, read: Phase)
     return notes
 
 
-def _cannot_draw(data: PhotographsDataModule) -> list[str]:
+def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol) -> list[str]:
     """Why the protocols cannot draw their samples from what is there, if they cannot."""
-    for attempt in (data.training_draws, data.evaluation_loader):
-        try:
-            attempt()
-        except InputError as error:
-            return [str(error)]
+    try:
+        data.training_sampler(targets)
+        data.evaluation_loader(targets=targets)
+    except InputError as error:
+        return [str(error)]
     return []
 
 
 def split_line(line: str) -> tuple[str, str, str]:
-    """Place, expected, found of an error's line."""
+    """Place, expected and found of an error's line."""
     match = _LINE.fullmatch(line)
     return (match["place"], match["expected"], match["found"]) if match else ("", "", line)
 
 
 def show(report: Report) -> None:
-    """The tables on the terminal."""
-    columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "least IoU", "inside")
+    """Print the tables."""
+    columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "inside")
     table = Table("phase", *columns)
     for name, phase in report.phases.items():
         iou, inside = phase.overlaps("iou"), phase.overlaps("inside")
@@ -238,23 +260,18 @@ def show(report: Report) -> None:
             rich.print(table)
 
 
-def _plain(phase: Phase) -> dict:
-    """Without pictures."""
-    content = asdict(phase)
-    for seen in content["seen"]:
-        del seen["tile"]
-    return content
-
-
 def write(report: Report, folder: Path) -> Path:
-    """Write ``check.json`` and, where there are photographs, ``contact.png``; gives the folder."""
+    """Write ``check.json`` and, if there are photographs, ``contact.png``; returns ``folder``."""
     keys = ("place", "expected", "found")
     content = {
         "problems": [dict(zip(keys, split_line(line), strict=True)) for line in report.problems],
         "notes": report.notes,
         "inspections": report.inspections,
-        "phases": {name: _plain(phase) for name, phase in report.phases.items()},
+        "phases": {name: asdict(phase) for name, phase in report.phases.items()},
     }
+    for phase in content["phases"].values():
+        for seen in phase["seen"]:
+            del seen["tile"]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "check.json").write_text(json.dumps(content, indent=1))
     rows: dict[str, list[Tile]] = {}
@@ -262,7 +279,7 @@ def write(report: Report, folder: Path) -> Path:
         for seen in phase.seen:
             if seen.tile is not None:
                 label = "" if seen.iou is None else f" {seen.iou:.2f}"
-                rows.setdefault(f"{name} {seen.name}", []).append((f"{seen.pid:03d}{label}", seen.tile))
+                rows.setdefault(f"{name} {seen.name}", []).append((f"{seen.position:03d}{label}", seen.tile))
     if rows:
         save_sheet(rows, folder / "contact.png")
     return folder

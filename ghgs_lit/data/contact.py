@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 from scipy import ndimage
 
 from ghgs_lit.data.overlap import project
-from ghgs_lit.data.reader import View, fit
+from ghgs_lit.data.view import View, resize_view
 
 Tile = np.ndarray
 _HEIGHT, _LINE = 176, 14
@@ -17,7 +17,15 @@ _DOTS = 400
 
 
 def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
-    """[176, w, 3] uint8: the mask's outline in green, some vertices of the body in red; a cross for None."""
+    """Draw the outline of the mask in green and some vertices of the body in red.
+
+    Args:
+        view: the photograph; None draws a cross.
+        body: vertices [n, 3] in the world, or None.
+
+    Returns:
+        [176, w, 3] uint8.
+    """
     if view is None:
         image = Image.new("RGB", (_HEIGHT, _HEIGHT), _GREY)
         draw = ImageDraw.Draw(image)
@@ -25,7 +33,7 @@ def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
         draw.line((0, _HEIGHT, _HEIGHT, 0), _RED, 2)
         return np.asarray(image)
     h, w = view.mask.shape
-    small = fit(view, _HEIGHT, max(round(w * _HEIGHT / h), 1))
+    small = resize_view(view, _HEIGHT, max(round(w * _HEIGHT / h), 1))
     tile = small.image.copy()
     tile[small.mask ^ ndimage.binary_erosion(small.mask)] = _GREEN
     if body is not None:
@@ -36,7 +44,12 @@ def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
 
 
 def save_sheet(rows: Mapping[str, Sequence[tuple[str, Tile]]], path: Path) -> None:
-    """A row for each subject: its name, and its tiles with their labels (camera, IoU) below."""
+    """Save tiles as one picture, a row for each subject.
+
+    Args:
+        rows: (label, tile) pairs by name of the subject; labels are camera and IoU.
+        path: the picture.
+    """
     width = max(sum(tile.shape[1] + 2 for _, tile in tiles) for tiles in rows.values())
     step = _HEIGHT + 2 * _LINE
     sheet = Image.new("RGB", (width, step * len(rows)))

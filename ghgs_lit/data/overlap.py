@@ -5,25 +5,30 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ghgs_lit.data.reader import View, resize_image
+from ghgs_lit.data.view import View, resize_image
 
 # Fewer vertices than this do not fill a silhouette.
 MIN_VERTICES = 500
-# Cells that a body is high: with more, those between two vertices of SMPL's torso would stay empty.
+# Height of a body in cells: with more of them, cells between two vertices of SMPL's torso would stay empty.
 _CELLS = 96
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """``iou`` of the body's silhouette and the mask; ``inside``, the share of the vertices that the
-    photograph shows which lie in the mask (or in a cell beside it, a hundredth of the body)."""
+    """How a body fits a mask.
+
+    Attributes:
+        iou: intersection over union of the body's silhouette and the mask.
+        inside: share of the vertices inside the photograph that lie in the mask, or in a cell beside it (a
+            hundredth of the body's height).
+    """
 
     iou: float
     inside: float
 
 
 def project(vertices: np.ndarray, view: View) -> np.ndarray:
-    """Pixels [m, 2] (u, v) of those vertices [n, 3] that are before the camera, by double precision."""
+    """Pixels [m, 2] (u, v), float64, of those vertices [n, 3] that are in front of the camera."""
     pose, matrix = view.extrinsics.astype(np.float64), view.intrinsics.astype(np.float64)
     points = vertices.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
     points = points[points[:, 2] > 1e-6] @ matrix.T
@@ -31,10 +36,17 @@ def project(vertices: np.ndarray, view: View) -> np.ndarray:
 
 
 def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
-    """How body ``vertices`` [n, 3] fit the mask of ``view``; None for a body of too few vertices.
+    """Compare the silhouette of a body with a mask.
 
-    The silhouette of the vertices is taken on a coarse grid, where they lie densely enough to be joined
-    without knowing the faces; parts outside the photograph count on neither side.
+    The silhouette is taken on a coarse grid, where the vertices lie densely enough to be joined without
+    knowing the faces. Parts outside the photograph do not count.
+
+    Args:
+        vertices: [n, 3] in the world, metres.
+        view: the photograph.
+
+    Returns:
+        The overlap; None for a body with fewer than :data:`MIN_VERTICES` vertices.
     """
     if len(vertices) < MIN_VERTICES:
         return None

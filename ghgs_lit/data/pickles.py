@@ -1,9 +1,9 @@
-"""Pickles of data sets, read without running what they say.
+"""Reads pickles of data sets without running them.
 
 A pickle is a program: whoever wrote it chooses what is called while it is read. Data sets need arrays and
 containers only, so only these are admitted; every other name is refused before anything is called. Names of
-NumPy 1 (``numpy.core``) and 2 (``numpy._core``) and of Python 2 (``__builtin__``) are understood, and
-trimesh's array subclass is read as the array that it is, without trimesh.
+NumPy 1 (``numpy.core``) and 2 (``numpy._core``) and of Python 2 (``__builtin__``) are known, and trimesh's
+array subclass is read as a plain array, without trimesh.
 """
 
 import codecs
@@ -21,7 +21,7 @@ from ghgs_lit.errors import InputError
 
 
 def _bytes(text: str, encoding: str = "latin1") -> bytes:
-    """How protocols below 3 write bytes; no other codec than theirs."""
+    """How protocols below 3 write bytes; no other codec is admitted."""
     if encoding not in ("latin1", "latin-1"):
         raise pickle.UnpicklingError(f"codec {encoding!r}")
     return codecs.encode(text, "latin1")
@@ -77,9 +77,11 @@ def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], 
 
 
 def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """The arrays, scalars and plain containers of a pickle.
+    """Read the arrays, scalars and plain containers of a pickle.
 
-    ``also`` admits further names, (module, name), as harmless stand-ins for what they name.
+    Args:
+        path: the file.
+        also: further names that are admitted, (module, name), with harmless replacements for them.
 
     Raises:
         InputError: it is missing, broken, or names anything else, which is then not called.
@@ -91,9 +93,9 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
 
 
 def load_npy(path: Path) -> Any:
-    """An ``.npy`` file; what is pickled in it is read as by :func:`load_pickle`.
+    """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`.
 
-    A pickled object in an array without dimensions (``np.save`` of a dictionary) comes out as itself.
+    A pickled object in an array without dimensions (``np.save`` of a dictionary) is returned itself.
 
     Raises:
         InputError: it is missing, broken, or names anything but arrays and plain containers.

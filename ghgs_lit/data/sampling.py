@@ -1,8 +1,9 @@
 """Which photographs make a sample: input views and targets, in training and in evaluation.
 
-A photograph is named by its ring position ``pid`` and view ``vid`` (see :mod:`ghgs_lit.synthesis.rig`);
-inputs are ring cameras (vid 0). Every draw is a function of (seed, step, index in the batch) alone,
-so that a run goes on exactly where it stopped, whatever the number of workers.
+A photograph is identified by its ring position and the number of the view at that position: 0 is the ring
+camera itself, 1 repeats the next ring camera, 3 is the exact middle between the two, 2 and 4 are random in
+the first and the second half. Inputs are ring cameras (view 0). Every sample is a function of (seed, step,
+index in the batch) alone, so that a run resumes exactly where it stopped, whatever the number of workers.
 """
 
 import hashlib
@@ -11,25 +12,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ghgs_lit.config.settings import set_fields
 from ghgs_lit.errors import InputError, choice, require
 
-VIEW_IDS = (0, 1, 2, 3, 4)
-RING_VID, MIDDLE_VID = 0, 3
+VIEW_NUMBERS = (0, 1, 2, 3, 4)
+RING_VIEW, MIDDLE_VIEW = 0, 3
 # Streams of random numbers that must not repeat one another.
 _ORDER, _COUNT, _SAMPLE = 0, 1, 2
 
+#: (ring position, view number)
 Photo = tuple[int, int]
 
 
 def subject_rng(seed: int, name: str) -> np.random.Generator:
-    """Random numbers of one subject, the same whichever other subjects there are."""
+    """Random numbers of one subject, independent of which other subjects there are."""
     digest = hashlib.sha256(name.encode()).digest()
     return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
 
 
 @dataclass(frozen=True)
-class Draw:
-    """One sample: ``(pid, vid)`` of the inputs and of the targets of a subject."""
+class SampleSpec:
+    """Which photographs of a subject make one sample."""
 
     subject: str
     inputs: tuple[Photo, ...]
@@ -37,15 +40,24 @@ class Draw:
 
 
 def photo_name(photo: Photo) -> str:
-    """``<pid>/<vid>`` as in the layout's paths: ``004/3`` is view 3 of position 4."""
+    """``004/3`` for view 3 at position 4, as in the paths of rendered data."""
     return f"{photo[0]:03d}/{photo[1]}"
+
+
+def ring_photos(positions: Sequence[int]) -> tuple[Photo, ...]:
+    """The photographs of the ring cameras at ``positions``."""
+    return tuple((position, RING_VIEW) for position in positions)
 
 
 @dataclass(frozen=True)
 class ViewProtocol:
-    """Input views. ``training_counts``: how many, one count drawn for each step; ``evaluation_count``.
+    """How input views are chosen.
 
-    ``training``: ``any`` ring cameras in random order, or ``even``: evenly spaced from a random start.
+    Attributes:
+        name: name of the protocol in results.
+        training_counts: numbers of views; one of them is drawn for each training step.
+        evaluation_count: number of views in evaluation.
+        training: ``any`` (ring cameras in random order) or ``even`` (evenly spaced from a random start).
     """
 
     name: str
@@ -54,18 +66,18 @@ class ViewProtocol:
     training: str = "any"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "training_counts", tuple(self.training_counts))
+        set_fields(self, training_counts=tuple(self.training_counts))
         valid = len(self.training_counts) > 0 and min(self.training_counts) >= 2
         require(valid, "views.training_counts", "counts of at least 2", list(self.training_counts))
         require(self.evaluation_count >= 2, "views.evaluation_count", "at least 2", self.evaluation_count)
         choice("views.training", self.training, ("any", "even"))
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
-        """Positions of a training sample's inputs."""
+        """Positions of the ``count`` inputs of a training sample."""
         if self.training == "even":
             start = int(rng.integers(ring))
-            return [(start + pid) % ring for pid in even_positions(ring, count)]
-        return [int(pid) for pid in rng.choice(np.asarray(available), count, replace=False)]
+            return [(start + position) % ring for position in even_positions(ring, count)]
+        return [int(position) for position in rng.choice(np.asarray(available), count, replace=False)]
 
 
 def even_positions(ring: int, count: int) -> list[int]:
@@ -74,61 +86,64 @@ def even_positions(ring: int, count: int) -> list[int]:
 
 
 def middle(first: int, second: int, ring: int) -> Photo:
-    """The photograph half-way from position ``first`` on to ``second``: of a ring camera or between two."""
+    """The photograph half-way from position ``first`` on to ``second``: a ring camera or between two."""
     doubled = 2 * first + (second - first) % ring
-    return doubled // 2 % ring, MIDDLE_VID if doubled % 2 else RING_VID
+    return doubled // 2 % ring, MIDDLE_VIEW if doubled % 2 else RING_VIEW
 
 
 @dataclass(frozen=True)
 class TargetProtocol:
-    """Target views.
+    """How target views are chosen.
 
-    ``kind`` of the evaluation: ``release``, view ``vid`` at an input's position (3: 11.25 degrees from
-    it); ``midway``, half-way between an input and the next; ``random``, any of ``training_vids`` at
-    any position, fixed by the seed; ``cameras``, view ``vid`` at the ``positions`` (null: all) that are
-    no inputs. ``per_subject``: how many in evaluation, the first ones (``all``: one beside every input,
-    or every camera). Training draws ``per_step`` photographs with ``training_vids``.
+    Attributes:
+        name: name of the protocol in results.
+        kind: which targets evaluation measures (null: the value of ``name``): ``release``, view ``view`` at
+            an input's position (3: 11.25 degrees from the input); ``midway``, half-way between an input and
+            the next; ``random``, any of ``training_views`` at any position, fixed by the seed; ``cameras``,
+            view ``view`` at those of ``positions`` that are not inputs.
+        view: number of the view that ``release`` and ``cameras`` take.
+        positions: positions that ``cameras`` takes (null: all).
+        per_subject: number of targets in evaluation, the first ones; ``all``: one beside every input, or
+            every camera.
+        training_views: numbers of the views that training draws from, at any position.
+        per_step: number of targets that training draws for each sample.
     """
 
     name: str
     kind: str | None = None
-    vid: int = MIDDLE_VID
+    view: int = MIDDLE_VIEW
     positions: tuple[int, ...] | None = None
     per_subject: int | str = 1
-    training_vids: tuple[int, ...] = (0, 2, 3, 4)
+    training_views: tuple[int, ...] = (0, 2, 3, 4)
     per_step: int = 1
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "kind", self.kind or self.name)
-        object.__setattr__(self, "training_vids", tuple(self.training_vids))
+        set_fields(self, kind=self.kind or self.name, training_views=tuple(self.training_views))
         choice("targets.kind", self.kind, ("release", "midway", "random", "cameras"))
         if self.positions is not None:
-            object.__setattr__(self, "positions", tuple(self.positions))
-            require(
-                self.kind == "cameras",
-                "targets.positions",
-                "null unless targets.kind=cameras",
-                self.positions,
-            )
-        choice("targets.vid", self.vid, VIEW_IDS)
-        known = len(self.training_vids) > 0 and set(self.training_vids) <= set(VIEW_IDS)
-        require(known, "targets.training_vids", f"some of {list(VIEW_IDS)}", list(self.training_vids))
+            set_fields(self, positions=tuple(self.positions))
+            cameras = self.kind == "cameras"
+            require(cameras, "targets.positions", "null unless targets.kind=cameras", self.positions)
+        choice("targets.view", self.view, VIEW_NUMBERS)
+        known = len(self.training_views) > 0 and set(self.training_views) <= set(VIEW_NUMBERS)
+        require(known, "targets.training_views", f"some of {list(VIEW_NUMBERS)}", list(self.training_views))
         require(self.per_step >= 1, "targets.per_step", "at least 1", self.per_step)
         many = self.per_subject == "all" or (isinstance(self.per_subject, int) and self.per_subject >= 1)
         require(many, "targets.per_subject", "a number of at least 1 or all", self.per_subject)
 
     @property
-    def vids(self) -> set[int]:
-        """Every vid that training or evaluation may ask for."""
-        evaluated = {"midway": {RING_VID, MIDDLE_VID}, "random": set()}.get(self.kind, {self.vid})
-        return evaluated | set(self.training_vids)
+    def view_numbers(self) -> set[int]:
+        """Every view number that training or evaluation may ask for."""
+        evaluated = {"midway": {RING_VIEW, MIDDLE_VIEW}, "random": set()}.get(self.kind, {self.view})
+        return evaluated | set(self.training_views)
 
     def draw(
         self, available: Sequence[int], inputs: Sequence[int], count: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
         """``count`` different photographs at ``available`` positions that are not inputs."""
-        taken = {(pid, RING_VID) for pid in inputs}
-        pool = [p for pid in available for vid in self.training_vids if (p := (pid, vid)) not in taken]
+        taken = ring_photos(inputs)
+        everything = [(position, view) for position in available for view in self.training_views]
+        pool = [photo for photo in everything if photo not in taken]
         if len(pool) < count:
             raise InputError(
                 f"targets: expected at least {count} photographs to draw from; found {len(pool)}"
@@ -138,17 +153,23 @@ class TargetProtocol:
     def evaluation(
         self, available: Sequence[int], inputs: Sequence[int], ring: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """The targets of a sample with these inputs."""
+        """The targets of an evaluation sample.
+
+        Args:
+            available: positions of the subject.
+            inputs: positions of the sample's inputs.
+            ring: number of positions on a full ring.
+            rng: random numbers of the subject.
+        """
         if self.kind == "cameras":
             return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
         if self.kind == "random":
             return self.draw(available, inputs, count, rng)
-        require(
-            count <= len(inputs), "targets.per_subject", f"at most the {len(inputs)} inputs, or all", count
-        )
+        most = f"at most the {len(inputs)} inputs, or all"
+        require(count <= len(inputs), "targets.per_subject", most, count)
         if self.kind == "release":
-            return tuple((pid, self.vid) for pid in inputs[:count])
+            return tuple((position, self.view) for position in inputs[:count])
         pairs = zip(inputs, [*inputs[1:], inputs[0]], strict=True)
         return tuple(middle(a, b, ring) for a, b in pairs)[:count]
 
@@ -156,19 +177,27 @@ class TargetProtocol:
         listed = available if self.positions is None else self.positions
         if lacking := sorted(set(listed) - set(available)):
             raise InputError(f"targets.positions: expected some of {list(available)}; found {lacking[0]}")
-        taken = {(pid, RING_VID) for pid in inputs}
-        photos = [photo for pid in listed if (photo := (pid, self.vid)) not in taken]
-        require(len(photos) > 0, "targets.positions", "a camera that is no input", list(listed))
+        taken = ring_photos(inputs)
+        photos = [photo for position in listed if (photo := (position, self.view)) not in taken]
+        require(len(photos) > 0, "targets.positions", "a camera that is not an input", list(listed))
         return tuple(photos if self.per_subject == "all" else photos[: int(self.per_subject)])
 
 
-#: Every camera that is no input, for rigs whose cameras all stand still.
-CAMERAS = TargetProtocol("cameras", vid=RING_VID, per_subject="all", training_vids=(RING_VID,))
+#: Every camera that is not an input: for rigs with static cameras.
+CAMERAS = TargetProtocol("cameras", view=RING_VIEW, per_subject="all", training_views=(RING_VIEW,))
 
 
 @dataclass(frozen=True)
-class TrainingDraws:
-    """The endless sequence of training batches over ``subjects`` (name to available positions)."""
+class TrainingSampler:
+    """The endless sequence of training samples.
+
+    Attributes:
+        subjects: available positions by name.
+        views, targets: the protocols.
+        ring: number of positions on a full ring.
+        batch_size: samples of one step in each process.
+        seed: together with the step and the index in the batch, it determines a sample.
+    """
 
     subjects: Mapping[str, tuple[int, ...]]
     views: ViewProtocol
@@ -178,22 +207,22 @@ class TrainingDraws:
     seed: int
 
     def __post_init__(self) -> None:
-        need = max(self.views.training_counts)
-        for name, pids in self.subjects.items():
-            if len(pids) < need or (self.views.training == "even" and len(pids) < self.ring):
-                wanted = self.ring if self.views.training == "even" else need
+        most = max(self.views.training_counts)
+        wanted = self.ring if self.views.training == "even" else most
+        for name, positions in self.subjects.items():
+            if len(positions) < max(wanted, most):
                 raise InputError(
                     f"views.training_counts: expected {wanted} ring positions of subject {name} to draw "
-                    f"{need} views from; found {len(pids)}"
+                    f"{most} views from; found {len(positions)}"
                 )
 
-    def batch(self, step: int, rank: int = 0, world: int = 1) -> list[Draw]:
-        """Samples of process ``rank`` of ``world`` at ``step``; every count is the same on all."""
+    def batch(self, step: int, rank: int = 0, world: int = 1) -> list[SampleSpec]:
+        """Samples of process ``rank`` of ``world`` at ``step``; all have the same number of inputs."""
         count = int(np.random.default_rng([self.seed, _COUNT, step]).choice(self.views.training_counts))
         first = (step * world + rank) * self.batch_size
         return [self._sample(step, first + i, count) for i in range(self.batch_size)]
 
-    def _sample(self, step: int, index: int, count: int) -> Draw:
+    def _sample(self, step: int, index: int, count: int) -> SampleSpec:
         """Sample number ``index`` of the run: all subjects once in random order, then in another."""
         names = list(self.subjects)
         epoch, place = divmod(index, len(names))
@@ -201,26 +230,35 @@ class TrainingDraws:
         rng = np.random.default_rng([self.seed, _SAMPLE, step, index])
         available = self.subjects[name]
         inputs = self.views.draw(available, count, self.ring, rng)
-        targets = self.targets.draw(available, inputs, self.targets.per_step, rng)
-        return Draw(name, tuple((pid, RING_VID) for pid in inputs), targets)
+        return SampleSpec(
+            name, ring_photos(inputs), self.targets.draw(available, inputs, self.targets.per_step, rng)
+        )
 
 
-def evaluation_draws(
+def evaluation_samples(
     subjects: Mapping[str, tuple[int, ...]],
     count: int,
     targets: TargetProtocol,
     ring: int,
     seed: int,
     positions: Mapping[int, Sequence[int]] | None = None,
-) -> list[Draw]:
-    """One sample a subject with ``count`` inputs, evenly spaced unless ``positions[count]`` lists them.
+) -> list[SampleSpec]:
+    """One sample for each subject, always the same ones.
+
+    Args:
+        subjects: available positions by name.
+        count: number of inputs.
+        targets: the target protocol.
+        ring: number of positions on a full ring.
+        seed: of random targets.
+        positions: input positions by number of inputs; evenly spaced where they are not listed.
 
     Raises:
         InputError: a subject lacks an input position.
     """
     inputs = list((positions or {}).get(count) or even_positions(ring, count))
     require(len(inputs) == count, f"data.evaluation_positions.{count}", f"{count} positions", inputs)
-    draws = []
+    specs = []
     for name, available in subjects.items():
         if lacking := sorted(set(inputs) - set(available)):
             raise InputError(
@@ -228,5 +266,5 @@ def evaluation_draws(
                 f"found no position {lacking[0]}"
             )
         chosen = targets.evaluation(available, inputs, ring, subject_rng(seed, name))
-        draws.append(Draw(name, tuple((pid, RING_VID) for pid in inputs), chosen))
-    return draws
+        specs.append(SampleSpec(name, ring_photos(inputs), chosen))
+    return specs

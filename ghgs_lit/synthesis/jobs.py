@@ -1,8 +1,8 @@
-"""Rendering many people into the layout: several processes, resumable, the same for the same seed.
+"""Renders many people into the layout: in several processes, resumable, the same files for the same seed.
 
-Workers are spawned (a fork of a process that runs threads may hang): a script that calls
-:func:`render_people` needs the usual ``if __name__ == "__main__":``. Workers only write into
-workspaces; the one process that holds the lock moves finished subjects to their place.
+Workers are spawned (a fork of a process that runs threads may hang), so a script that calls
+:func:`render_people` needs ``if __name__ == "__main__":``. Workers write into workspaces only; the process
+that holds the lock moves finished subjects to their place.
 """
 
 import contextlib
@@ -23,17 +23,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from ghgs_lit.config.settings import from_config, image_size
-from ghgs_lit.data.layout import View, encode_depth, position_name, write_body, write_view
-from ghgs_lit.data.progress import Progress
-from ghgs_lit.data.sampling import VIEW_IDS, subject_rng
+from ghgs_lit.config.settings import from_config, image_size, set_fields
+from ghgs_lit.data.layout import position_name
+from ghgs_lit.data.sampling import VIEW_NUMBERS, subject_rng
+from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
+from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.synthesis.writing import write_body, write_view
 
-# Part of every cache key: raise it when photographs of the same settings would change.
+# Part of every cache key: increase it when photographs of the same settings would change.
 RENDER_VERSION = 1
 
 
@@ -63,27 +65,35 @@ class SyntheticSource:
 class RenderSettings:
     """What is rendered of each person.
 
-    ``size``: side or (height, width) in pixels; ``samples`` x ``samples`` rays a pixel;
-    ``positions``: which of the ring (null: all). ``vids``: 0 the ring camera, 3 the exact middle to
-    the next one, 2 and 4 random between (1 repeats the next position's 0; stereo readers want it).
+    Attributes:
+        size: side or (height, width) in pixels.
+        samples: each pixel is the mean of ``samples`` x ``samples`` rays.
+        positions: positions of the ring that are rendered (null: all).
+        views: numbers of the views at each position (:mod:`ghgs_lit.synthesis.rig`); targets need 0, 2, 3 and
+            4, stereo methods need 1.
+        quality: of the JPEG files, 1 to 100.
+        lights: settings of the lights or their mapping.
     """
 
     size: int | tuple[int, int] = 512
     samples: int = 3
     positions: tuple[int, ...] | None = None
-    vids: tuple[int, ...] = (0, 2, 3, 4)
+    views: tuple[int, ...] = (0, 2, 3, 4)
     quality: int = 98
     lights: Lights = field(default_factory=Lights)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", image_size("data.render.size", self.size))
         require(1 <= self.samples <= 16, "data.render.samples", "between 1 and 16", self.samples)
         require(1 <= self.quality <= 100, "data.render.quality", "between 1 and 100", self.quality)
-        known = len(self.vids) > 0 and set(self.vids) <= set(VIEW_IDS)
-        require(known, "data.render.vids", f"some of {list(VIEW_IDS)}", list(self.vids))
-        object.__setattr__(self, "lights", from_config(Lights, "data.render.lights", self.lights))
-        object.__setattr__(self, "vids", tuple(self.vids))
-        object.__setattr__(self, "positions", None if self.positions is None else tuple(self.positions))
+        known = len(self.views) > 0 and set(self.views) <= set(VIEW_NUMBERS)
+        require(known, "data.render.views", f"some of {list(VIEW_NUMBERS)}", list(self.views))
+        set_fields(
+            self,
+            size=image_size("data.render.size", self.size),
+            lights=from_config(Lights, "data.render.lights", self.lights),
+            views=tuple(self.views),
+            positions=None if self.positions is None else tuple(self.positions),
+        )
 
 
 @dataclass(frozen=True)
@@ -99,7 +109,9 @@ class _Job:
 
 def identity(rig: Rig, settings: RenderSettings, seed: int) -> dict:
     """Everything that photographs of a given person depend on, as plain data."""
-    return {"version": RENDER_VERSION, "seed": seed, "rig": asdict(rig), "render": asdict(settings)}
+    render = asdict(settings)
+    render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
+    return {"version": RENDER_VERSION, "seed": seed, "rig": asdict(rig), "render": render}
 
 
 def render_subject(job: _Job) -> _Job:
@@ -108,12 +120,12 @@ def render_subject(job: _Job) -> _Job:
     person = job.rig.place(job.source.load(job.name), rng)
     yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), job.settings.lights.draw(rng)
     studio = Studio(person, lights, job.settings.samples)
-    vids = job.settings.vids
+    numbers = job.settings.views
     positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions
-    for pid in positions:
-        cameras = job.rig.cameras(yaws[pid, list(vids)], *job.settings.size)
+    for position in positions:
+        cameras = job.rig.cameras(yaws[position, list(numbers)], *job.settings.size)
         photographs = studio.shoot(cameras)
-        for n, vid in enumerate(vids):
+        for n, number in enumerate(numbers):
             view = View(
                 image=np.round(photographs.images[n] * 255).astype(np.uint8),
                 mask=photographs.masks[n],
@@ -121,7 +133,8 @@ def render_subject(job: _Job) -> _Job:
                 intrinsics=cameras.intrinsics[n].numpy(),
                 extrinsics=cameras.extrinsics[n].numpy(),
             )
-            write_view(job.workspace, position_name(job.name, pid), vid, view, job.settings.quality)
+            folder = position_name(job.name, position)
+            write_view(job.workspace, folder, number, view, job.settings.quality)
     if person.body_vertices is not None:
         write_body(job.workspace, job.name, person.body_vertices)
     return job
@@ -136,10 +149,21 @@ def render_people(
     seed: int,
     workers: int | None = None,
 ) -> int:
-    """Render the subjects ``names[phase]`` of ``source`` below ``root``; those already there are kept.
+    """Render people below ``root``; those that are already there are kept.
 
-    Returns how many were rendered now. Safe to kill, to repeat, and to start twice at once: a
-    second process waits for the first. ``workers``: processes (null: one a core; 0: this one).
+    It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
+
+    Args:
+        root: folder of the rendered data set.
+        names: names of the subjects of each phase.
+        source: loads them.
+        rig: the cameras, and how subjects are placed.
+        settings: what is rendered.
+        seed: seed of heights, yaws and lights.
+        workers: number of processes (None: one for each core; 0: this one).
+
+    Returns:
+        How many subjects were rendered now.
 
     Raises:
         InputError: ``root`` holds something else, or a person is bad.
@@ -150,7 +174,8 @@ def render_people(
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
     progress = Progress(Path(root))
     progress.check_settings(identity(rig, settings, seed))
-    if not any(progress.missing(phase, listed) for phase, listed in names.items()):
+    missing = progress.complete.missing
+    if not any(missing(phase, listed) for phase, listed in names.items()):
         return 0
     with progress.lock():
         progress.check_settings(identity(rig, settings, seed))  # another process may have been faster
@@ -159,7 +184,7 @@ def render_people(
         todo = [
             _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name))
             for phase, listed in names.items()
-            for name in progress.missing(phase, listed)
+            for name in missing(phase, listed)
         ]
         with _bar() as bar:
             task = bar.add_task(f"rendering into {root}", total=len(todo))
@@ -192,14 +217,14 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
 
 
 def _start_worker() -> None:
-    """One thread a process; Ctrl-C is the parent's to answer, and without the parent there is no work."""
+    """One thread for each process; Ctrl-C is left to the parent; a worker ends with its parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """A parent that is killed (``kill``, ``kill -9``, the batch system) takes nobody with it by itself."""
+    """Nothing else ends a worker whose parent is killed (``kill``, ``kill -9``, the batch system)."""
     multiprocessing.parent_process().join()
     os._exit(1)
 

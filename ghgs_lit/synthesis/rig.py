@@ -1,8 +1,8 @@
 """The ring of cameras that THuman2.0 is rendered with, and how a subject is placed in it.
 
-``positions`` cameras stand evenly around the subject. At each position there are views (``vid``):
-0 the ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 random
-in the first and the second half of the step. Yaw 0 looks at a subject that faces +z from the front.
+``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is the
+ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are random in the
+first and the second half of the step. Yaw 0 looks at a subject that faces +z from the front.
 """
 
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ghgs_lit.config.settings import set_fields
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.types import Cameras
@@ -17,9 +18,18 @@ from ghgs_lit.types import Cameras
 
 @dataclass(frozen=True)
 class Rig:
-    """Lengths in metres, angles in degrees; ``focal``, ``shift_y`` and sizes as fractions of the image.
+    """A ring of cameras.
 
-    ``height`` is what subjects are scaled to, ± ``height_jitter`` (null keeps their own height).
+    Attributes:
+        positions: number of cameras.
+        radius: distance of the cameras from ``look_at``, metres.
+        look_at: the point that all cameras look at, metres.
+        pitch: degrees; below 0 the cameras look down.
+        focal: focal length as a fraction of the image's height.
+        shift_y: offset of the principal point below the centre, as a fraction of the image's height.
+        yaw_jitter: the ring of each subject is turned by up to this angle, degrees.
+        height: height that subjects are scaled to, metres (null: they keep their own).
+        height_jitter: greatest deviation from ``height``, metres.
     """
 
     positions: int = 16
@@ -39,10 +49,10 @@ class Rig:
         require(-89 < self.pitch < 89, "rig.pitch", "between -89 and 89 degrees", self.pitch)
         require(self.focal > 0, "rig.focal", "more than 0", self.focal)
         require(self.height is None or self.height > 0, "rig.height", "more than 0 or null", self.height)
-        object.__setattr__(self, "look_at", tuple(self.look_at))
+        set_fields(self, look_at=tuple(self.look_at))
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
-        """Yaw [positions, 5] in degrees of every position and vid of one subject."""
+        """Yaws [positions, 5] in degrees of all views of one subject."""
         step = 360.0 / self.positions
         start = rng.uniform(-self.yaw_jitter, self.yaw_jitter) + step * np.arange(self.positions)
         first, second = rng.uniform(0, 0.5, (2, self.positions))
@@ -50,7 +60,12 @@ class Rig:
         return start[:, None] + step * offsets
 
     def cameras(self, yaws: np.ndarray, height: int, width: int) -> Cameras:
-        """Cameras at ``yaws`` (degrees, any shape) for an image of ``height`` x ``width``; float32."""
+        """Cameras of the ring, float32.
+
+        Args:
+            yaws: degrees, any shape.
+            height, width: image size in pixels.
+        """
         yaw, pitch = np.radians(yaws)[..., None], np.radians(self.pitch)
         zero = np.zeros_like(yaw)
         backward = np.concatenate(
@@ -70,7 +85,7 @@ class Rig:
         return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(extrinsics), height, width)
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
-        """``person`` scaled, feet at y = 0, centred; the body vertices get the same transform."""
+        """Scale a person, put the feet on y = 0 and centre it; the body vertices move along."""
         jitter = self.height_jitter * rng.uniform(-1, 1)
         low = np.min([part.vertices.min(0) for part in person.parts if len(part.vertices)], 0)
         high = np.max([part.vertices.max(0) for part in person.parts if len(part.vertices)], 0)

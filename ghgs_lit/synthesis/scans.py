@@ -1,7 +1,5 @@
-"""Textured meshes as people have them: THuman2.0 scans (``.obj``) and multi-part ``.glb`` files."""
+"""Scans: textured meshes, either as THuman2.0 stores them (``.obj``) or ``.glb`` files with several parts."""
 
-import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,13 +7,12 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from ghgs_lit.data.reader import read_array, read_image
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.data.decoding import read_array, read_image
+from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
-_SPLIT_FILES = ("splits.json", "split_train.txt")
 
 
 @dataclass(frozen=True)
@@ -38,10 +35,10 @@ class ScanSource:
         return names
 
     def load(self, name: str) -> Person:
-        """One scan with its ``body_vertices.npy``, where it has one, as stored.
+        """One scan as stored, with its ``body_vertices.npy`` if it has one.
 
         Raises:
-            InputError: no mesh, an unreadable one, or a part without texture.
+            InputError: the mesh is missing or unreadable, or a part has no texture.
         """
         folder = self.folder / name
         path = _mesh_file(folder) if folder.is_dir() else None
@@ -52,7 +49,7 @@ class ScanSource:
         return Person(name=name, parts=load_parts(path), body_vertices=body)
 
     def facing(self, name: str) -> float:
-        """Degrees about y that the first camera is turned by: nothing is known of these scans."""
+        """Degrees about y that the first camera is turned by: where these scans face is not known."""
         return 0.0
 
 
@@ -97,9 +94,9 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
 
 
 def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | None]:
-    """Texture [h, w, 3 or 4] uint8 and alpha cutoff of a material; None where it has no colour."""
+    """Texture [h, w, 3 or 4] uint8 and alpha cutoff of a material; None if it has no colour."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and image.format is None:  # not from a file: trimesh's stand-in for a lost material
+    if image is not None and image.format is None:  # not from a file: trimesh replaced a lost material
         image = None
     factor = getattr(material, "baseColorFactor", None)
     if image is None and factor is not None:  # one plain colour, as buttons and eyes often have
@@ -109,7 +106,7 @@ def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | N
     if image is None:
         return None, None
     mode = str(getattr(material, "alphaMode", None) or "OPAQUE").upper()
-    # Blended hair is cut at one half: a photograph here has one surface a ray.
+    # Blended hair is cut at one half: each ray of a photograph sees one surface.
     cutoff = None if mode == "OPAQUE" else float(getattr(material, "alphaCutoff", None) or 0.5)
     has_alpha = "A" in image.getbands() or "transparency" in image.info
     cutoff = cutoff if has_alpha else None
@@ -121,100 +118,8 @@ def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | N
 
 
 def _image_beside(path: Path) -> Image.Image | None:
-    """The texture of a scan whose ``.mtl`` was lost: ``material0.*``, or the only image there is."""
+    """The texture of a scan whose ``.mtl`` was lost: ``material0.*``, or the only image."""
     images = sorted(p for p in path.parent.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
     named = [p for p in images if p.stem == "material0"]
     chosen = named[:1] or (images if len(images) == 1 else [])
     return read_image(chosen[0]) if chosen else None
-
-
-def split_names(
-    source: Path,
-    names: Sequence[str],
-    split: str | Mapping[str, Sequence[str]] | None,
-    val_fraction: float,
-    seed: int,
-) -> dict[str, list[str]]:
-    """Which of ``names`` are ``train`` and which ``val``.
-
-    ``split`` is as for :func:`read_split`. Without it, such files in the source folder count; without
-    those, ``val_fraction`` of the names are drawn by ``seed``.
-
-    Raises:
-        InputError: the split is missing or malformed, names scans that do not exist, or overlaps.
-    """
-    if split is None and not any((source / name).exists() for name in _SPLIT_FILES):
-        require(0 <= val_fraction < 1, "data.val_fraction", "at least 0 and below 1", val_fraction)
-        order = np.random.default_rng(seed).permutation(len(names))
-        count = round(val_fraction * len(names))
-        return {
-            "train": [names[i] for i in sorted(order[count:])],
-            "val": [names[i] for i in sorted(order[:count])],
-        }
-    chosen = read_split(source if split is None else split, names)
-    for phase, listed in chosen.items():
-        if unknown := sorted(set(listed) - set(names)):
-            raise InputError(
-                f"{split or source}: expected ids of scans in {source}; found {unknown[0]!r} in {phase}"
-            )
-    return chosen
-
-
-def read_split(split: str | Path | Mapping[str, Sequence[str]], names: Sequence[str]) -> dict[str, list[str]]:
-    """Who is ``train`` and who ``val`` (a split without ``val`` may call it ``test``).
-
-    ``split``: a JSON file with these lists, a folder with one or with ``split_train.txt`` and
-    ``split_val.txt`` (one id a line), or a mapping of ids and of ranges ``0000-0425``, which stand for
-    those of ``names`` that lie in them.
-
-    Raises:
-        InputError: it is missing, malformed, or somebody is in both.
-    """
-    if isinstance(split, Mapping):
-        place: Path | str = "data.split"
-        chosen = _lists(place, split)
-        chosen = {
-            phase: [n for entry in listed for n in _expand(entry, names)] for phase, listed in chosen.items()
-        }
-    else:
-        folder = place = Path(split).expanduser()
-        if folder.is_dir():
-            place = next((p for n in _SPLIT_FILES if (p := folder / n).exists()), folder)
-        if not place.is_file():
-            raise InputError(f"{place}: expected a JSON file or a folder with split_train.txt; found neither")
-        chosen = _read_split(place)
-    if both := sorted(set(chosen["train"]) & set(chosen["val"])):
-        raise InputError(f"{place}: expected disjoint train and val; found {both[0]!r} in both")
-    return chosen
-
-
-def _expand(entry: object, names: Sequence[str]) -> list[str]:
-    """An id, or those of ``names`` in a range of ids of equal length."""
-    first, dash, last = str(entry).partition("-")
-    if not dash:
-        return [str(entry)]
-    return [name for name in names if len(name) == len(first) and first <= name <= last]
-
-
-def _lists(place: Path | str, content: Mapping) -> dict[str, list]:
-    chosen = {"train": content.get("train"), "val": content.get("val", content.get("test"))}
-    for phase, listed in chosen.items():
-        if not isinstance(listed, Sequence) or isinstance(listed, str):
-            raise InputError(f"{place}: expected a list {phase!r} (test does for val); found {listed!r}")
-    return {phase: list(listed) for phase, listed in chosen.items()}
-
-
-def _read_split(path: Path) -> dict[str, list[str]]:
-    if path.suffix == ".json":
-        try:
-            content = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: expected JSON; found {error}") from error
-        return _lists(path, content if isinstance(content, Mapping) else {})
-    result = {}
-    for phase in ("train", "val"):
-        file = path.with_name(f"split_{phase}.txt")
-        if not file.exists():
-            raise InputError(f"{file}: expected one id a line; found no such file")
-        result[phase] = file.read_text().split()
-    return result

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_npy, load_pickle
-from ghgs_lit.data.reader import check_array
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.scans import ScanSource
 
-# How the folder of the fits is called in the archives and scripts that are about.
+# Names of the folder of the fits in published archives and scripts.
 FIT_FOLDERS = ("THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "THuman2.0_SMPLX_Paras", "smplx_2", "smplx")
 _NEEDED = ("betas", "global_orient", "body_pose")
 _MORE = ("left_hand_pose", "right_hand_pose", "jaw_pose", "leye_pose", "reye_pose", "expression")
@@ -28,8 +28,12 @@ _FIT_SIZES = {"global_orient": (3,), "scale": (1,), "translation": (3,), "transl
 
 @dataclass(frozen=True)
 class SmplxFit:
-    """``smplx_param.pkl``: ``parameters`` of the male SMPL-X model by name [1, n], ``scale`` and
-    ``translation`` [3] from its frame to the scan's: **scale first**, ``v * scale + translation``."""
+    """The content of ``smplx_param.pkl``.
+
+    Attributes:
+        parameters: of the male SMPL-X model, by name, [1, n].
+        scale, translation: from the model's frame to the scan's: ``v * scale + translation``, scale first.
+    """
 
     parameters: Mapping[str, np.ndarray]
     scale: float
@@ -71,9 +75,11 @@ def read_fit(path: Path) -> SmplxFit:
 
 
 def find_fits(source: Path, fits: str | None) -> Path | None:
-    """The folder of the fits: as configured, else one of :data:`FIT_FOLDERS` in or beside ``source``.
+    """The folder of the fits, None if there is none; each scan's own folder is looked into as well.
 
-    None where there is none; each scan's own folder is looked into as well.
+    Args:
+        source: folder of the scans.
+        fits: the configured folder (None: one of :data:`FIT_FOLDERS` in or beside ``source``).
 
     Raises:
         InputError: the configured folder does not exist.
@@ -91,8 +97,11 @@ def find_fits(source: Path, fits: str | None) -> Path | None:
 class THuman2Source:
     """Raw scans with their bodies.
 
-    ``body_model``: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
-    ``smplx_param.pkl``; None reads ``mesh_smplx.obj``, which the fits bring along.
+    Attributes:
+        folder: folder of the scans.
+        fits: folder of the fits (None: each scan's own folder).
+        body_model: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
+            ``smplx_param.pkl`` (None: read ``mesh_smplx.obj``, a part of the fits).
     """
 
     folder: Path
@@ -103,10 +112,10 @@ class THuman2Source:
         return ScanSource(self.folder).names()
 
     def fit(self, name: str) -> Path | None:
-        """The folder of one scan's fit; None where there are no fits at all.
+        """The folder of one scan's fit; None if there are no fits at all.
 
         Raises:
-            InputError: there are fits, but none of this scan.
+            InputError: there are fits, but not of this scan.
         """
         if (self.folder / name / "smplx_param.pkl").exists():
             return self.folder / name
@@ -117,10 +126,10 @@ class THuman2Source:
         return self.fits / name
 
     def body(self, name: str) -> np.ndarray | None:
-        """Vertices [n, 3] float64 of the body in the scan's frame, None without fits.
+        """Body vertices [n, 3] float64 in the scan's frame; None without fits.
 
         Raises:
-            InputError: the fit is bad, or nothing says what its vertices are.
+            InputError: the fit is bad, or its vertices are neither stored nor computable.
         """
         folder = self.fit(name)
         if folder is None:
@@ -140,7 +149,7 @@ class THuman2Source:
         """One scan with its body, both as stored.
 
         Raises:
-            InputError: the scan or its fit is bad, or the body is somewhere else than the scan.
+            InputError: the scan or its fit is bad, or the body does not lie in the scan.
         """
         scan, body = ScanSource(self.folder).load(name), self.body(name)
         if body is None:
@@ -149,16 +158,16 @@ class THuman2Source:
         return Person(name, scan.parts, body.astype(np.float32))
 
     def check(self, name: str) -> None:
-        """Read all that rendering a scan will read.
+        """Read everything that rendering a scan reads.
 
         Raises:
-            InputError: something of it is bad.
+            InputError: a part of it is bad.
         """
         self.load(name)
         self.facing(name)
 
     def facing(self, name: str) -> float:
-        """Degrees about y that the first camera is turned by, to look at the scan's front; 0 without fit."""
+        """Degrees about y that the first camera is turned by, to face the person; 0 without a fit."""
         folder = self.fit(name)
         path = None if folder is None else folder / "smplx_param.pkl"
         return 0.0 if path is None or not path.exists() else read_fit(path).facing
@@ -177,7 +186,7 @@ def _obj_vertices(path: Path) -> np.ndarray:
 
 
 def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
-    """A fit without its scale, translation or in metres does not lie in its scan."""
+    """Refuse a body that does not lie in its scan: its scale or translation was not applied."""
     points = np.concatenate([part.vertices for part in scan.parts])
     low, high = points.min(0), points.max(0)
     tall = high[1] - low[1]
@@ -209,8 +218,12 @@ def _smplx_model(folder: Path) -> Any:
 def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     """Vertices [10475, 3] of the male SMPL-X model, before scale and translation.
 
+    Args:
+        folder: the model's files.
+        parameters: by name, [1, n].
+
     Raises:
-        InputError: the package or the model files are not there.
+        InputError: the package or the model files are missing.
     """
     import torch
 
@@ -221,7 +234,11 @@ def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.nda
 
 
 def ghg_body(path: Path, vertices: np.ndarray) -> np.ndarray:
-    """Vertices of a fit moved as GHG's renderer moved the scan: its ``<id>_transform.npy``.
+    """Move the body of a scan as GHG's renderer moved the scan.
+
+    Args:
+        path: ``<id>_transform.npy``.
+        vertices: [n, 3] in the scan's frame.
 
     Raises:
         InputError: the file is missing, or lacks a number.

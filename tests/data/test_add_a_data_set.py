@@ -21,7 +21,7 @@ TEMPLATE = Path(__file__).parents[2] / "docs" / "template"
 CAMERAS, SIZE = 8, 60
 KEYS = {
     "views": {"name": "v3", "training_counts": [3], "evaluation_count": 3},
-    "targets": {"name": "cameras", "vid": 0},
+    "targets": {"name": "cameras", "view": 0, "training_views": [0]},
 }
 
 
@@ -37,10 +37,10 @@ def project(tmp_path):
             folder = tmp_path / "photographs" / phase / name
             folder.mkdir(parents=True)
             color = rng.integers(60, 255, 3)
-            for pid in range(CAMERAS):
+            for camera in range(CAMERAS):
                 pixels = np.zeros((SIZE, SIZE, 4), np.uint8)
                 pixels[10:50, 22:38] = (*color, 255)
-                Image.fromarray(pixels).save(folder / f"{pid}.png")
+                Image.fromarray(pixels).save(folder / f"{camera}.png")
             np.savez(
                 folder / "cameras.npz", intrinsics=cameras.intrinsics, extrinsics=cameras.extrinsics[:, :3]
             )
@@ -50,7 +50,7 @@ def project(tmp_path):
 
 @pytest.fixture(autouse=True)
 def clean(monkeypatch):
-    """Every test admits and imports anew."""
+    """Each test starts without admitted or imported modules."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(plugins.VARIABLE, raising=False)
     plugins._installed.cache_clear()
@@ -91,7 +91,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
     content = json.loads(Path("run/metrics.json").read_text())
     assert content["provenance"]["data"] == {"name": "my_people", "split": "val"}
     assert content["provenance"]["training"]["steps"] == 2
-    # One subject; every camera that is no input is a target.
+    # One subject; every camera that is not an input is a target.
     before = {row["target"]: row["psnr"] for row in content["rows"]}
     assert {row["subject"] for row in content["rows"]} == {"c"}
     assert len(before) == CAMERAS - 3
@@ -113,6 +113,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
 
 
 def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
+    """Cameras, masks and bodies of the template reach the batch; what it cannot give is refused."""
     monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
     data = build(node(project), "data")
     (batch,) = list(data.evaluation_loader())
@@ -124,14 +125,16 @@ def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
     assert batch.masks.float().mean().item() == pytest.approx(40 * 16 / 60**2, abs=0.01)
     # Other processes find the class, too.
     assert str(project) in sys.path
-    with pytest.raises(InputError, match="no other view at a camera; found 3"):
-        list(build(node(project, targets={"name": "cameras", "vid": 3}), "data").evaluation_loader())
+    between = {"name": "cameras", "view": 3}
+    with pytest.raises(InputError, match="found cameras, which asks for views between cameras"):
+        list(build(node(project, targets=between), "data").evaluation_loader())
     (project / "photographs" / "val" / "c" / "cameras.npz").unlink()
     with pytest.raises(InputError, match=r"c/cameras\.npz"):
         list(build(node(project), "data").evaluation_loader())
 
 
 def test_nothing_is_admitted_by_a_configuration(project):
+    """A checkpoint of somebody else cannot have foreign code imported."""
     for target in ("my_people.MyDataModule", "os.system", "ghgs_lit_evil.x"):
         with pytest.raises(InputError, match=r"data\._target_"):
             build(node(project, _target_=target), "data")
@@ -139,6 +142,7 @@ def test_nothing_is_admitted_by_a_configuration(project):
 
 
 def test_an_admitted_module_admits_no_other(project, monkeypatch):
+    """Admitting one module must not admit names that only resemble it."""
     monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
     for target in ("my_people_2.X", "os.system", "my_people"):
         with pytest.raises(InputError, match="expected a class of ghgs_lit"):
@@ -146,6 +150,7 @@ def test_an_admitted_module_admits_no_other(project, monkeypatch):
 
 
 def test_a_module_and_an_installed_package_can_be_admitted(monkeypatch):
+    """Both documented ways of admitting code work, and end when they are taken back."""
     monkeypatch.setenv(plugins.VARIABLE, "fractions")
     assert build({"_target_": "fractions.Fraction", "numerator": 3}).numerator == 3
     monkeypatch.delenv(plugins.VARIABLE)
@@ -158,6 +163,7 @@ def test_a_module_and_an_installed_package_can_be_admitted(monkeypatch):
 
 
 def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
+    """A wrong GHGS_PLUGINS names its file; an error inside the file is not hidden."""
     for name, said in (
         ("none.py", r"found no .*none\.py"),
         ("json.py", "no other module has"),

@@ -14,6 +14,8 @@ from scipy import sparse
 
 from ghgs_lit.data.humman.reader import HuMManReader
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
+from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.miniatures import humman
 from ghgs_lit.synthesis.miniatures.smpl import stand_in
@@ -30,38 +32,42 @@ def root(tmp_path_factory) -> Path:
     return folder
 
 
-def reader(root: Path, **options) -> HuMManReader:
-    return HuMManReader(root, [TEST], range(0, 97, 6), **options)
+def photographs(root: Path, size=None, **options) -> Photographs:
+    return Photographs(HuMManReader(root, [TEST], range(0, 97, 6), **options), size)
 
 
 def test_frames_are_multiples_of_6_and_some_lack(root):
-    assert list(reader(root).subjects) == [f"{TEST}_{n:06d}" for n in (0, 6, 18)]
-    assert set(reader(root).subjects.values()) == {tuple(range(10))}
+    """Frames that a sequence lacks are left out; all ten cameras are positions."""
+    assert list(photographs(root).reader.subjects) == [f"{TEST}_{n:06d}" for n in (0, 6, 18)]
+    assert set(photographs(root).reader.subjects.values()) == {tuple(range(10))}
 
 
 def test_a_camera_that_lacks_a_frame_is_left_out(root, tmp_path):
+    """A missing photograph removes one camera from one frame, not the frame."""
     shutil.copytree(root / TEST, tmp_path / TEST)
     (tmp_path / TEST / "kinect_color" / "kinect_004" / "000006.png").unlink()
-    subjects = reader(tmp_path).subjects
+    subjects = photographs(tmp_path).reader.subjects
     assert subjects[f"{TEST}_000006"] == (0, 1, 2, 3, 5, 6, 7, 8, 9)
     assert subjects[f"{TEST}_000018"] == tuple(range(10))
 
 
 def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_path):
+    """The official test sequences never reach training."""
     shutil.copytree(root, tmp_path / "recon")
     (tmp_path / "recon" / "notes").mkdir()
-    data = build_data("humman", tmp_path / "recon", "data.body=none")
+    data = build_data("humman", tmp_path / "recon", "data.body=none").dataset
     assert len(data.split["val"]) == len(set(data.split["val"])) == 22
     assert data.sequences("train") == ["p100001_a000048"]
-    assert data.reader("val", None).sequences == {TEST}
+    assert data.reader("val").sequences == {TEST}
     assert data.published == {"train": 317, "val": 22}
-    assert list(data.frames) == [6 * i for i in range(17)]
+    assert list(range(*data.frames)) == [6 * i for i in range(17)]
 
 
 def test_the_world_is_the_first_cameras_frame_in_metres(root):
+    """A wrong unit or direction of the extrinsics would move the cameras."""
     content = json.loads((root / TEST / "cameras.json").read_text())
     assert len(content) == 20
-    views = [reader(root).view(f"{TEST}_000000", k) for k in range(10)]
+    views = [photographs(root).view(f"{TEST}_000000", k) for k in range(10)]
     np.testing.assert_allclose(views[0].extrinsics, np.eye(4), atol=1e-6)
     np.testing.assert_allclose(views[3].extrinsics[:3, 3], content["kinect_color_003"]["T"], rtol=1e-6)
     centers = np.stack([-v.extrinsics[:3, :3].T @ v.extrinsics[:3, 3] for v in views])
@@ -69,20 +75,23 @@ def test_the_world_is_the_first_cameras_frame_in_metres(root):
 
 
 def test_any_value_of_the_matting_is_the_performer(root):
+    """Soft values of the matting count as the performer, too."""
     path = root / TEST / "kinect_mask" / "kinect_002" / "000006.png"
     matting = np.asarray(Image.open(path))
     assert ((matting > 0) & (matting < 128)).any()
-    np.testing.assert_array_equal(reader(root).view(f"{TEST}_000006", 2).mask, matting > 0)
+    np.testing.assert_array_equal(photographs(root).view(f"{TEST}_000006", 2).mask, matting > 0)
 
 
 def test_drawn_masks_are_read_where_there_are_any(root):
-    view = reader(root, masks="kinect_mask_manual").view(f"{TEST}_000006", 2)
-    assert view.mask.sum() < reader(root).view(f"{TEST}_000006", 2).mask.sum()
+    """The option data.masks selects another folder, which only test sequences have."""
+    view = photographs(root, masks="kinect_mask_manual").view(f"{TEST}_000006", 2)
+    assert view.mask.sum() < photographs(root).view(f"{TEST}_000006", 2).mask.sum()
     assert not (root / "p100001_a000048" / "kinect_mask_manual").exists()
 
 
 def test_the_background_is_black(root):
-    view = reader(root).view(f"{TEST}_000000", 1)
+    """The studio behind the performer must not reach the model."""
+    view = photographs(root).view(f"{TEST}_000000", 1)
     assert view.image[~view.mask].max() == 0
     assert view.image[view.mask].max() > 60
 
@@ -100,14 +109,15 @@ def test_intrinsics_fit_resized_photographs(root, tmp_path, share):
     full = Image.fromarray(np.full((HEIGHT, WIDTH), 255, np.uint8))
     full.save(tmp_path / TEST / "kinect_mask" / name)
     size = (HEIGHT // share, WIDTH // share)
-    view = reader(tmp_path, size=size).view(f"{TEST}_000000", 5)
+    view = photographs(tmp_path, size=size).view(f"{TEST}_000000", 5)
     assert view.image.shape == (*size, 3)
     np.testing.assert_allclose(centroid(view.image), project(view, point), atol=0.02)
 
 
 def test_depth_points_lie_on_the_performer(root):
-    data = reader(root, body="depth")
-    for name in data.subjects:
+    """Points that replace a body lie inside every mask, upright and of human height."""
+    data = photographs(root, body="depth")
+    for name in data.reader.subjects:
         points = data.body(name)
         assert len(points) > 500
         assert points.dtype == np.float32
@@ -125,11 +135,14 @@ def test_depth_points_are_millimetres_of_the_depth_cameras(root, tmp_path):
             content[key]["T"][0] += 0.3
     (tmp_path / TEST / "cameras.json").write_text(json.dumps(content))
     name = f"{TEST}_000000"
-    assert len(reader(tmp_path, body="depth").body(name)) < 0.7 * len(reader(root, body="depth").body(name))
+    assert len(photographs(tmp_path, body="depth").body(name)) < 0.7 * len(
+        photographs(root, body="depth").body(name)
+    )
 
 
 def test_no_body_is_a_choice(root):
-    assert reader(root, body="none").body(f"{TEST}_000000") is None
+    """Without a body a batch says so, and training without Chamfer loss is possible."""
+    assert photographs(root, body="none").body(f"{TEST}_000000") is None
     batch = build_data(
         "humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0"
     ).training_batch(0)
@@ -138,15 +151,17 @@ def test_no_body_is_a_choice(root):
 
 
 def test_evaluation_takes_evenly_spaced_inputs_and_all_other_targets(root):
+    """The documented protocol: inputs 0 3 6 and seven targets; frames are not people."""
     data = build_data("humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0")
     samples = list(data.evaluation_loader(views=3))
     assert len(samples) == 3
     assert samples[0].views == (("000/0", "003/0", "006/0"),)
     assert samples[0].targets.images.shape == (1, 7, 3, 36, 64)
-    assert data.people(data.reader("val", None)) == 1
+    assert data.dataset.reader("val").people == 1
 
 
 def test_parameters_have_the_published_shapes(root):
+    """The miniature's SMPL parameters are those of the real files."""
     found = read_parameters(root / TEST / "smpl_params" / "000018.npz")
     assert {key: value.shape for key, value in found.items()} == {
         "betas": (10,), "body_pose": (69,), "global_orient": (3,), "transl": (3,)
@@ -154,6 +169,7 @@ def test_parameters_have_the_published_shapes(root):
 
 
 def test_the_stand_in_has_the_shapes_of_smpl(root):
+    """The replacement of the licensed model is read as a model of SMPL's shapes."""
     arrays = read_model(root.with_name("recon_body_models") / "smpl" / "SMPL_NEUTRAL.pkl")
     assert arrays["weights"].sum(1) == pytest.approx(1)
     assert arrays["J_regressor"].sum(1) == pytest.approx(1, abs=1e-4)
@@ -161,14 +177,16 @@ def test_the_stand_in_has_the_shapes_of_smpl(root):
 
 
 def test_smpl_vertices_project_into_every_mask(root):
+    """Model, parameters and cameras agree about where the body is."""
     pytest.importorskip("smplx")
-    data = reader(root, body="smpl", smpl_model=root.with_name("recon_body_models"))
-    for name in data.subjects:
+    data = photographs(root, body="smpl", smpl_model=root.with_name("recon_body_models"))
+    for name in data.reader.subjects:
         assert data.body(name).shape == (6890, 3)
         assert min(inside(data.view(name, k), data.body(name)) for k in range(10)) > 0.97
 
 
 def test_smpl_turns_about_the_pelvis_and_then_shifts(root):
+    """The order of rotation and translation is SMPL's."""
     pytest.importorskip("smplx")
     from ghgs_lit.data.humman.smpl import Body
 
@@ -197,6 +215,7 @@ class Ch:
 
 @pytest.mark.parametrize("protocol", [0, 2])
 def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monkeypatch, protocol):
+    """Users of the official file need no package that no longer installs."""
     module = type(sys)("chumpy.ch")
     module.Ch, Ch.__module__, Ch.__qualname__ = Ch, "chumpy.ch", "Ch"
     monkeypatch.setitem(sys.modules, "chumpy", type(sys)("chumpy"))
@@ -217,6 +236,7 @@ def test_pickles_of_the_official_release_are_read_without_chumpy(tmp_path, monke
 
 
 def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
+    """A miniature is reproducible, whatever else is made."""
     make_miniature(humman, tmp_path / "recon", [TEST], {"train": 1, "val": 0}, WIDTH, seed=3, frames=[0])
     for name in ("kinect_color/kinect_007/000000.png", "kinect_depth/kinect_007/000000.png", "cameras.json"):
         place = Path("p100001_a000048") / name
@@ -224,14 +244,15 @@ def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
 
 
 def test_targets_between_cameras_that_stand_still_are_refused(root):
+    """Views that do not exist are refused before anything is read."""
     data = build_data(
         "humman", root, "data.body=none", "data.size=[36,64]", "data.workers=0", "targets=release"
     )
     for draw in (
-        data.training_draws,
+        data.training_sampler,
         data.evaluation_loader,
-        partial(data.evaluation_loader, targets="midway"),
+        partial(data.evaluation_loader, targets={"name": "midway"}),
     ):
         with pytest.raises(InputError, match=r"targets: expected cameras for data=humman.*; found"):
             draw()
-    assert len(data.evaluation_loader(targets="cameras")) > 0
+    assert len(data.evaluation_loader(targets=CAMERAS)) > 0

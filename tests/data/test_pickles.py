@@ -42,6 +42,7 @@ def equal(a, b) -> bool:
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_arrays_and_containers_come_through(tmp_path, protocol):
+    """Everything that data sets store is read, in every pickle protocol."""
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps(CONTENT, protocol=protocol))
     found = load_pickle(path)
@@ -52,6 +53,7 @@ def test_arrays_and_containers_come_through(tmp_path, protocol):
 
 @pytest.mark.parametrize("core", ["core", "_core"])
 def test_names_of_both_numpys(tmp_path, core):
+    """Files written by NumPy 1 and 2 are both read."""
     data = pickle.dumps({"a": np.arange(3.0), "b": np.float64(2)}, protocol=2)
     for name in (b"numpy._core.multiarray", b"numpy.core.multiarray"):
         data = data.replace(name, f"numpy.{core}.multiarray".encode())
@@ -61,6 +63,7 @@ def test_names_of_both_numpys(tmp_path, core):
 
 
 def test_python_2s_strings_and_builtins(tmp_path):
+    """Files written by Python 2, as ZJU-MoCap's, are read."""
     path = tmp_path / "a.pkl"
     # As cPickle.dump({'poses': set([1.0])}, protocol=2) of Python 2 wrote it.
     path.write_bytes(b"\x80\x02}U\x05posesc__builtin__\nset\n]G?\xf0\x00\x00\x00\x00\x00\x00a\x85Rs.")
@@ -69,6 +72,7 @@ def test_python_2s_strings_and_builtins(tmp_path):
 
 @pytest.mark.parametrize("module", ["trimesh.caching", "trimesh.util"])
 def test_trimeshs_arrays_are_arrays(tmp_path, module):
+    """THuman2.0's fits hold trimesh's array class, under either of its names."""
     path = tmp_path / "a.pkl"
     data = pickle.dumps({"translation": np.ones(3, np.float32).view(TrackedArray)}, protocol=2)
     assert b"trimesh.caching\nTrackedArray" in data
@@ -90,6 +94,7 @@ def test_trimeshs_arrays_are_arrays(tmp_path, module):
 )
 @pytest.mark.parametrize("protocol", [0, 2, 5])
 def test_anything_else_is_refused_by_its_name_and_not_called(tmp_path, call, name, protocol):
+    """A malicious pickle runs nothing, whatever it names."""
     mark = tmp_path / "called"
     function, *arguments = call
     bad = Call(function, *(a.format(path=mark) for a in arguments))
@@ -108,6 +113,7 @@ def test_anything_else_is_refused_by_its_name_and_not_called(tmp_path, call, nam
 
 
 def test_no_codec_but_the_one_that_bytes_need(tmp_path):
+    """The one admitted function cannot be used for other codecs."""
     path = tmp_path / "a.pkl"
     # _codecs.encode('uryyb', 'rot13')
     path.write_bytes(b"\x80\x02c_codecs\nencode\nX\x05\x00\x00\x00uryybX\x05\x00\x00\x00rot13\x86R.")
@@ -116,6 +122,7 @@ def test_no_codec_but_the_one_that_bytes_need(tmp_path):
 
 
 def test_broken_pickles_are_named(tmp_path):
+    """A missing, truncated or foreign file is named."""
     path = tmp_path / "a.pkl"
     with pytest.raises(InputError, match=r"a\.pkl: expected a pickle; found no such file"):
         load_pickle(path)
@@ -127,6 +134,7 @@ def test_broken_pickles_are_named(tmp_path):
 
 
 def test_npy_files(tmp_path):
+    """Plain and pickled .npy files are read by the same rules."""
     path = tmp_path / "a.npy"
     np.save(path, np.arange(3))
     assert load_npy(path).tolist() == [0, 1, 2]

@@ -1,4 +1,4 @@
-"""Sampling protocols and the DataModules: angles, draws that resume, batches, refusals."""
+"""Sampling protocols and the DataModules: angles, samples that resume, batches, refusals."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,16 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from ghgs_lit.data.datamodules import RenderedDataModule
 from ghgs_lit.data.sampling import (
     TargetProtocol,
-    TrainingDraws,
+    TrainingSampler,
     ViewProtocol,
-    evaluation_draws,
+    evaluation_samples,
     even_positions,
     middle,
 )
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis import RenderedDataModule
 from tests.helpers.people import RELEASE, V4, equal, render_boxes
 
 FULL = tuple(range(16))
@@ -32,7 +32,7 @@ def root(tmp_path_factory):
 
 def module(root, **changes) -> RenderedDataModule:
     arguments = {"views": V4, "targets": RELEASE, "size": 28, "batch_size": 2} | changes
-    return RenderedDataModule(str(root), **arguments)
+    return RenderedDataModule(root=str(root), **arguments)
 
 
 def turns(cameras) -> np.ndarray:
@@ -46,6 +46,7 @@ def between(a, b) -> np.ndarray:
 
 
 def test_even_positions_are_the_protocols():
+    """The inputs of the published protocols for 3, 4 and 5 views."""
     assert even_positions(16, 3) == [0, 5, 10]
     assert even_positions(16, 4) == [0, 4, 8, 12]
     assert even_positions(16, 5) == [0, 3, 6, 9, 12]
@@ -55,7 +56,7 @@ def test_even_positions_are_the_protocols():
 def test_targets_stand_where_their_protocol_says(root, count):
     """Angles of the actual cameras: 11.25 degrees beside the first input; equally far from two inputs."""
     data = module(root)
-    for batch in data.evaluation_loader(count, "release"):
+    for batch in data.evaluation_loader(count, TargetProtocol("release")):
         first, target = turns(batch.cameras)[:, 0], turns(batch.targets.cameras)[:, 0]
         np.testing.assert_allclose((target - first) % 360, 11.25, atol=1e-3)
         assert batch.targets.names == (("000/3",),) * len(batch.subjects)
@@ -71,7 +72,7 @@ def test_targets_stand_where_their_protocol_says(root, count):
             between(targets, after), np.broadcast_to(step / 2, targets.shape), atol=1e-3
         )
     if count == 4:
-        batch = next(iter(data.evaluation_loader(4, "midway")))
+        batch = next(iter(data.evaluation_loader(4, {"name": "midway"})))
         assert batch.targets.names[0] == ("002/0",)
         np.testing.assert_allclose(
             between(turns(batch.targets.cameras), turns(batch.cameras)[:, :1]), 45, atol=1e-3
@@ -79,6 +80,7 @@ def test_targets_stand_where_their_protocol_says(root, count):
 
 
 def test_middle_wraps_around_the_ring():
+    """The middle of two positions is right across the end of the ring."""
     assert middle(0, 5, 16) == (2, 3)
     assert middle(12, 0, 16) == (14, 0)
     assert middle(10, 0, 16) == (13, 0)
@@ -87,24 +89,26 @@ def test_middle_wraps_around_the_ring():
 
 
 def test_release_beside_every_input_and_listed_positions():
+    """per_subject=all measures beside every input; listed inputs replace the even ones."""
     targets = TargetProtocol("release", per_subject="all")
-    draws = evaluation_draws({"a": FULL}, 3, targets, 16, 0, {3: [0, 6, 11]})
-    assert draws[0].inputs == ((0, 0), (6, 0), (11, 0))
-    assert draws[0].targets == ((0, 3), (6, 3), (11, 3))
+    samples = evaluation_samples({"a": FULL}, 3, targets, 16, 0, {3: [0, 6, 11]})
+    assert samples[0].inputs == ((0, 0), (6, 0), (11, 0))
+    assert samples[0].targets == ((0, 3), (6, 3), (11, 3))
 
 
 def test_random_targets_of_evaluation_are_fixed_and_differ_between_subjects():
+    """Evaluation measures the same targets every time."""
     targets = TargetProtocol("random", per_subject=3)
     subjects = {f"s{i}": FULL for i in range(6)}
-    first = evaluation_draws(subjects, 4, targets, 16, 0)
-    assert first == evaluation_draws(subjects, 4, targets, 16, 0)
+    first = evaluation_samples(subjects, 4, targets, 16, 0)
+    assert first == evaluation_samples(subjects, 4, targets, 16, 0)
     assert len({d.targets for d in first}) == 6
-    for draw in first:
-        assert len(set(draw.targets)) == 3
-        assert not set(draw.targets) & set(draw.inputs)
+    for sample in first:
+        assert len(set(sample.targets)) == 3
+        assert not set(sample.targets) & set(sample.inputs)
 
 
-def draws(views=RANDOM, targets=None, **changes) -> TrainingDraws:
+def sampler(views=RANDOM, targets=None, **changes) -> TrainingSampler:
     targets = targets or TargetProtocol("random", per_step=3)
     arguments = {
         "subjects": {f"s{i}": FULL for i in range(5)},
@@ -112,57 +116,64 @@ def draws(views=RANDOM, targets=None, **changes) -> TrainingDraws:
         "batch_size": 2,
         "seed": 0,
     } | changes
-    return TrainingDraws(views=views, targets=targets, **arguments)
+    return TrainingSampler(views=views, targets=targets, **arguments)
 
 
-def test_training_draws_depend_on_seed_step_and_index_only():
-    forward = [draws().batch(step) for step in range(40)]
-    backward = [draws().batch(step) for step in reversed(range(40))][::-1]
+def test_training_samples_depend_on_seed_step_and_index_only():
+    """A resumed run sees what an uninterrupted one sees; no global generator matters."""
+    forward = [sampler().batch(step) for step in range(40)]
+    backward = [sampler().batch(step) for step in reversed(range(40))][::-1]
     assert forward == backward
-    assert forward != [draws(seed=1).batch(step) for step in range(40)]
+    assert forward != [sampler(seed=1).batch(step) for step in range(40)]
     torch.manual_seed(5)
     np.random.seed(5)  # noqa: NPY002  no global generator has a say
-    assert forward[7] == draws().batch(7)
+    assert forward[7] == sampler().batch(7)
 
 
-def test_training_draws_are_fair():
-    batches = [draws().batch(step) for step in range(300)]
+def test_training_samples_are_fair():
+    """Every subject once in each round, all counts, positions and views, no target among the inputs."""
+    batches = [sampler().batch(step) for step in range(300)]
     for batch in batches:
         assert len({len(d.inputs) for d in batch}) == 1
-        for draw in batch:
-            assert len(set(draw.inputs)) == len(draw.inputs)
-            assert len(set(draw.targets)) == 3
-            assert not set(draw.targets) & set(draw.inputs)
+        for sample in batch:
+            assert len(set(sample.inputs)) == len(sample.inputs)
+            assert len(set(sample.targets)) == 3
+            assert not set(sample.targets) & set(sample.inputs)
     names = [d.subject for batch in batches for d in batch]
     for start in range(0, 600, 5):  # every subject once in each round
         assert sorted(names[start : start + 5]) == ["s0", "s1", "s2", "s3", "s4"]
     assert len({tuple(names[s : s + 5]) for s in range(0, 600, 5)}) > 30
     counts = np.bincount([len(batch[0].inputs) for batch in batches], minlength=6)[3:]
     assert counts.min() > 70
-    seen = np.bincount([pid for batch in batches for d in batch for pid, _ in d.inputs], minlength=16)
+    seen = np.bincount(
+        [position for batch in batches for d in batch for position, _ in d.inputs], minlength=16
+    )
     assert seen.min() > 0.6 * seen.mean()
-    assert {vid for batch in batches for d in batch for _, vid in d.targets} == {0, 2, 3, 4}
+    assert {view for batch in batches for d in batch for _, view in d.targets} == {0, 2, 3, 4}
 
 
 def test_processes_share_out_one_sequence():
-    whole = [d.subject for step in range(5) for d in draws(batch_size=4).batch(step)]
-    ranks = [[draws().batch(step, rank, 2) for step in range(5)] for rank in range(2)]
+    """Several processes train on the samples of one, each sample once."""
+    whole = [d.subject for step in range(5) for d in sampler(batch_size=4).batch(step)]
+    ranks = [[sampler().batch(step, rank, 2) for step in range(5)] for rank in range(2)]
     assert whole == [d.subject for step in range(5) for rank in range(2) for d in ranks[rank][step]]
     for one, other in zip(*ranks, strict=True):
         assert len(one[0].inputs) == len(other[0].inputs)
 
 
 def test_even_training_views_keep_their_spacing():
-    even = draws(ViewProtocol("v5", (5,), 5, "even"))
+    """views.training=even turns the ring but keeps the distances."""
+    even = sampler(ViewProtocol("v5", (5,), 5, "even"))
     starts = set()
     for step in range(60):
-        pids = [pid for pid, _ in even.batch(step)[0].inputs]
-        starts.add(pids[0])
-        assert sorted(np.diff([*pids, pids[0]]) % 16) == [3, 3, 3, 3, 4]
+        positions = [position for position, _ in even.batch(step)[0].inputs]
+        starts.add(positions[0])
+        assert sorted(np.diff([*positions, positions[0]]) % 16) == [3, 3, 3, 3, 4]
     assert len(starts) > 10
 
 
 def test_batches_have_the_shapes_and_values_they_promise(root):
+    """Shapes, types and value ranges of a batch, and what apply_mask changes."""
     data = module(root, targets={"name": "random", "per_step": 2}, target_size=[42, 35], body_vertices=5)
     batch = data.training_batch(0)
     assert batch.images.shape == (2, 4, 3, 28, 28)
@@ -184,6 +195,7 @@ def test_batches_have_the_shapes_and_values_they_promise(root):
 
 
 def test_data_without_depth_or_body_says_none(root, tmp_path):
+    """Missing depth or bodies become None, not zeros."""
     import shutil
 
     shutil.copytree(root / "train", tmp_path / "train")
@@ -239,12 +251,14 @@ def test_training_resumes_with_the_very_next_draw(root, tmp_path):
 
 
 def test_loading_processes_change_nothing(root):
+    """Batches are independent of the number of workers."""
     alone, helped = module(root), module(root, workers=2, pin_memory=False)
     for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
         assert equal(a, b)
 
 
 def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
+    """Lengths follow subjects, batch size, steps_per_epoch and limit; evaluation repeats exactly."""
     data = module(root)
     assert len(data.train_dataloader()) == 2  # 3 subjects, 2 at a time
     assert [len(batch.subjects) for batch in data.val_dataloader()] == [2]
@@ -263,7 +277,7 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
         ({"views": V4 | {"training": "odd"}}, "views.training: expected one of any, even; found 'odd'"),
         ({"views": V4 | {"trainign": "any"}}, "views key: expected one of .*; found 'trainign'"),
         ({"targets": {"name": "sideways"}}, "targets.kind: expected one of release, midway, random"),
-        ({"targets": RELEASE | {"training_vids": [7]}}, "targets.training_vids: expected some of"),
+        ({"targets": RELEASE | {"training_views": [7]}}, "targets.training_views: expected some of"),
         (
             {"targets": RELEASE | {"per_subject": 0}},
             "targets.per_subject: expected a number of at least 1 or all",
@@ -276,18 +290,21 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
     ],
 )
 def test_impossible_values_fail_at_once(root, changes, message):
+    """A wrong value or key fails when the configuration is read and is named."""
     with pytest.raises(InputError, match=message):
         module(root, **changes)
 
 
 def test_fewer_views_than_asked(root, tmp_path):
+    """Too few cameras are refused with the subject's name; listed positions help."""
     import shutil
 
     for kind in ("img", "mask", "parm", "depth"):
-        for pid in (0, 4, 9):
+        for position in (0, 4, 9):
             for phase, name in (("train", "s0"), ("val", "s3")):
                 shutil.copytree(
-                    root / phase / kind / f"{name}_{pid:03d}", tmp_path / phase / kind / f"{name}_{pid:03d}"
+                    root / phase / kind / f"{name}_{position:03d}",
+                    tmp_path / phase / kind / f"{name}_{position:03d}",
                 )
     data = module(tmp_path, batch_size=1)
     with pytest.raises(

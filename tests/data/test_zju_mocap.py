@@ -12,7 +12,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.data.reader import fit
+from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.sampling import CAMERAS
+from ghgs_lit.data.view import resize_view
 from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.reader import Split, ZJUMoCapReader
 from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
@@ -33,21 +35,23 @@ def root(tmp_path_factory) -> Path:
     return folder
 
 
-def reader(root: Path, sequence: str = "386", frames=(0, 2, 1), **options) -> ZJUMoCapReader:
-    return ZJUMoCapReader(root, [Split((sequence,), frames)], **options)
+def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> Photographs:
+    return Photographs(ZJUMoCapReader(root, [Split((sequence,), frames)], **options), size)
 
 
 def test_bodies_project_into_every_mask(root):
+    """Cameras, bodies and masks of both generations agree, after undistortion."""
     for sequence in ("386", "313"):
-        data = reader(root, sequence, cameras=None, masks=BOTH)
-        shares = [inside(data.view(n, k), data.body(n)) for n, pids in data.subjects.items() for k in pids]
+        data = photographs(root, sequence, cameras=None, masks=BOTH)
+        shares = [inside(data.view(n, k), data.body(n)) for n, ks in data.reader.subjects.items() for k in ks]
         assert len(shares) == 2 * (21 if sequence == "313" else 23)
         assert min(shares) > 0.99
 
 
 def test_translations_are_millimetres(root):
+    """Forgetting the unit would put the cameras kilometres away."""
     cams = load_npy(root / "CoreView_386" / "annots.npy")["cams"]
-    data = reader(root)
+    data = photographs(root)
     for k in (0, 11):
         view = data.view("CoreView_386_000000", k)
         np.testing.assert_allclose(view.extrinsics[:3, 3] * 1000, cams["T"][k][:, 0], rtol=1e-6)
@@ -58,41 +62,49 @@ def test_translations_are_millimetres(root):
 
 
 def test_any_label_is_the_performer(root):
-    data = reader(root, undistorted=False)
+    """Label maps have many labels; any but 0 is the performer."""
+    data = photographs(root, undistorted=False)
     labels = np.asarray(Image.open(root / "CoreView_386" / "mask_cihp" / "Camera_B1" / "000000.png"))
     assert 0 < labels.max() < 20
     np.testing.assert_array_equal(data.view("CoreView_386_000000", 0).mask, labels > 0)
 
 
 def test_label_maps_of_three_channels_are_read(root):
+    """Some real label maps have three channels; the first counts."""
     labels = Image.open(root / "CoreView_386" / "mask_cihp" / "Camera_B4" / "000000.png")
     assert labels.mode == "RGB"
-    mask = reader(root, undistorted=False).view("CoreView_386_000000", 3).mask
+    mask = photographs(root, undistorted=False).view("CoreView_386_000000", 3).mask
     np.testing.assert_array_equal(mask, np.asarray(labels)[..., 0] > 0)
 
 
 def test_masks_are_united(root):
-    parts = [reader(root, undistorted=False, masks=[m]).view("CoreView_386_000000", 5).mask for m in BOTH]
-    union = reader(root, undistorted=False, masks=BOTH).view("CoreView_386_000000", 5).mask
+    """Several folders of masks give their union."""
+    parts = [
+        photographs(root, undistorted=False, masks=[m]).view("CoreView_386_000000", 5).mask for m in BOTH
+    ]
+    union = photographs(root, undistorted=False, masks=BOTH).view("CoreView_386_000000", 5).mask
     np.testing.assert_array_equal(union, parts[0] | parts[1])
     assert union.sum() > max(part.sum() for part in parts)
 
 
 def test_a_sequence_without_the_second_folder_of_masks_is_read(root, tmp_path):
+    """A missing second folder of masks is not an error."""
     shutil.copytree(root / "CoreView_386", tmp_path / "CoreView_386")
     shutil.rmtree(tmp_path / "CoreView_386" / "mask")
-    one = reader(tmp_path, masks=BOTH).view("CoreView_386_000000", 0).mask
-    np.testing.assert_array_equal(one, reader(root).view("CoreView_386_000000", 0).mask)
+    one = photographs(tmp_path, masks=BOTH).view("CoreView_386_000000", 0).mask
+    np.testing.assert_array_equal(one, photographs(root).view("CoreView_386_000000", 0).mask)
 
 
 def test_the_background_is_black(root):
+    """The studio behind the performer must not reach the model."""
     for undistorted in (True, False):
-        view = reader(root, undistorted=undistorted).view("CoreView_386_000000", 2)
+        view = photographs(root, undistorted=undistorted).view("CoreView_386_000000", 2)
         assert view.image[~view.mask].max() == 0
         assert view.image[view.mask].max() > 60
 
 
 def test_undistortion_is_that_of_opencv():
+    """The published calibrations are OpenCV's; our undistortion agrees with stored results of it."""
     height, width = OPENCV["image"].shape[:2]
     grid = undistorting_grid(OPENCV["intrinsics"], OPENCV["distortion"].ravel(), height, width)
     image, mask = undistort(OPENCV["image"], np.ones((height, width), bool), grid)
@@ -104,16 +116,18 @@ def test_undistortion_is_that_of_opencv():
 
 
 def test_undistortion_comes_before_the_resize(root):
-    whole = reader(root).view("CoreView_386_000000", 7)
-    half = reader(root, size=(SIZE // 2, SIZE // 2)).view("CoreView_386_000000", 7)
+    """Lens coefficients belong to the stored size."""
+    whole = photographs(root).view("CoreView_386_000000", 7)
+    half = photographs(root, size=(SIZE // 2, SIZE // 2)).view("CoreView_386_000000", 7)
     mean = whole.image.reshape(SIZE // 2, 2, SIZE // 2, 2, 3).mean((1, 3))
     assert np.abs(half.image - mean).max() <= 1
-    bent = reader(root, undistorted=False).view("CoreView_386_000000", 7)
+    bent = photographs(root, undistorted=False).view("CoreView_386_000000", 7)
     assert (bent.mask != whole.mask).any()
     np.testing.assert_array_equal(bent.intrinsics, whole.intrinsics)
 
 
 def test_a_lens_without_distortion_leaves_photographs_alone(root):
+    """The resampling itself shifts nothing."""
     grid = undistorting_grid(OPENCV["intrinsics"], np.zeros(5), *OPENCV["image"].shape[:2])
     image, mask = undistort(OPENCV["image"], np.ones(OPENCV["image"].shape[:2], bool), grid)
     assert np.abs(image.astype(int) - OPENCV["image"]).max() <= 1
@@ -126,7 +140,7 @@ def test_intrinsics_fit_resized_photographs(root, tmp_path, side):
     folder = tmp_path / "CoreView_386"
     shutil.copytree(root / "CoreView_386", folder)
     cams = load_npy(folder / "annots.npy")["cams"]
-    point = reader(root).body("CoreView_386_000000").mean(0)
+    point = photographs(root).body("CoreView_386_000000").mean(0)
     local = cams["R"][0] @ point + cams["T"][0][:, 0] / 1000
     x, y = (cams["K"][0] @ local)[:2] / local[2]
     Image.fromarray(blob(SIZE, SIZE, x, y)).save(folder / "spot.png")
@@ -134,18 +148,22 @@ def test_intrinsics_fit_resized_photographs(root, tmp_path, side):
     (folder / "spot.png").rename(folder / "Camera_B1" / "000000.jpg")
     full = np.full((SIZE, SIZE), 7, np.uint8)
     Image.fromarray(full).save(folder / "mask_cihp" / "Camera_B1" / "000000.png")
-    view = reader(tmp_path, undistorted=False, size=(side, side)).view("CoreView_386_000000", 0)
+    view = photographs(tmp_path, undistorted=False, size=(side, side)).view("CoreView_386_000000", 0)
     np.testing.assert_allclose(centroid(view.image), project(view, point), atol=0.02)
 
 
 def test_halving_is_opencvs_area(root):
-    view = reader(root).view("CoreView_386_000000", 0)
+    """Downscaling agrees with OpenCV's INTER_AREA."""
+    view = photographs(root).view("CoreView_386_000000", 0)
     image = OPENCV["image"]
-    halved = fit(type(view)(image, image[..., 0] > 0, None, view.intrinsics, view.extrinsics), 24, 32).image
+    halved = resize_view(
+        type(view)(image, image[..., 0] > 0, None, view.intrinsics, view.extrinsics), 24, 32
+    ).image
     assert np.abs(halved.astype(int) - OPENCV["halved"]).max() <= 1
 
 
 def test_cameras_project_as_opencv_does():
+    """The half pixel between OpenCV's and our pixel centres is accounted for."""
     rotation, translation = OPENCV["rotation"], OPENCV["translation"]
     local = OPENCV["points"] @ rotation.T + translation
     ideal = local @ OPENCV["intrinsics"].T
@@ -159,29 +177,32 @@ def test_cameras_project_as_opencv_does():
 
 
 def test_cameras_are_the_first_so_many(root):
-    assert reader(root).subjects["CoreView_386_000000"] == tuple(range(20))
-    assert len(reader(root, cameras=None).subjects["CoreView_386_000000"]) == 23
-    assert len(reader(root, "313", cameras=None).subjects["CoreView_313_000001"]) == 21
+    """data.cameras selects the first cameras of a sequence."""
+    assert photographs(root).reader.subjects["CoreView_386_000000"] == tuple(range(20))
+    assert len(photographs(root, cameras=None).reader.subjects["CoreView_386_000000"]) == 23
+    assert len(photographs(root, "313", cameras=None).reader.subjects["CoreView_313_000001"]) == 21
 
 
 def test_old_sequences_count_frames_from_one(root):
-    data = reader(root, "313")
-    assert list(data.subjects) == ["CoreView_313_000001", "CoreView_313_000002"]
+    """313 and 315 number their frames from 1, and have 21 cameras."""
+    data = photographs(root, "313")
+    assert list(data.reader.subjects) == ["CoreView_313_000001", "CoreView_313_000002"]
     assert not (root / "CoreView_313" / "new_vertices" / "0.npy").exists()
     stored = np.load(root / "CoreView_313" / "new_vertices" / "1.npy")
     np.testing.assert_array_equal(data.body("CoreView_313_000001"), stored)
-    assert list(reader(root).subjects) == ["CoreView_386_000000", "CoreView_386_000001"]
+    assert list(photographs(root).reader.subjects) == ["CoreView_386_000000", "CoreView_386_000001"]
 
 
 @pytest.mark.parametrize("renamed", ["photographs", "masks", "both"])
 def test_old_sequences_are_read_with_long_and_short_names(root, tmp_path, renamed):
+    """Renamed files of 313 and 315 are found, too."""
     shutil.copytree(root / "CoreView_313", tmp_path / "CoreView_313")
     assert len(next((tmp_path / "CoreView_313").glob("Camera (22)/*.jpg")).stem.split("_")) == 7
     patterns = {"photographs": ["Camera*/*.jpg"], "masks": ["mask*/Camera*/*.png"]}
     for pattern in patterns.get(renamed, [*patterns["photographs"], *patterns["masks"]]):
         for path in (tmp_path / "CoreView_313").glob(pattern):
             path.rename(path.with_name(path.stem.split("_")[4] + path.suffix))
-    one, other = (reader(place, "313").view("CoreView_313_000002", 19) for place in (root, tmp_path))
+    one, other = (photographs(place, "313").view("CoreView_313_000002", 19) for place in (root, tmp_path))
     np.testing.assert_array_equal(one.image, other.image)
     np.testing.assert_array_equal(one.mask, other.mask)
 
@@ -196,21 +217,24 @@ def test_old_sequences_are_read_with_long_and_short_names(root, tmp_path, rename
     ],
 )
 def test_frame_numbers_are_of_both_generations(name, number):
+    """The frame number is read from names of both generations."""
     assert frame_number(PurePosixPath(name)) == number
 
 
 def test_names_of_windows_are_read(root, tmp_path):
+    """Some published annotations use backslashes."""
     folder = tmp_path / "CoreView_386"
     shutil.copytree(root / "CoreView_386", folder)
     content = load_npy(folder / "annots.npy")
     for frame in content["ims"]:
         frame["ims"] = [name.replace("/", "\\") for name in frame["ims"]]
     np.save(folder / "annots.npy", content)
-    assert reader(tmp_path).view("CoreView_386_000000", 0).mask.any()
+    assert photographs(tmp_path).view("CoreView_386_000000", 0).mask.any()
 
 
 @pytest.mark.parametrize("shape", [(4,), (5,), (5, 1), (1, 5)])
 def test_lens_coefficients_of_any_shape_are_read(root, tmp_path, shape):
+    """Coefficients are stored in several shapes."""
     folder = tmp_path / "CoreView_386"
     folder.mkdir()
     content = load_npy(root / "CoreView_386" / "annots.npy")
@@ -220,17 +244,18 @@ def test_lens_coefficients_of_any_shape_are_read(root, tmp_path, shape):
 
 
 def test_the_new_fit_is_preferred(root, tmp_path):
+    """The better fit is read where it exists, else the other, else none."""
     shutil.copytree(root / "CoreView_386", tmp_path / "CoreView_386")
     new = np.load(root / "CoreView_386" / "new_vertices" / "0.npy")
     old = np.load(root / "CoreView_386" / "vertices" / "0.npy")
     assert new.shape == (6890, 3)
     assert np.abs(new - old).max() > 0.002
-    np.testing.assert_array_equal(reader(root).body("CoreView_386_000000"), new)
-    np.testing.assert_array_equal(reader(root, bodies=["vertices"]).body("CoreView_386_000000"), old)
+    np.testing.assert_array_equal(photographs(root).body("CoreView_386_000000"), new)
+    np.testing.assert_array_equal(photographs(root, bodies=["vertices"]).body("CoreView_386_000000"), old)
     shutil.rmtree(tmp_path / "CoreView_386" / "new_vertices")
-    np.testing.assert_array_equal(reader(tmp_path).body("CoreView_386_000000"), old)
+    np.testing.assert_array_equal(photographs(tmp_path).body("CoreView_386_000000"), old)
     shutil.rmtree(tmp_path / "CoreView_386" / "vertices")
-    assert reader(tmp_path).body("CoreView_386_000000") is None
+    assert photographs(tmp_path).body("CoreView_386_000000") is None
 
 
 def test_parameters_place_the_body_about_the_origin(root):
@@ -246,14 +271,16 @@ def test_parameters_place_the_body_about_the_origin(root):
 
 
 def test_frames_are_places_in_the_annotations(root):
-    assert list(reader(root, frames=(1, 500, 5)).subjects) == ["CoreView_386_000001"]
-    assert list(reader(root, frames=(0, 500, 5)).subjects) == ["CoreView_386_000000"]
+    """Frames are indices, not frame numbers; an impossible start is refused."""
+    assert list(photographs(root, frames=(1, 500, 5)).reader.subjects) == ["CoreView_386_000001"]
+    assert list(photographs(root, frames=(0, 500, 5)).reader.subjects) == ["CoreView_386_000000"]
     with pytest.raises(InputError, match="expected a frame 700; found 2 frames"):
-        reader(root, frames=(700, 1000, 6))
+        photographs(root, frames=(700, 1000, 6))
 
 
 def test_the_default_split_is_sherfs(root):
-    data = build_data("zju_mocap", root)
+    """The split that the paper follows, in the shipped configuration."""
+    data = build_data("zju_mocap", root).dataset
     train, val = data.splits["train"], data.splits["val"]
     assert [s.sequences for s in train] == [("386", "387", "390", "392", "393", "394")]
     assert [s.sequences for s in val] == [("377", "313", "315")]
@@ -263,41 +290,45 @@ def test_the_default_split_is_sherfs(root):
 
 
 def test_batches_have_the_protocols_cameras(root):
+    """Inputs 0 7 15 and all 17 other cameras as targets; frames are not people."""
     data = build_data("zju_mocap", root, "data.size=64", "data.workers=0", "views=v3")
     batch = data.training_batch(0)
     assert batch.images.shape == (1, 3, 3, 64, 64)
     assert batch.targets.images.shape == (1, 1, 3, 64, 64)
     assert batch.body_vertices[0].shape == (4096, 3)
-    assert [data.people(data.reader(phase, None)) for phase in ("train", "val")] == [1, 1]
+    assert [data.dataset.reader(phase).people for phase in ("train", "val")] == [1, 1]
     samples = list(data.evaluation_loader(views=3))
     assert samples[0].views == (("000/0", "007/0", "015/0"),)
     assert [len(names) for sample in samples for names in sample.targets.names] == [17]
 
 
 def test_other_protocols_are_configurations(root):
+    """NHP's and GP-NeRF's numbers of frames and inputs."""
     nhp = build_data("zju_mocap_nhp", root)
     assert (
-        sum(len(range(*s.frames)) * len(s.sequences) for s in nhp.splits["train"])
+        sum(len(range(*s.frames)) * len(s.sequences) for s in nhp.dataset.splits["train"])
         == 60 + 67 + 10 + 100 + 50 + 54
     )
     gp_nerf = build_data("zju_mocap_gp_nerf", root)
-    assert sum(len(range(*s.frames)) * len(s.sequences) for s in gp_nerf.splits["train"]) == 1800
-    assert gp_nerf.evaluation_positions == {3: [0, 8, 16], 4: [0, 6, 12, 18], 5: [0, 4, 8, 12, 16]}
+    assert sum(len(range(*s.frames)) * len(s.sequences) for s in gp_nerf.dataset.splits["train"]) == 1800
+    assert gp_nerf.options.evaluation_positions == {3: [0, 8, 16], 4: [0, 6, 12, 18], 5: [0, 4, 8, 12, 16]}
 
 
 def test_the_same_numbers_make_the_same_miniature(root, tmp_path):
+    """A miniature is reproducible, whatever else is made."""
     make_miniature(zju_mocap, tmp_path, ["386"], SIZE, seed=3, frames=1)
     for name in ("Camera_B7/000000.jpg", "mask_cihp/Camera_B7/000000.png", "new_vertices/0.npy"):
         assert (tmp_path / "CoreView_386" / name).read_bytes() == (root / "CoreView_386" / name).read_bytes()
 
 
 def test_targets_between_cameras_that_stand_still_are_refused(root):
+    """Views that do not exist are refused before anything is read."""
     data = build_data("zju_mocap", root, "data.size=64", "data.workers=0", "targets=release")
     for draw in (
-        data.training_draws,
+        data.training_sampler,
         data.evaluation_loader,
-        partial(data.evaluation_loader, targets="midway"),
+        partial(data.evaluation_loader, targets={"name": "midway"}),
     ):
         with pytest.raises(InputError, match=r"targets: expected cameras for data=zju_mocap.*; found"):
             draw()
-    assert len(data.evaluation_loader(targets="cameras")) > 0
+    assert len(data.evaluation_loader(targets=CAMERAS)) > 0

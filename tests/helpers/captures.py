@@ -1,6 +1,8 @@
-"""What the tests of ZJU-MoCap and HuMMan share: miniatures made once, and what a view must agree with."""
+"""Shared by the tests of data sets: miniatures made once, broken files, what a view must agree with."""
 
 import functools
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,9 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.reader import View
+from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.view import View
+from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import people
 
 _person = functools.lru_cache(people.generate)
@@ -32,6 +36,26 @@ def build_data(name: str, root: Path, *overrides: str):
     cfg = _config(f"data={name}", *overrides)
     place = {} if any(o.startswith("data.root=") for o in overrides) else {"root": str(root)}
     return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0, **place)
+
+
+def stored(data, phase: str, size: tuple[int, int] | None = None) -> Photographs:
+    """The photographs of a data module, at their stored size unless ``size`` is given."""
+    return Photographs(data.dataset.reader(phase), size)
+
+
+class Malice:
+    """Runs a command when a pickle of it is read carelessly."""
+
+    def __reduce__(self):
+        return os.system, ("touch ran",)
+
+
+def refused(line: str, read: Callable[[], object]) -> None:
+    """Check that ``read`` is refused with one line that matches, and that no pickle ran in this folder."""
+    with pytest.raises(InputError, match=line) as caught:
+        read()
+    assert "\n" not in str(caught.value)
+    assert not Path("ran").exists()
 
 
 def inside(view: View, points: np.ndarray) -> float:

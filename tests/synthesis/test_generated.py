@@ -9,7 +9,9 @@ from ghgs_lit.data.sampling import (
     subject_rng,
 )
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis import ScansDataModule, SyntheticDataModule, people
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.datamodules import ScansDataModule, SyntheticDataModule
+from ghgs_lit.synthesis.jobs import RenderSettings
 from tests.helpers.people import RELEASE, RIG, V4, box_person, equal
 
 
@@ -21,6 +23,7 @@ def built(*overrides, **extra):
 @pytest.mark.parametrize("views", ["v3", "v4", "v5", "random"])
 @pytest.mark.parametrize("targets", ["release", "midway", "random"])
 def test_configuration_groups_build(views, targets, tmp_path):
+    """Every combination of views= and targets= builds; a file's values are the class's defaults."""
     data = built("data=scans", f"views={views}", f"targets={targets}")
     assert data.views.name == views
     assert data.targets.name == targets
@@ -29,9 +32,9 @@ def test_configuration_groups_build(views, targets, tmp_path):
     )
     # Evaluating another protocol by its name gives what its file says.
     by_name = TargetProtocol(targets)
-    assert (data.targets.kind, data.targets.vid, data.targets.per_subject) == (
+    assert (data.targets.kind, data.targets.view, data.targets.per_subject) == (
         by_name.kind,
-        by_name.vid,
+        by_name.view,
         by_name.per_subject,
     )
     synthetic = built(f"views={views}", f"targets={targets}", cache_dir=str(tmp_path))
@@ -39,10 +42,11 @@ def test_configuration_groups_build(views, targets, tmp_path):
 
 
 def test_configuration_of_the_rig_is_the_rigs_default():
+    """YAML and code agree about the rig; a misspelt nested key is named."""
     data = built("data=scans")
     assert isinstance(data, ScansDataModule)
-    assert data.rig == RIG
-    assert data.render == type(data.render)()
+    assert data.dataset.rig == RIG
+    assert data.dataset.render == RenderSettings()
     with pytest.raises(InputError, match=r"data\.rig key: expected one of .*; found 'raduis'"):
         built("data=scans", "+data.rig.raduis=3")
     with pytest.raises(InputError, match=r"data\.render\.lights key"):
@@ -77,6 +81,7 @@ def generated(monkeypatch):
 
 
 def test_generated_people_are_rendered_once_and_extended(tmp_path, generated):
+    """More people extend the cache; nobody is generated twice."""
     data = synthetic(tmp_path)
     with pytest.raises(InputError, match="expected the folder of the data set; found no such folder"):
         data.train_dataloader()
@@ -91,14 +96,15 @@ def test_generated_people_are_rendered_once_and_extended(tmp_path, generated):
     more = synthetic(tmp_path, people={"train": 3, "val": 1})
     more.prepare_data()
     assert generated[3:] == [(0, 2)]
-    assert more.root == data.root
+    assert more.dataset.root == data.dataset.root
     assert len(more.subjects("train")) == 3
     assert len(synthetic(tmp_path).subjects("train")) == 2
 
 
 def test_the_cache_is_named_after_every_setting(tmp_path):
+    """Different settings never share a cache; what does not change pixels does."""
     roots = [
-        synthetic(tmp_path, **changes).root
+        synthetic(tmp_path, **changes).dataset.root
         for changes in (
             {},
             {"people_seed": 1},
@@ -110,19 +116,21 @@ def test_the_cache_is_named_after_every_setting(tmp_path):
         )
     ]
     assert len(set(roots)) == len(roots)
-    assert synthetic(tmp_path, seed=5, size=14, people={"train": 9, "val": 3}).root == roots[0]
+    assert synthetic(tmp_path, seed=5, size=14, people={"train": 9, "val": 3}).dataset.root == roots[0]
 
 
 def test_generated_people_must_have_the_views_that_are_asked_for(tmp_path):
+    """Targets that were not rendered are refused at once."""
     with pytest.raises(
-        InputError, match=r"data\.render\.vids: expected \[0, 2, 3, 4\] for targets=release; found \[0\]"
+        InputError, match=r"data\.render\.views: expected \[0, 2, 3, 4\] for targets=release; found \[0\]"
     ):
-        synthetic(tmp_path, render={"size": 28, "vids": [0]})
+        synthetic(tmp_path, render={"size": 28, "views": [0]})
     with pytest.raises(InputError, match=r"data\.people\.val: expected at least 1; found 0"):
         synthetic(tmp_path, people={"train": 2})
 
 
 def test_rig_draws_do_not_depend_on_other_subjects():
+    """A subject looks the same whichever other subjects there are."""
     a, b = RIG.yaws(subject_rng(0, "a")), RIG.yaws(subject_rng(0, "b"))
     assert not np.allclose(a, b)
     np.testing.assert_array_equal(a, RIG.yaws(subject_rng(0, "a")))

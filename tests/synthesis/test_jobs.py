@@ -17,7 +17,7 @@ from ghgs_lit.synthesis.jobs import render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
 
-SMALL = replace(TINY, positions=(0, 4, 8), vids=(0, 3))
+SMALL = replace(TINY, positions=(0, 4, 8), views=(0, 3))
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -105,6 +105,7 @@ def render_at_once(barrier, root: Path, scans: Path, log: Path) -> None:
 
 
 def test_two_processes_at_once_share_the_work(scans, reference, tmp_path):
+    """Two runs on one folder neither collide nor render twice."""
     barrier, root, log = SPAWN.Barrier(2), tmp_path / "out", tmp_path / "log"
     processes = [SPAWN.Process(target=render_at_once, args=(barrier, root, scans, log)) for _ in range(2)]
     for process in processes:
@@ -146,6 +147,7 @@ def lives(pid: int) -> bool:
 
 @pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_the_process_that_started_them(scans, tmp_path, signal_number):
+    """A killed run leaves no processes behind."""
     log = tmp_path / "log"
     process = SPAWN.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
     process.start()
@@ -162,11 +164,13 @@ def test_workers_end_with_the_process_that_started_them(scans, tmp_path, signal_
 
 
 def test_several_workers_make_the_same_files(scans, reference, tmp_path):
+    """Files are independent of the number of processes."""
     render_boxes(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
     assert contents(tmp_path / "out") == reference
 
 
 def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp_path):
+    """An error loses no finished work and leaves no half subject."""
     root = tmp_path / "out"
     names = {"train": ["s0", "s1", "s2"], "val": ["s3"]}
     source = Counting(ScanSource(scans), tmp_path / "log", fail="s1")
@@ -178,6 +182,7 @@ def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp
 
 
 def test_other_settings_and_other_folders_are_refused(scans, tmp_path):
+    """Renders of different settings are never mixed, and no foreign file is touched."""
     root = tmp_path / "out"
     render_boxes(root, scans, 1, 0, settings=SMALL)
     before = contents(root)
@@ -203,24 +208,27 @@ def test_other_settings_and_other_folders_are_refused(scans, tmp_path):
     [
         ({"size": 0}, r"data\.render\.size: expected a side or"),
         ({"samples": 0}, r"data\.render\.samples: expected between 1 and 16; found 0"),
-        ({"vids": (0, 9)}, r"data\.render\.vids: expected some of"),
+        ({"views": (0, 9)}, r"data\.render\.views: expected some of"),
         ({"quality": 0}, r"data\.render\.quality"),
     ],
 )
 def test_impossible_settings_fail_at_once(changes, message):
+    """A wrong value fails before rendering starts and names its key."""
     with pytest.raises(InputError, match=message):
         replace(TINY, **changes)
 
 
 def test_positions_beyond_the_ring_are_refused(scans, tmp_path):
+    """A position that the ring lacks is refused before anything is written."""
     with pytest.raises(InputError, match=r"data\.render\.positions: expected some of 0 to 15"):
         render_boxes(tmp_path / "out", scans, 1, 0, settings=replace(TINY, positions=(0, 16)))
     assert not (tmp_path / "out").exists()
 
 
 def test_portrait_photographs(scans, tmp_path):
+    """Photographs need not be square: focal length and centre follow the height."""
     render_boxes(tmp_path / "out", scans, 1, 0, settings=replace(SMALL, size=(56, 28)))
-    view = Layout(tmp_path / "out", "train").view("s0", 0, 0)
+    view = Layout(tmp_path / "out", "train").read_view("s0", 0, 0, depth=True)
     assert view.image.shape == (56, 28, 3)
     assert view.intrinsics[0, 0] == pytest.approx(0.8 * 56)
     columns = np.flatnonzero(view.mask.any(0))

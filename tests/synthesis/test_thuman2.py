@@ -14,19 +14,20 @@ from ghgs_lit.data.overlap import overlap
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.synthesis import THuman2DataModule, people
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.datamodules import THuman2DataModule
 from ghgs_lit.synthesis.miniatures import thuman2 as miniature
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
-from ghgs_lit.synthesis.scans import read_split
 from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
 from ghgs_lit.types import Cameras
+from tests.helpers.captures import stored
 from tests.helpers.people import V4
 
 SIZE = 96
 COUNT = {"train": 1, "val": 1}
-RELEASE = {"name": "release", "training_vids": [2, 3, 4]}
+RELEASE = {"name": "release", "training_views": [2, 3, 4]}
 
 
 @pytest.fixture(scope="module")
@@ -59,30 +60,34 @@ def seen_by(view, scan=None) -> np.ndarray:
 
 def test_published_renders_have_integer_pixel_centres(rendered):
     """The person seen from the camera that was read covers exactly the mask; half a pixel off it does not."""
-    view = module(rendered).reader("train", None).view("0000", 2, 3)
+    view = stored(module(rendered), "train").view("0000", 2, 3)
     np.testing.assert_array_equal(seen_by(view), view.mask)
-    ignored = module(rendered, pixel_centers="half").reader("train", None).view("0000", 2, 3)
+    ignored = stored(module(rendered, pixel_centers="half"), "train").view("0000", 2, 3)
     assert (seen_by(ignored) != ignored.mask).sum() > 20
 
 
 def test_own_renders_have_half_pixel_centres(raw, tmp_path):
-    data = module(str(tmp_path), source=str(raw), limit={"val": 1, "train": 1}, render_workers=0)
-    data.render = type(data.render)(size=48, samples=1, vids=(0, 3), positions=(0, 1, 2, 3))
-    data.render_scans()
-    K = data.reader("train", None).view("0000", 0, 0).intrinsics
+    """pixel_centers=auto leaves the centres of our own renders alone."""
+    render = {"size": 48, "samples": 1, "views": (0, 3), "positions": (0, 1, 2, 3)}
+    limit = {"val": 1, "train": 1}
+    data = module(str(tmp_path), source=str(raw), limit=limit, render=render, render_workers=0)
+    assert data.dataset.render_missing() == 2
+    K = stored(data, "train").view("0000", 0, 0).intrinsics
     np.testing.assert_allclose(K[:2, 2], [24, 24 + 48 * 25 / 1024], atol=1e-5)
 
 
 def test_the_principal_point_is_25_pixels_of_1024_below_the_middle_and_resizes(rendered):
-    K = module(rendered).reader("train", None).view("0000", 0, 0).intrinsics
+    """The published principal point, at any size."""
+    K = stored(module(rendered), "train").view("0000", 0, 0).intrinsics
     np.testing.assert_allclose([K[0, 0], K[1, 1]], 0.8 * SIZE, rtol=1e-6)
     np.testing.assert_allclose(K[:2, 2] - 0.5, [SIZE / 2, SIZE / 2 + SIZE * 25 / 1024], atol=1e-5)
-    half = module(rendered).reader("train", (SIZE // 2, SIZE // 2)).view("0000", 0, 0).intrinsics
+    half = stored(module(rendered), "train", (SIZE // 2, SIZE // 2)).view("0000", 0, 0).intrinsics
     np.testing.assert_allclose(half[:2], K[:2] / 2, rtol=1e-6)
 
 
 def test_depth_is_inverse_and_scaled_by_2_to_the_15(rendered):
-    reader = module(rendered).reader("train", None)
+    """Published depth files unproject to the body."""
+    reader = stored(module(rendered), "train")
     view, body = reader.view("0000", 5, 0), reader.body("0000")
     height, width = view.mask.shape
     cameras = Cameras(torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width)
@@ -93,13 +98,15 @@ def test_depth_is_inverse_and_scaled_by_2_to_the_15(rendered):
 
 
 def test_every_view_sees_the_body_in_its_mask(rendered):
+    """Cameras, bodies and masks of all 80 views agree."""
     for phase in ("train", "val"):
-        reader = module(rendered).reader(phase, None)
+        photographs = stored(module(rendered), phase)
+        reader = photographs.reader
         fits = [
-            overlap(reader.body(name), reader.view(name, pid, vid))
-            for name, pids in reader.subjects.items()
-            for pid in pids
-            for vid in reader.vids(name, pid)
+            overlap(photographs.body(name), photographs.view(name, position, view))
+            for name, positions in reader.subjects.items()
+            for position in positions
+            for view in reader.views_at(name, position)
         ]
         assert len(fits) == 80
         assert min(fit.iou for fit in fits) > 0.75
@@ -107,28 +114,28 @@ def test_every_view_sees_the_body_in_its_mask(rendered):
 
 
 def test_views_between_ring_cameras(rendered):
-    """16 cameras 22.5 degrees apart; vid 1 is the next one, 3 the exact middle, 2 and 4 in the halves."""
-    reader = module(rendered).reader("train", None)
+    """16 cameras 22.5 degrees apart; view 1 is the next one, 3 the exact middle, 2 and 4 in the halves."""
+    photographs = stored(module(rendered), "train")
     yaw = {}
-    for pid in range(16):
-        for vid in range(5):
-            E = reader.view("0000", pid, vid).extrinsics.astype(np.float64)
+    for position in range(16):
+        for view in range(5):
+            E = photographs.view("0000", position, view).extrinsics.astype(np.float64)
             center = -E[:3, :3].T @ E[:3, 3]
-            yaw[pid, vid] = np.degrees(np.arctan2(center[0], center[2]))
+            yaw[position, view] = np.degrees(np.arctan2(center[0], center[2]))
             assert np.linalg.norm(center - [0, 0.85, 0]) == pytest.approx(2, abs=1e-4)
             assert center[1] == pytest.approx(0.85 + 2 * np.sin(np.radians(8)), abs=1e-4)
-    for pid in range(16):
-        turn = [(yaw[pid, vid] - yaw[pid, 0]) % 360 for vid in range(5)]
+    for position in range(16):
+        turn = [(yaw[position, view] - yaw[position, 0]) % 360 for view in range(5)]
         assert turn[1] == pytest.approx(22.5, abs=0.01)
         assert turn[3] == pytest.approx(11.25, abs=0.01)
         assert turn[2] < 11.25 < turn[4] < 22.5
-        assert (yaw[(pid + 1) % 16, 0] - yaw[pid, 1]) % 360 == pytest.approx(0, abs=0.01) or (
-            yaw[(pid + 1) % 16, 0] - yaw[pid, 1]
+        assert (yaw[(position + 1) % 16, 0] - yaw[position, 1]) % 360 == pytest.approx(0, abs=0.01) or (
+            yaw[(position + 1) % 16, 0] - yaw[position, 1]
         ) % 360 == pytest.approx(360, abs=0.01)
 
 
 def test_files_are_of_the_published_types(rendered):
-    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` is no view."""
+    """Three-channel masks of 0 and 255, 16-bit depth, 3 x 4 cameras; ``_hr`` files are not views."""
     train = rendered / "train"
     mask = np.asarray(Image.open(train / "mask/0000_004/2.png"))
     assert mask.shape == (SIZE, SIZE, 3)
@@ -136,7 +143,7 @@ def test_files_are_of_the_published_types(rendered):
     assert np.asarray(Image.open(train / "depth/0000_004/2.png")).dtype == np.uint16
     assert np.load(train / "parm/0000_004/2_extrinsic.npy").shape == (3, 4)
     assert Image.open(train / "img/0000_004/2_hr.jpg").size == (2 * SIZE, 2 * SIZE)
-    assert module(rendered).reader("train", None).vids("0000", 4) == [0, 1, 2, 3, 4]
+    assert stored(module(rendered), "train").reader.views_at("0000", 4) == [0, 1, 2, 3, 4]
 
 
 def test_the_first_camera_faces_the_person(raw):
@@ -185,6 +192,7 @@ def test_bodies_are_computed_where_the_licensed_model_is(raw, monkeypatch, tmp_p
 
 @pytest.mark.parametrize("name", ["THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "smplx_2", "smplx"])
 def test_folders_of_fits_go_by_several_names(raw, tmp_path, name):
+    """Fits are found under every published folder name, and beside each scan."""
     beside, inside = tmp_path / "a" / "scans", tmp_path / "b" / "scans"
     for scans, fits in ((beside, beside.parent / name), (inside, inside / name)):
         shutil.copytree(raw / "0000", scans / "0000")
@@ -200,6 +208,7 @@ def test_folders_of_fits_go_by_several_names(raw, tmp_path, name):
 
 
 def test_scans_without_fits_have_no_body(raw, tmp_path):
+    """Scans alone can be rendered, without bodies."""
     shutil.copytree(raw / "0000", tmp_path / "0000")
     source = THuman2Source(tmp_path, find_fits(tmp_path, None))
     assert source.load("0000").body_vertices is None
@@ -207,6 +216,7 @@ def test_scans_without_fits_have_no_body(raw, tmp_path):
 
 
 def test_fits_of_smpl_call_the_translation_transl(raw, tmp_path):
+    """Fits of either naming are read alike."""
     path = raw.parent / "THuman2.0_smplx" / "0000" / "smplx_param.pkl"
     content = pickle.loads(path.read_bytes())  # our own file
     assert type(content["translation"]).__name__ == "TrackedArray"
@@ -225,7 +235,7 @@ def test_ghgs_transform_is_applied_to_its_bodies(rendered, raw, tmp_path):
     root, scans = tmp_path / "root", tmp_path / "raw" / "THuman2.0_Release"
     shutil.copytree(rendered, root)
     shutil.copytree(raw.parent, scans.parent)
-    expected = Layout(root, "train").body("0000")
+    expected = Layout(root, "train").read_body("0000")
     shutil.rmtree(root / "train" / "smpl")
     part = THuman2Source(scans, find_fits(scans, None)).load("0000").parts[0]
     low, high = part.vertices.min(0).astype(float), part.vertices.max(0).astype(float)
@@ -241,9 +251,9 @@ def test_ghgs_transform_is_applied_to_its_bodies(rendered, raw, tmp_path):
         "move_delta_axis_2": np.array([shift[2]]),
     }
     np.save(scans / "0000" / "0000_transform.npy", transform)
-    body = module(root, source=str(scans)).reader("train", None).body("0000")
+    body = stored(module(root, source=str(scans)), "train").body("0000")
     np.testing.assert_allclose(body, expected, atol=2e-4)
-    assert module(root).reader("train", None).body("0000") is None
+    assert stored(module(root), "train").body("0000") is None
     del transform["offset"]
     np.save(scans / "0000" / "0000_transform.npy", transform)
     with pytest.raises(
@@ -253,6 +263,7 @@ def test_ghgs_transform_is_applied_to_its_bodies(rendered, raw, tmp_path):
 
 
 def test_a_split_need_not_be_that_of_the_folders(rendered, tmp_path):
+    """data.split selects across the folders train and val."""
     assert module(rendered).subjects("val") == {"0426": tuple(range(16))}
     swapped = module(rendered, split={"train": ["0426"], "val": ["0000-0400"]})
     assert list(swapped.subjects("train")) == ["0426"]
@@ -261,18 +272,6 @@ def test_a_split_need_not_be_that_of_the_folders(rendered, tmp_path):
     (tmp_path / "split_train.txt").write_text("0426\n")
     (tmp_path / "split_val.txt").write_text("0000\n")
     assert list(module(rendered, split=str(tmp_path)).subjects("val")) == ["0000"]
-
-
-def test_ranges_of_ids():
-    names = [f"{i:04d}" for i in range(0, 526, 25)]
-    split = read_split({"train": ["0000-0425"], "val": ["0426-0525"]}, names)
-    assert (len(split["train"]), len(split["val"])) == (18, 4)
-    with pytest.raises(
-        InputError, match=r"data\.split: expected disjoint train and val; found '0025' in both"
-    ):
-        read_split({"train": ["0000-0025"], "val": ["0025"]}, names)
-    with pytest.raises(InputError, match=r"data\.split: expected a list 'val'"):
-        read_split({"train": ["0000"]}, names)
 
 
 def composed(name, root, *overrides):
@@ -289,10 +288,11 @@ def composed(name, root, *overrides):
     ],
 )
 def test_named_protocols(rendered, experiment, size, inputs, targets):
+    """Each experiment= has its publication's size, inputs and targets."""
     data, cfg = composed(experiment, rendered, "data.depths=false")
-    assert data.size == (size, size)
+    assert data.options.size == (size, size)
     assert list(cfg.evaluation.targets) == [data.targets.name]
-    batch = next(iter(data.evaluation_loader(targets=data.targets.name)))
+    batch = next(iter(data.evaluation_loader(targets=data.targets)))
     assert list(batch.views[0]) == inputs
     assert list(batch.targets.names[0]) == targets
     assert batch.images.shape[-2:] == (size, size)
@@ -304,5 +304,6 @@ def test_named_protocols(rendered, experiment, size, inputs, targets):
 
 @pytest.mark.parametrize(("views", "inputs"), [(3, [0, 5, 10]), (4, [0, 4, 8, 12]), (5, [0, 3, 6, 9, 12])])
 def test_three_to_five_views(rendered, views, inputs):
+    """Other numbers of inputs are evenly spaced."""
     batch = next(iter(module(rendered).evaluation_loader(views)))
-    assert list(batch.views[0]) == [f"{pid:03d}/0" for pid in inputs]
+    assert list(batch.views[0]) == [f"{position:03d}/0" for position in inputs]

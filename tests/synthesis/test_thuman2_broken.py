@@ -12,7 +12,7 @@ from PIL import Image
 
 from ghgs_lit.data.check import inspect, show, split_line, write
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis import THuman2DataModule
+from ghgs_lit.synthesis.datamodules import THuman2DataModule
 from ghgs_lit.synthesis.miniatures import thuman2 as miniature
 from tests.data.test_pickles import Call
 from tests.helpers.people import V4
@@ -41,7 +41,7 @@ def module(folder, **changes) -> THuman2DataModule:
     arguments = {
         "root": str(folder / "root"),
         "views": V4,
-        "targets": {"name": "release", "training_vids": [3]},
+        "targets": {"name": "release", "training_views": [3]},
         "size": SIZE,
         "name": "thuman2",
         "rig": {"positions": 4},
@@ -222,6 +222,7 @@ RAW = {
 
 
 def test_sound_data_is_clean(folder, tmp_path, capsys):
+    """Intact data has no problems; tables, check.json and the contact sheet are written."""
     report = inspect(module(folder, source=str(folder / "raw/THuman2.0_Release")))
     assert report.problems == []
     assert report.notes == [
@@ -243,6 +244,7 @@ def test_sound_data_is_clean(folder, tmp_path, capsys):
 
 @pytest.mark.parametrize("kind", RENDERED)
 def test_broken_renders(folder, kind):
+    """Each defect of a render is found by task=check and reported once."""
     damage, pattern = RENDERED[kind]
     damage(folder)
     problems = inspect(module(folder)).problems
@@ -254,6 +256,7 @@ def test_broken_renders(folder, kind):
 
 @pytest.mark.parametrize("kind", RAW)
 def test_broken_scans(folder, kind, monkeypatch):
+    """Each defect of a scan or fit is found by task=check and reported once; pickles run nothing."""
     monkeypatch.chdir(folder)
     damage, pattern = RAW[kind]
     damage(folder)
@@ -265,6 +268,7 @@ def test_broken_scans(folder, kind, monkeypatch):
 
 
 def test_an_id_of_a_split_that_is_not_there(folder):
+    """A split that names a missing subject is reported, and stops training."""
     split = {"train": ["0000", "0001"], "val": ["0426"]}
     assert inspect(module(folder, split=split)).problems == [
         f"{folder}/root/train/img/0001_000: expected a whole subject; found none, or a half-rendered one"
@@ -274,19 +278,22 @@ def test_an_id_of_a_split_that_is_not_there(folder):
 
 
 def test_a_folder_of_fits_that_is_not_there(folder):
+    """A wrong data.fits is named instead of being ignored."""
     data = module(folder, source=str(folder / "raw/THuman2.0_Release"), fits=str(folder / "none"))
     with pytest.raises(
         InputError, match=r"none: expected the folder of the SMPL-X fits; found no such folder"
     ):
-        data.scans()
+        data.dataset.scans()
 
 
 def test_loading_processes_find_the_same(folder):
+    """task=check reports the same with several workers."""
     RENDERED["mask empty"][0](folder)
     assert inspect(module(folder, workers=2)).problems == inspect(module(folder)).problems
 
 
 def test_a_few_vertices_are_no_silhouette(folder):
+    """A body of too few vertices is not mistaken for a wrong camera."""
     body(folder, lambda v: v[:100])
     report = inspect(module(folder))
     assert report.problems == []

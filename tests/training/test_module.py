@@ -16,6 +16,7 @@ from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress, StepTime
 from ghgs_lit.training.checkpoints import Checkpoints
 from ghgs_lit.training.validation_pictures import Pictures
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 from tests.helpers.training import Standin, example_batch, flat_renderer
 
 RELEASE = Optimization(lr=1e-4, warmup=0.01, start_factor=0.04, end_factor=5e-4)

@@ -1,5 +1,1 @@
-"""HuMMan-Recon v1.0: one performer among ten Kinects, as it is downloaded."""
-
-from ghgs_lit.data.humman.datamodule import HuMManDataModule
-
-__all__ = ["HuMManDataModule"]
+"""HuMMan-Recon v1.0: one performer among ten Kinects, read as it is downloaded."""

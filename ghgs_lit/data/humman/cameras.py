@@ -11,27 +11,36 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.data.reader import check_array, check_extrinsics, check_intrinsics
+from ghgs_lit.data.decoding import check_array, check_extrinsics, check_intrinsics
 from ghgs_lit.errors import InputError
 
 KINECTS = range(10)
-# Metres: cameras of one studio stand neither nearer together nor further apart.
+# Metres: least and greatest plausible distance between cameras of one studio.
 _NEAREST, _FURTHEST = 0.1, 100.0
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Ten cameras: ``intrinsics`` [10, 3, 3], centres at integers; ``extrinsics`` [10, 4, 4] in metres."""
+    """Ten cameras.
+
+    Attributes:
+        intrinsics: [10, 3, 3] in pixels, pixel centres at integers.
+        extrinsics: [10, 4, 4], world to camera, metres.
+    """
 
     intrinsics: np.ndarray
     extrinsics: np.ndarray
 
 
 def read_calibration(path: Path, kind: str) -> Calibration:
-    """The ``color`` or ``depth`` cameras of a ``cameras.json``.
+    """Read the cameras of a sequence.
+
+    Args:
+        path: its ``cameras.json``.
+        kind: ``color`` or ``depth``.
 
     Raises:
-        InputError: it is missing or broken, lacks a camera, or one is bad or not in metres.
+        InputError: it is missing or broken, a camera is missing or bad, or translations are not in metres.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected the cameras of a sequence; found no such file")

@@ -1,23 +1,32 @@
-"""Points of the performer's surface from the depth cameras: what can stand in for a body's vertices."""
+"""Points of the performer's surface from the depth cameras: a replacement for the vertices of a body."""
 
 from pathlib import Path
 
 import numpy as np
 
+from ghgs_lit.data.decoding import read_image
 from ghgs_lit.data.humman.cameras import KINECTS, Calibration
-from ghgs_lit.data.reader import read_image
 from ghgs_lit.errors import InputError
 
 MILLIMETRES = 1000.0
-_FURTHEST = 5.0  # metres: what the toolbox cuts off, too
-# Kept of all points: a multiple of what a loss uses, evenly over the cameras.
+_FURTHEST = 5.0  # metres: the limit of the data set's own toolbox, too
+# Number of points that are kept, evenly over the cameras: a multiple of what a loss uses.
 _KEPT = 20000
 
 
 def surface_points(
     sequence: Path, frame: int, depth_cameras: Calibration, cameras: Calibration, masks: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """[n, 3] float32 in the world: what the depth cameras see inside all ``masks`` (by colour camera).
+    """What the depth cameras see inside all masks.
+
+    Args:
+        sequence: folder of the sequence.
+        frame: number of the frame.
+        depth_cameras, cameras: calibrations of the depth and of the colour cameras.
+        masks: [h, w] bool by number of the colour camera.
+
+    Returns:
+        [n, 3] float32 in the world, metres.
 
     Raises:
         InputError: a depth map is missing or bad, or no point lies inside the masks.
@@ -37,7 +46,7 @@ def _path(sequence: Path, kinect: int, frame: int) -> Path:
 
 
 def _points(path: Path, cameras: Calibration, kinect: int) -> np.ndarray:
-    """[n, 3] in the world of all pixels of one depth map that have a depth."""
+    """World points [n, 3] of all pixels of a depth map that have a depth."""
     depth = np.asarray(read_image(path))
     if depth.ndim != 2 or depth.dtype == np.uint8:
         raise InputError(
@@ -54,7 +63,7 @@ def _points(path: Path, cameras: Calibration, kinect: int) -> np.ndarray:
 def _inside(
     points: np.ndarray, kinect: int, cameras: Calibration, masks: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """Those that no mask excludes and one sees; the nearest camera is asked first: it excludes the most."""
+    """Points that no mask excludes and one includes; the own camera comes first: it excludes the most."""
     seen = np.zeros(len(points), bool)
     for k in sorted(masks, key=lambda k: k != kinect):
         pose, (height, width) = cameras.extrinsics[k], masks[k].shape

@@ -1,23 +1,25 @@
 """Photographs of HuMMan-Recon v1.0 sequences as they were downloaded.
 
 ``<root>/p<subject>_a<action>/`` holds, for the Kinects 000 to 009 and frames that are multiples of 6,
-``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` of the same names (matting: any value
-but 0 is the performer), for the test sequences ``kinect_mask_manual/``, ``kinect_depth/`` (640 x 576,
-millimetres, frame of the depth camera), ``smpl_params/<frame>.npz`` and ``cameras.json``. Some frames lack.
+``kinect_color/kinect_<k>/<frame>.png`` (1920 x 1080), ``kinect_mask/`` with the same names (matting: any
+value but 0 is the performer), for the test sequences ``kinect_mask_manual/``, ``kinect_depth/`` (640 x 576,
+millimetres, frame of the depth camera), ``smpl_params/<frame>.npz`` and ``cameras.json``. Some frames are
+missing.
 """
 
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from ghgs_lit.data.decoding import check_center, check_name, read_image, read_map, to_rgb
 from ghgs_lit.data.humman.cameras import KINECTS, Calibration, read_calibration
 from ghgs_lit.data.humman.depth import surface_points
 from ghgs_lit.data.humman.smpl import Body, read_parameters
-from ghgs_lit.data.reader import Reader, View, check_centre, check_name, opencv_view, read_image, read_map
+from ghgs_lit.data.reader import FrameReader
+from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -32,21 +34,22 @@ class _Frame:
     number: int
 
 
-class HuMManReader(Reader):
+class HuMManReader(FrameReader):
     """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
 
     Args:
         folder: root of the data set.
-        sequences: names of folders; those that are not there are left out.
+        sequences: names of folders; missing ones are left out.
         frames: numbers of frames; those that a sequence lacks are left out, and of a frame the cameras.
         masks: folder of masks, ``kinect_mask`` or ``kinect_mask_manual``.
         body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
             cameras inside all masks; ``none``.
-        limit: of all frames, the first so many.
-        size, cache_mb, strict: as for :class:`Reader`.
+        smpl_model: the model's file, or a folder that has it.
+        limit: number of frames in all, the first ones (None: all).
+        strict: as for :class:`Reader`.
 
     Raises:
-        InputError: none of the sequences is there, cameras are bad, or the body model cannot be had.
+        InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
     """
 
     def __init__(
@@ -58,103 +61,88 @@ class HuMManReader(Reader):
         body: str = "none",
         smpl_model: Path | None = None,
         limit: int | None = None,
-        **options: Any,
+        strict: bool = True,
     ) -> None:
-        super().__init__(**options)
+        super().__init__(strict)
         self.masks, self.body_kind = masks, body
-        self._frames: dict[str, _Frame] = {}
         self._body: Body | None = None
         if body == "smpl":
-            self._load_model(smpl_model)
-        there = [path for name in sequences if (path := folder / name).is_dir()]
-        if len(there) < len(sequences):
-            log.warning("%s: %d of %d sequences are there", folder, len(there), len(sequences))
-        if not there:
-            self.problem(f"{folder}: expected sequences such as p000455_a000986; found none of the split")
-        for path in there:
-            self._add(path, frames)
+            with self.collecting():
+                self._body = _load_model(smpl_model)
+        for name in self.existing(folder, sequences, "p000455_a000986"):
+            with self.collecting():
+                self._add(folder / name, frames)
         self.subjects = dict(list(self.subjects.items())[:limit])
 
-    @property
-    def sequences(self) -> set[str]:
-        """Names of the sequences that the subjects are frames of."""
-        return {self._frames[name].folder.name for name in self.subjects}
-
-    def _load_model(self, path: Path | None) -> None:
-        try:
-            if path is None:
-                raise InputError(
-                    "data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl for body=smpl; found null "
-                    "(body=depth takes points of the depth cameras in its place; body=none with "
-                    "loss.weights.chamfer=0 trains without)"
-                )
-            self._body = Body(path)
-        except InputError as error:
-            self.problem(str(error))
-
     def _add(self, path: Path, frames: Sequence[int]) -> None:
-        """The frames of one sequence that are there, with the cameras that have them."""
-        try:
-            cameras = read_calibration(path / "cameras.json", "color")
-            there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
-            found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
-            found = {number: pids for number, pids in found.items() if pids}
-            if not found:
-                raise InputError(
-                    f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "
-                    f"{len(frames)} (frame numbers are multiples of 6)"
-                )
-        except InputError as error:
-            self.problem(str(error))
-            return
+        """Add the frames of one sequence that exist, with the cameras that have them."""
+        cameras = read_calibration(path / "cameras.json", "color")
+        there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
+        found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
+        found = {number: positions for number, positions in found.items() if positions}
+        if not found:
+            raise InputError(
+                f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "
+                f"{len(frames)} (frame numbers are multiples of 6)"
+            )
         if len(found) < len(frames):
             log.info("%s: %d of %d frames are there", path, len(found), len(frames))
-        for number, pids in found.items():
-            if len(pids) < len(KINECTS):
-                lacking = sorted(set(KINECTS) - set(pids))
+        for number, positions in found.items():
+            if len(positions) < len(KINECTS):
+                lacking = sorted(set(KINECTS) - set(positions))
                 log.warning("%s: frame %06d lacks kinects %s, left out", path, number, lacking)
             name = check_name(f"{path.name}_{number:06d}")
-            self._frames[name] = _Frame(path, cameras, number)
-            self.subjects[name] = pids
+            self.frames[name] = _Frame(path, cameras, number)
+            self.subjects[name] = positions
 
-    def read_view(self, name: str, pid: int, vid: int, depth: bool) -> View:
-        frame = self._frames[name]
-        path = _file(frame.folder, "kinect_color", pid, frame.number)
-        image = np.asarray(read_image(path).convert("RGB"))
-        mask = self._mask(frame, pid, image.shape[:2])
-        intrinsics = frame.cameras.intrinsics[pid]
-        check_centre(path, intrinsics, *image.shape[:2])
-        return opencv_view(image, mask, intrinsics, frame.cameras.extrinsics[pid])
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        frame = self.frames[name]
+        path = _file(frame.folder, "kinect_color", position, frame.number)
+        image = to_rgb(read_image(path))
+        mask = self._mask(frame, position, image.shape[:2])
+        intrinsics = frame.cameras.intrinsics[position]
+        check_center(path, intrinsics, *image.shape[:2])
+        return opencv_view(image, mask, intrinsics, frame.cameras.extrinsics[position])
 
     def read_body(self, name: str) -> np.ndarray | None:
-        frame = self._frames[name]
+        frame = self.frames[name]
         if self.body_kind == "depth":
-            masks = {pid: self._mask(frame, pid) for pid in self.subjects[name]}
+            masks = {position: self._mask(frame, position) for position in self.subjects[name]}
             depth_cameras = read_calibration(frame.folder / "cameras.json", "depth")
             return surface_points(frame.folder, frame.number, depth_cameras, frame.cameras, masks)
         if self._body is None:
             return None
         return self._body.vertices(read_parameters(frame.folder / "smpl_params" / f"{frame.number:06d}.npz"))
 
-    def place(self, name: str, pid: int, vid: int) -> str:
-        frame = self._frames[name]
-        return str(_file(frame.folder, self.masks, pid, frame.number))
+    def place(self, name: str, position: int, view: int) -> str:
+        frame = self.frames[name]
+        return str(_file(frame.folder, self.masks, position, frame.number))
 
-    def _mask(self, frame: _Frame, pid: int, size: tuple[int, int] | None = None) -> np.ndarray:
+    def _mask(self, frame: _Frame, position: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """Where the matting has any value."""
-        path = _file(frame.folder, self.masks, pid, frame.number)
+        path = _file(frame.folder, self.masks, position, frame.number)
         if size is None:
             image = read_image(path)
             size = (image.height, image.width)
         return read_map(path, size) != 0
 
 
-def _file(folder: Path, kind: str, pid: int, number: int) -> Path:
-    return folder / kind / f"kinect_{pid:03d}" / f"{number:06d}.png"
+def _load_model(path: Path | None) -> Body:
+    if path is None:
+        raise InputError(
+            "data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl for body=smpl; found null "
+            "(body=depth takes points of the depth cameras in its place; body=none with "
+            "loss.weights.chamfer=0 trains without)"
+        )
+    return Body(path)
+
+
+def _file(folder: Path, kind: str, kinect: int, number: int) -> Path:
+    return folder / kind / f"kinect_{kinect:03d}" / f"{number:06d}.png"
 
 
 def _frames_of(folder: Path) -> set[int]:
-    """Numbers of the photographs in a folder; none where there is no folder."""
+    """Numbers of the photographs in a folder; none if the folder is missing."""
     if not folder.is_dir():
         return set()
     return {int(p.stem) for p in folder.iterdir() if p.suffix == ".png" and p.stem.isdecimal()}

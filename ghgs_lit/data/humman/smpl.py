@@ -1,8 +1,8 @@
 """Bodies from SMPL parameters, for those who have the licensed model.
 
-HuMMan stores parameters, not vertices: they take SMPL_NEUTRAL and the package ``smplx``. The model file is
-read without running it: pickles of the official release name chumpy and SciPy classes, for which harmless
-stand-ins keep the arrays.
+HuMMan stores parameters, not vertices: vertices need SMPL_NEUTRAL and the package ``smplx``. The model file
+is read without running it: pickles of the official release name chumpy and SciPy classes, which are replaced
+by harmless classes that keep the arrays.
 """
 
 import contextlib
@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from scipy import sparse
 
+from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
-from ghgs_lit.data.reader import check_array
 from ghgs_lit.errors import InputError
 
 VERTICES = 6890
@@ -36,14 +36,14 @@ _FILES = ("smpl/SMPL_NEUTRAL.pkl", "smpl/SMPL_NEUTRAL.npz", "SMPL_NEUTRAL.pkl", 
 
 
 class _Chumpy:
-    """Stands in for ``chumpy.ch.Ch``: an array under ``x``."""
+    """Replaces ``chumpy.ch.Ch``: an array under ``x``."""
 
     def __setstate__(self, state: dict) -> None:
         self.array = np.asarray(state["x"])
 
 
 class _Sparse:
-    """Stands in for SciPy's compressed column matrices."""
+    """Replaces SciPy's compressed column matrices."""
 
     def __setstate__(self, state: dict) -> None:
         parts = (state["data"], state["indices"], state["indptr"])
@@ -51,13 +51,13 @@ class _Sparse:
 
 
 def _reconstruct(kind: type, base: type, state: Any) -> object:
-    """How protocols below 2 make objects; only stand-ins are made."""
+    """How protocols below 2 make objects; only the replacements above are made."""
     if kind not in (_Chumpy, _Sparse):
         raise pickle.UnpicklingError(f"an object of {kind!r}")
     return kind.__new__(kind)
 
 
-_STAND_INS = {
+_REPLACEMENTS = {
     ("chumpy.ch", "Ch"): _Chumpy,
     **{(f"scipy.sparse.{module}", "csc_matrix"): _Sparse for module in ("csc", "_csc")},
     **{(module, "_reconstructor"): _reconstruct for module in ("copy_reg", "copyreg")},
@@ -66,7 +66,7 @@ _STAND_INS = {
 
 
 def model_file(path: Path) -> Path:
-    """The model at ``path``: the file itself, or a folder that has it under one of its usual names.
+    """The model's file: ``path`` itself, or one of the usual names in the folder ``path``.
 
     Raises:
         InputError: there is none.
@@ -82,13 +82,13 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an SMPL model file.
 
     Raises:
-        InputError: it is missing, names anything that could run, or an array lacks or has another shape.
+        InputError: it is missing, names anything that could run, or an array is missing or has another shape.
     """
     if path.suffix == ".npz":
         with _opened(path) as archive:
             content = {key: archive[key] for key in _SHAPES if key in archive}
     else:
-        content = load_pickle(path, also=_STAND_INS)
+        content = load_pickle(path, also=_REPLACEMENTS)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected the arrays of an SMPL model; found {type(content).__name__}")
     arrays = {key: getattr(content.get(key), "array", content.get(key)) for key in _SHAPES}
@@ -99,7 +99,7 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
     """Parameters of one frame, each a vector of float64.
 
     Raises:
-        InputError: the file is missing or broken, or a vector lacks, has another length or is not finite.
+        InputError: the file is missing or broken; a vector is missing, has another length or is not finite.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected SMPL parameters; found no such file")
@@ -113,11 +113,11 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _opened(path: Path):
-    """An ``.npz``; whatever is wrong with it, inside the block too, becomes an InputError."""
+    """Open an ``.npz``; every error, also one inside the block, becomes an InputError."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             yield archive
-    except Exception as error:  # zipfile, zlib and NumPy raise whatever they like
+    except Exception as error:  # zipfile, zlib and NumPy raise many types
         raise InputError(f"{path}: expected an .npz file of arrays; found {error}") from error
 
 

@@ -1,5 +1,1 @@
-"""ZJU-MoCap: one performer among 21 or 23 cameras, as it is downloaded."""
-
-from ghgs_lit.data.zju_mocap.datamodule import ZJUMoCapDataModule
-
-__all__ = ["ZJUMoCapDataModule"]
+"""ZJU-MoCap: one performer among 21 or 23 cameras, read as it is downloaded."""

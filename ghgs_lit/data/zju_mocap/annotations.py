@@ -2,7 +2,7 @@
 
 A pickled dictionary in an array without dimensions: ``cams`` with lists ``K`` (3, 3), ``D`` (4 or 5
 coefficients in any shape), ``R`` (3, 3), ``T`` (3, 1) in **millimetres**, world to camera; ``ims`` with a
-dictionary a frame, whose ``ims`` are the paths of its photographs in the order of the cameras. Of the
+dictionary for each frame, whose ``ims`` are the paths of its photographs in the order of the cameras. In the
 sequences 313 and 315 these are the original long names, whose fifth field is the frame number from 1.
 """
 
@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from ghgs_lit.data.decoding import check_array, check_extrinsics, check_intrinsics
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.data.reader import check_array, check_extrinsics, check_intrinsics
 from ghgs_lit.errors import InputError
 
 MILLIMETRES = 1000.0
-# Cameras that stand nearer together than this were not given in millimetres, metres.
+# Metres: cameras that are all closer together than this were not given in millimetres.
 _NEAREST = 0.1
 
 
@@ -26,8 +26,11 @@ _NEAREST = 0.1
 class Annotations:
     """Cameras of one sequence and the photographs of its frames.
 
-    ``intrinsics`` [n, 3, 3] as calibrated (centres at integers), ``distortions`` n vectors,
-    ``extrinsics`` [n, 4, 4] world to camera in metres, ``frames[f][k]`` the path of camera k at frame f.
+    Attributes:
+        intrinsics: [n, 3, 3] in pixels as calibrated, pixel centres at integers.
+        distortions: for each camera the coefficients k1 k2 p1 p2 (k3).
+        extrinsics: [n, 4, 4], world to camera, metres.
+        frames: ``frames[f][k]`` is the path of camera k at frame f.
     """
 
     intrinsics: np.ndarray
@@ -37,7 +40,7 @@ class Annotations:
 
 
 def read_annotations(path: Path) -> Annotations:
-    """The checked content of an ``annots.npy``.
+    """Read and check an ``annots.npy``.
 
     Raises:
         InputError: it is missing, unsafe or broken; a camera or a name is bad.
@@ -72,10 +75,10 @@ def read_annotations(path: Path) -> Annotations:
 
 
 def frame_number(name: PurePath) -> int:
-    """The number in the name of a photograph, which names the body's files too.
+    """The frame number in the name of a photograph; the files of bodies are named after it.
 
     Raises:
-        InputError: the name is of neither generation.
+        InputError: the name has neither of the two known forms.
     """
     field = frame_field(name)
     if not field.isdecimal():
@@ -86,7 +89,7 @@ def frame_number(name: PurePath) -> int:
 
 
 def frame_field(name: PurePath) -> str:
-    """The part of a name that says the frame: all of ``000012``, ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
+    """The frame number as it is in a name: ``000012``, or ``0001`` of ``…_Camera_(1)_0001_2019-…``."""
     fields = name.stem.split("_")
     return fields[4] if len(fields) > 4 else name.stem
 

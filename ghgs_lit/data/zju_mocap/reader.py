@@ -10,20 +10,13 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
-from ghgs_lit.data.reader import (
-    Reader,
-    View,
-    check_centre,
-    check_name,
-    opencv_view,
-    read_array,
-    read_image,
-    read_map,
-)
+from ghgs_lit.config.settings import set_fields
+from ghgs_lit.data.decoding import check_center, check_name, read_array, read_image, read_map, to_rgb
+from ghgs_lit.data.reader import FrameReader
+from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
 from ghgs_lit.errors import InputError, require
@@ -35,17 +28,19 @@ BODY_VERTICES = 6890
 
 @dataclass(frozen=True)
 class Split:
-    """``sequences`` (ids) with the frames ``range(*frames)`` of each: places in its ``annots.npy``, from 0.
+    """Some frames of some sequences.
 
-    A sequence that is shorter gives those that it has, as in the published loaders.
+    Attributes:
+        sequences: ids, such as 377.
+        frames: [start, stop, step] of the indices in ``annots.npy``, from 0. A shorter sequence gives the
+            frames that it has, as in the published loaders.
     """
 
     sequences: tuple[str, ...]
     frames: tuple[int, int, int]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "sequences", tuple(map(str, self.sequences)))
-        object.__setattr__(self, "frames", tuple(self.frames))
+        set_fields(self, sequences=tuple(map(str, self.sequences)), frames=tuple(self.frames))
         require(len(self.sequences) > 0, "data.splits.sequences", "ids such as 377", list(self.sequences))
         start, stop, step = self.frames if len(self.frames) == 3 else (-1, 0, 0)
         valid = 0 <= start < stop and step >= 1
@@ -63,23 +58,23 @@ class _Frame:
         return frame_number(self.folder / self.annotations.frames[self.index][0])
 
 
-class ZJUMoCapReader(Reader):
+class ZJUMoCapReader(FrameReader):
     """Frames of ``splits``, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
+
+    Missing sequences are left out (``ghgs prepare task=check`` counts them).
 
     Args:
         folder: root of the data set.
         splits: which sequences and frames.
-        cameras: the first so many of each sequence (None: all 21 or 23).
-        undistorted: take the lens distortion out of photographs and masks.
-        masks: folders whose label maps are united, those that a sequence has.
-        bodies: folders of vertices, the first that a sequence has.
-        limit: of all frames, the first so many.
-        size, cache_mb, strict: as for :class:`Reader`.
-
-    Sequences that are not there are left out (``ghgs prepare task=check`` counts them).
+        cameras: number of cameras used of each sequence, the first ones (None: all 21 or 23).
+        undistorted: remove the lens distortion of photographs and masks.
+        masks: folders of label maps; those that a sequence has are united.
+        bodies: folders of vertices; the first that a sequence has is read.
+        limit: number of frames in all, the first ones (None: all).
+        strict: as for :class:`Reader`.
 
     Raises:
-        InputError: none of the sequences is there, or annotations are bad.
+        InputError: all sequences are missing, or annotations are bad.
     """
 
     def __init__(
@@ -91,73 +86,61 @@ class ZJUMoCapReader(Reader):
         masks: Sequence[str] = ("mask_cihp",),
         bodies: Sequence[str] = ("new_vertices", "vertices"),
         limit: int | None = None,
-        **options: Any,
+        strict: bool = True,
     ) -> None:
-        super().__init__(**options)
+        super().__init__(strict)
         self.undistorted, self.masks, self.bodies = undistorted, tuple(masks), tuple(bodies)
-        self._frames: dict[str, _Frame] = {}
-        wanted = [(folder / f"CoreView_{s}", split.frames) for split in splits for s in split.sequences]
-        there = [(path, frames) for path, frames in wanted if path.is_dir()]
-        if len(there) < len(wanted):
-            log.warning("%s: %d of %d sequences are there", folder, len(there), len(wanted))
-        if not there:
-            self.problem(f"{folder}: expected sequences such as {wanted[0][0].name}; found none of the split")
-        for path, frames in there:
-            self._add(path, frames, cameras)
+        wanted = [(f"CoreView_{s}", split.frames) for split in splits for s in split.sequences]
+        there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
+        for name, frames in wanted:
+            if name in there:
+                with self.collecting():
+                    self._add(folder / name, frames, cameras)
         self.subjects = dict(list(self.subjects.items())[:limit])
 
-    @property
-    def sequences(self) -> set[str]:
-        """Names of the sequences that the subjects are frames of."""
-        return {self._frames[name].folder.name for name in self.subjects}
-
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
-        """The chosen frames of one sequence."""
-        try:
-            annotations = read_annotations(path / "annots.npy")
-            count = len(annotations.intrinsics)
-            if cameras is not None and cameras > count:
-                raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
-            wanted = range(*frames)
-            chosen = [index for index in wanted if index < len(annotations.frames)]
-            if not chosen:
-                raise InputError(
-                    f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
-                    f"found {len(annotations.frames)} frames"
-                )
-            found = [_Frame(path, annotations, index) for index in chosen]
-            named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in found}
-        except InputError as error:
-            self.problem(str(error))
-            return
+        """Add the chosen frames of one sequence."""
+        annotations = read_annotations(path / "annots.npy")
+        count = len(annotations.intrinsics)
+        if cameras is not None and cameras > count:
+            raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
+        wanted = range(*frames)
+        chosen = [index for index in wanted if index < len(annotations.frames)]
+        if not chosen:
+            raise InputError(
+                f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
+                f"found {len(annotations.frames)} frames"
+            )
+        found = [_Frame(path, annotations, index) for index in chosen]
+        named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in found}
         if len(chosen) < len(wanted):
             log.info("%s: %d of %d frames (the sequence is shorter)", path, len(chosen), len(wanted))
-        self._frames |= named
+        self.frames |= named
         self.subjects |= dict.fromkeys(named, tuple(range(count if cameras is None else cameras)))
 
-    def read_view(self, name: str, pid: int, vid: int, depth: bool) -> View:
-        frame = self._frames[name]
-        photograph = frame.annotations.frames[frame.index][pid]
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        frame = self.frames[name]
+        photograph = frame.annotations.frames[frame.index][position]
         path = _find(frame.folder, photograph, photograph.suffix)
-        image = np.asarray(read_image(path).convert("RGB"))
+        image = to_rgb(read_image(path))
         mask = self._mask(frame.folder, photograph, image.shape[:2])
-        intrinsics = frame.annotations.intrinsics[pid]
-        check_centre(path, intrinsics, *image.shape[:2])
+        intrinsics = frame.annotations.intrinsics[position]
+        check_center(path, intrinsics, *image.shape[:2])
         if self.undistorted:
-            grid = undistorting_grid(intrinsics, frame.annotations.distortions[pid], *image.shape[:2])
+            grid = undistorting_grid(intrinsics, frame.annotations.distortions[position], *image.shape[:2])
             image, mask = undistort(image, mask, grid)
-        return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[pid])
+        return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[position])
 
     def read_body(self, name: str) -> np.ndarray | None:
-        frame = self._frames[name]
+        frame = self.frames[name]
         folder = next((f for b in self.bodies if (f := frame.folder / b).is_dir()), None)
         if folder is None:
             return None
         return read_array(folder / f"{frame.number}.npy", [(BODY_VERTICES, 3)]).astype(np.float32)
 
-    def place(self, name: str, pid: int, vid: int) -> str:
-        frame = self._frames[name]
-        photograph = frame.annotations.frames[frame.index][pid]
+    def place(self, name: str, position: int, view: int) -> str:
+        frame = self.frames[name]
+        photograph = frame.annotations.frames[frame.index][position]
         return str(_find(self._mask_folders(frame.folder)[0], photograph, ".png"))
 
     def _mask_folders(self, folder: Path) -> list[Path]:
@@ -173,7 +156,7 @@ class ZJUMoCapReader(Reader):
 
 
 def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
-    """A file of a photograph under its own name, or under its frame field alone (313 and 315, renamed)."""
+    """A photograph's file: under its own name, or under its frame field alone (313 and 315, renamed)."""
     path = folder / photograph.with_suffix(suffix)
     renamed = path.with_name(frame_field(photograph) + suffix)
     return renamed if not path.exists() and renamed.exists() else path

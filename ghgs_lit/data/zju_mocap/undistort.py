@@ -1,7 +1,7 @@
-"""Taking lens distortion out of photographs and masks, as OpenCV's ``undistort`` does.
+"""Removes lens distortion from photographs and masks, as OpenCV's ``undistort`` does.
 
-The calibration's own convention holds in this file: pixel centres at integers. OpenCV itself is no
-dependency; kornia has its camera model.
+Pixel centres are at integers in this file, as in the calibration. OpenCV itself is not a dependency; kornia
+has its camera model.
 """
 
 import numpy as np
@@ -9,32 +9,41 @@ import torch
 import torch.nn.functional as F
 from kornia.geometry.calibration import distort_points
 
-# The model is evaluated so many pixels apart and linear between: wrong by less than 0.01 px.
+# Pixels between evaluations of the model; it is interpolated linearly, with errors below 0.01 px.
 _STEP = 8
 
 
 def undistorting_grid(
     intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int
 ) -> torch.Tensor:
-    """Where each pixel of the undistorted image lies in the photograph, [1, h, w, 2] for ``grid_sample``.
+    """Where each pixel of the undistorted image lies in the photograph.
 
-    The undistorted image keeps ``intrinsics`` [3, 3]. ``distortion`` is [k1, k2, p1, p2] or with k3.
+    Args:
+        intrinsics: [3, 3] in pixels; the undistorted image keeps them.
+        distortion: k1 k2 p1 p2, or k1 k2 p1 p2 k3.
+        height, width: size of the photograph in pixels.
+
+    Returns:
+        [1, h, w, 2] for ``grid_sample``.
     """
     counts = [max(2, -(-side // _STEP) + 1) for side in (height, width)]
     knots = [torch.linspace(0, side - 1, n) for side, n in zip((height, width), counts, strict=True)]
     rows, columns = torch.meshgrid(*knots, indexing="ij")
     matrix, coefficients = (torch.from_numpy(a).float()[None] for a in (intrinsics, distortion))
     places = distort_points(torch.stack((columns, rows), -1).reshape(1, -1, 2), matrix, coefficients)
-    # Pixel j, centred at integer j, stands at (2 j + 1) / w - 1 where align_corners is false.
+    # Pixel j, centred at integer j, is at (2 j + 1) / w - 1 with align_corners=False.
     grid = ((2 * places + 1) / torch.tensor([width, height]) - 1).reshape(1, *counts, 2)
     dense = F.interpolate(grid.permute(0, 3, 1, 2), (height, width), mode="bilinear", align_corners=True)
     return dense.permute(0, 2, 3, 1)
 
 
 def undistort(image: np.ndarray, mask: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """``image`` [h, w, 3] uint8 and ``mask`` [h, w] bool, bilinear; black and empty beyond the photograph.
+    """Resample bilinearly; black and empty outside the photograph.
 
-    Of the mask the pixels that are more than half covered stay.
+    Args:
+        image: [h, w, 3] uint8.
+        mask: [h, w] bool; pixels that are more than half covered stay in the mask.
+        grid: from :func:`undistorting_grid`.
     """
     layers = np.concatenate((image, 255 * mask[..., None].astype(np.uint8)), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()

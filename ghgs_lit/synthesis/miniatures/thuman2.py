@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.caching import TrackedArray
 
 from ghgs_lit.data.layout import position_name
-from ghgs_lit.data.sampling import VIEW_IDS, subject_rng
+from ghgs_lit.data.sampling import VIEW_NUMBERS, subject_rng
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.miniatures.capture import save_image
@@ -132,7 +132,7 @@ def make(
     people: Mapping[str, int],
     size: int,
     seed: int,
-    vids: Sequence[int] = VIEW_IDS,
+    vids: Sequence[int] = VIEW_NUMBERS,
     positions: int = 16,
 ) -> Path:
     """Write renders below ``root`` in the layout that the published scripts make.

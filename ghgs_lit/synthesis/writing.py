@@ -1,0 +1,36 @@
+"""Writes views and bodies in the layout that :mod:`ghgs_lit.data.layout` reads."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ghgs_lit.data.view import View
+
+
+def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
+    """Write one view; the JPEG keeps the full resolution of colours.
+
+    Args:
+        phase: folder of the phase.
+        folder: name of the subject's position, ``<id>_<position>``.
+        number: number of the view at that position.
+        view: what to write.
+        quality: of the JPEG, 1 to 100.
+    """
+    folders = {kind: phase / kind / folder for kind in ("img", "mask", "depth", "parm")}
+    for path in folders.values():
+        path.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
+    Image.fromarray(view.mask.astype(np.uint8) * 255).save(folders["mask"] / f"{number}.png")
+    if view.inverse_depth is not None:
+        Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png")
+    np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))
+    np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
+
+
+def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
+    """Write the body vertices [n, 3] of a subject."""
+    folder = phase / "smpl" / name
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "vertices.npy", vertices.astype(np.float32))

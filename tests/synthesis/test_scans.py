@@ -1,0 +1,91 @@
+"""Scans on disk: loaded as they are, rendered with one transform, and bad ones are named."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from ghgs_lit.data.layout import Layout
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.synthesis.scans import ScanSource
+from ghgs_lit.types import Cameras
+from tests.helpers.people import render_boxes, write_obj_scan
+
+
+def test_obj_scans_are_loaded_as_they_are(tmp_path):
+    """Vertices, texture and body are those of the files; a lost .mtl does not matter."""
+    write_obj_scan(tmp_path, "a", (200, 90, 30))
+    person = ScanSource(tmp_path).load("a")
+    part = person.parts[0]
+    np.testing.assert_allclose(part.vertices.min(0), [1 - 0.205, 1.25, 2.85], atol=1e-5)
+    assert np.abs(part.texture.reshape(-1, 3).mean(0) - [200, 90, 30]).max() < 3
+    assert person.body_vertices.dtype == np.float32
+    assert len(person.body_vertices) == 8
+    (tmp_path / "a" / "material0.mtl").unlink()  # often lost: the picture beside the mesh is found anyway
+    assert ScanSource(tmp_path).load("a").parts[0].texture.shape == (4, 4, 3)
+
+
+def test_glb_scans_keep_parts_frames_and_cutouts(tmp_path):
+    """Parts keep their transforms and alpha modes; a mesh without texture is refused."""
+    scene = trimesh.Scene()
+    for k, (mode, cutoff) in enumerate([("OPAQUE", None), ("MASK", 0.3), ("BLEND", None)]):
+        mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+        texture = Image.fromarray(np.full((4, 4, 4), 50 * k, np.uint8))
+        material = PBRMaterial(baseColorTexture=texture, alphaMode=mode, alphaCutoff=cutoff)
+        mesh.visual = TextureVisuals(uv=np.zeros((len(mesh.vertices), 2)), material=material)
+        scene.add_geometry(
+            mesh, node_name=f"n{k}", transform=trimesh.transformations.translation_matrix([0, k, 0])
+        )
+    (tmp_path / "g").mkdir()
+    scene.export(tmp_path / "g" / "g.glb")
+    parts = ScanSource(tmp_path).load("g").parts
+    assert [part.alpha_cutoff for part in parts] == [None, pytest.approx(0.3), 0.5]
+    assert [part.texture.shape[2] for part in parts] == [3, 4, 4]
+    np.testing.assert_allclose([part.vertices[:, 1].mean() for part in parts], [0, 1, 2], atol=1e-6)
+    plain = trimesh.Scene([trimesh.creation.box()])
+    plain.export(tmp_path / "g" / "g.glb")
+    with pytest.raises(InputError, match=r"g\.glb: expected a texture for the mesh"):
+        ScanSource(tmp_path).load("g")
+
+
+def test_bad_scans_are_named(tmp_path):
+    """Every defect of a scan is reported with its path."""
+    with pytest.raises(InputError, match="nowhere: expected a folder of scans; found no such folder"):
+        ScanSource(tmp_path / "nowhere").names()
+    with pytest.raises(InputError, match=r"expected <id>/<id>\.obj or <id>/<id>\.glb; found none"):
+        ScanSource(tmp_path).names()
+    path = write_obj_scan(tmp_path, "bare", textured=False)
+    with pytest.raises(InputError, match=r"bare\.obj: expected a texture for the mesh .*; found none"):
+        ScanSource(tmp_path).load("bare")
+    path.write_text("f 1 2 3\n")
+    with pytest.raises(InputError, match=r"bare\.obj: expected"):
+        ScanSource(tmp_path).load("bare")
+    with pytest.raises(InputError, match=r"other: expected other\.obj or other\.glb; found neither"):
+        ScanSource(tmp_path).load("other")
+    write_obj_scan(tmp_path, "body")
+    np.save(tmp_path / "body" / "body_vertices.npy", np.zeros((5, 2)))
+    with pytest.raises(InputError, match=r"body_vertices\.npy: expected an array nx3; found 5x2"):
+        ScanSource(tmp_path).load("body")
+
+
+def test_rendered_scans_share_one_transform(tmp_path):
+    """Depth and body vertices of a rendered scan meet: the body here is the box itself."""
+    render_boxes(tmp_path / "out", tmp_path / "scans", train=1, val=0)
+    layout = Layout(tmp_path / "out", "train")
+    body = layout.read_body("s0")
+    assert body[:, 1].min() == pytest.approx(0, abs=2e-3)  # stored in 16 bits beside the mesh
+    assert 1.75 <= np.ptp(body[:, 1]) <= 1.85
+    for position in layout.subjects["s0"][::5]:
+        for number in layout.views_at("s0", position):
+            view = layout.read_view("s0", position, number, depth=True)
+            height, width = view.mask.shape
+            cameras = Cameras(
+                torch.from_numpy(view.intrinsics), torch.from_numpy(view.extrinsics), height, width
+            )
+            points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask]
+            assert (points > body.min(0) - 0.05).all()
+            assert (points < body.max(0) + 0.05).all()
