@@ -5,7 +5,6 @@ with), ``lock`` and ``tmp/`` (workspaces: what is being written).
 """
 
 import contextlib
-import fcntl
 import json
 import logging
 import os
@@ -15,8 +14,8 @@ from pathlib import Path
 
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.data.completeness import Completeness
-from ghgs_lit.errors import InputError
-from ghgs_lit.files import write_text_atomically
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import is_locked, lock, lock_owner, write_text_atomically
 
 log = logging.getLogger(__name__)
 
@@ -59,13 +58,11 @@ class Progress:
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """Let one process at a time write; the system frees the lock when a process dies."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with open(self.folder / "lock", "w") as handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                log.info("waiting for another process that renders into %s", self.root)
-                fcntl.flock(handle, fcntl.LOCK_EX)
+        path = self.folder / "lock"
+        if is_locked(path):
+            log.info("waiting for %s, which renders into %s", lock_owner(path), self.root)
+        with lock(path, wait=True) as held:
+            require(held, str(self.root), "one rendering at a time in a process", "another")
             yield
 
     def workspace(self, phase: str, name: str) -> Path:

@@ -5,7 +5,7 @@ ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 
 first and the second half of the step. Yaw 0 looks at a subject that faces +z from the front.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -93,10 +93,4 @@ class Rig:
         require(tall > 0, person.name, "a mesh with some height", tall)
         scale = 1.0 if self.height is None else (self.height + jitter) / tall
         origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2], np.float64)
-
-        def move(vertices: np.ndarray) -> np.ndarray:
-            return ((vertices.astype(np.float64) - origin) * scale).astype(np.float32)
-
-        parts = tuple(replace(part, vertices=move(part.vertices)) for part in person.parts)
-        body = None if person.body_vertices is None else move(person.body_vertices)
-        return replace(person, parts=parts, body_vertices=body)
+        return person.mapped(lambda vertices: (vertices - origin) * scale)
