@@ -1,14 +1,13 @@
 """An analytic subject in front of a ring of cameras, for the tests of the stages."""
 
 import json
-import math
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from safetensors.torch import load_file
 
-from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.types import Batch
+from tests.helpers.cameras import camera_ring
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 CASES = json.loads((FIXTURES / "stages_cases.json").read_text())
@@ -25,18 +24,17 @@ def fixture(name, part, dtype=torch.float32):
 
 def ring(batch, views, height, width, spread=360.0, radius=2.0, zoom=0.8):
     """Cameras around the subject that look at it; elements differ by a rotation."""
-    focal = zoom * max(height, width)
-    intrinsics = torch.tensor([[focal, 0, width / 2 + 1], [0, focal, height / 2 - 1], [0, 0, 1]])
-    extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
-    for b in range(batch):
-        for v in range(views):
-            angle = math.radians(spread * v / views + 20 * b)
-            eye = CENTER + torch.tensor([radius * math.sin(angle), 0.3, radius * math.cos(angle)])
-            forward = F.normalize(CENTER - eye, dim=0)
-            right = F.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0])), dim=0)
-            rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
-            extrinsics[b, v, :3, :3], extrinsics[b, v, :3, 3] = rotation, -rotation @ eye
-    return Cameras(intrinsics.repeat(batch, views, 1, 1), extrinsics, height, width)
+    focal, principal = zoom * max(height, width), (width / 2 + 1, height / 2 - 1)
+    place = {
+        "center": tuple(CENTER.tolist()),
+        "raised": 0.3,
+        "spread": spread,
+        "radius": radius,
+        "turn": 20.0,
+    }
+    return camera_ring(
+        views, height, width, batch, (focal, focal), principal, **place, spread=spread, turn=20.0
+    )
 
 
 def ellipsoid(cameras, center=CENTER, radii=RADII):

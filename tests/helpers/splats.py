@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.types import Cameras, Gaussians, Rendering
+from tests.helpers import cameras
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
@@ -24,16 +25,10 @@ def camera_ring(
         distance: from the origin, in metres.
         focal: focal length along x as a part of the image's width.
     """
-    intrinsics = torch.eye(3)
-    intrinsics[0, 0], intrinsics[1, 1] = focal * width, 1.1 * focal * width
-    intrinsics[0, 2], intrinsics[1, 2] = 0.5 * width + 0.3, 0.5 * height - 0.2
-    extrinsics = torch.eye(4).repeat(batch, views, 1, 1)
-    for view in range(views):
-        angle = 2 * math.pi * view / views + 0.2 if views > 1 else 0.0
-        cosine, sine = math.cos(angle), math.sin(angle)
-        extrinsics[:, view, :3, :3] = torch.tensor([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-        extrinsics[:, view, 2, 3] = distance
-    return Cameras(intrinsics.expand(batch, views, 3, 3), extrinsics, height, width)
+    focal, principal = (focal * width, 1.1 * focal * width), (0.5 * width + 0.3, 0.5 * height - 0.2)
+    start = 180 - math.degrees(0.2) if views > 1 else 180.0
+    place = {"radius": distance, "start": start, "spread": -360.0, "up": -1.0}
+    return cameras.camera_ring(views, height, width, batch, focal, principal, **place)
 
 
 def cloud(

@@ -1,5 +1,7 @@
 """A model and a renderer that train in microseconds, and batches for them."""
 
+import math
+
 import lightning.pytorch as L
 import torch
 from torch import nn
@@ -17,20 +19,12 @@ from ghgs_lit.types import (
     Rendering,
     Targets,
 )
+from tests.helpers.cameras import camera_ring
 
 
 def ring(count: int, size: int, radius: float = 2.0, start: float = 0.0) -> Cameras:
-    """Cameras on a circle around the origin, looking at it, y down in the image."""
-    angles = torch.arange(count) * (2 * torch.pi / count) + start
-    centers = torch.stack((radius * angles.sin(), torch.zeros(count), radius * angles.cos()), -1)
-    forward = -centers / radius
-    down = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
-    rotation = torch.stack((torch.linalg.cross(down, forward), down, forward), -2)
-    extrinsics = torch.eye(4).repeat(count, 1, 1)
-    extrinsics[:, :3, :3] = rotation
-    extrinsics[:, :3, 3] = -(rotation @ centers[..., None])[..., 0]
-    intrinsics = torch.tensor([[size, 0.0, size / 2], [0.0, size, size / 2], [0, 0, 1]]).repeat(count, 1, 1)
-    return Cameras(intrinsics, extrinsics, size, size)
+    """Cameras [count] around the origin; ``start`` is the first one's angle in radians."""
+    return camera_ring(count, size, size, radius=radius, start=math.degrees(start))[0]
 
 
 def batched(cameras: Cameras, count: int) -> Cameras:
