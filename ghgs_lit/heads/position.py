@@ -29,39 +29,22 @@ def _axis_waves(
     return torch.cat((angles.sin(), angles.cos())).float() * SCALE
 
 
-def position_embedding(
-    channels: int, rows: int, columns: int, aspect: float, like: Tensor
-) -> Float[Tensor, "c rows columns"]:
-    """``0.1 E``: waves of x in the first half of the channels, of y in the second.
+def add_positions_(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
+    """Add ``0.1 E`` to ``x`` in place, in its precision: waves of x in the first half of the channels, of y
+    in the second.
 
     The unit is half the diagonal of the image; samples are cell centres. The waves of the two axes are cached
-    (a few kilobytes each), the map is not.
+    (a few kilobytes each); the embedding is never held as a map.
 
     Args:
-        channels: of the map, a multiple of 4.
-        rows: of the map.
-        columns: of the map.
+        x: maps whose number of channels is a multiple of 4; float64 gives float64 coordinates.
         aspect: width / height of the image.
-        like: gives the device; float64 gives float64 coordinates.
     """
-    x, y = _waves(channels, rows, columns, aspect, like)
-    return torch.cat((x.expand(-1, rows, -1), y.expand(-1, -1, columns)))
-
-
-def add_positions_(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
-    """Add ``0.1 E`` to ``x`` in place, in its precision; the embedding is never held as a map."""
     half = x.shape[1] // 2
-    across, down = _waves(*x.shape[1:], aspect, x)
-    x[:, :half].add_(across.to(x.dtype))
-    x[:, half:].add_(down.to(x.dtype))
-    return x
-
-
-def _waves(
-    channels: int, rows: int, columns: int, aspect: float, like: Tensor
-) -> tuple[Float[Tensor, "half 1 columns"], Float[Tensor, "half rows 1"]]:
-    dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
+    dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
     diagonal = math.hypot(aspect, 1.0)
-    x = _axis_waves(channels // 2, columns, aspect / diagonal, dtype, like.device)
-    y = _axis_waves(channels // 2, rows, 1.0 / diagonal, dtype, like.device)
-    return x[:, None, :], y[:, :, None]
+    across = _axis_waves(half, x.shape[3], aspect / diagonal, dtype, x.device)
+    down = _axis_waves(half, x.shape[2], 1.0 / diagonal, dtype, x.device)
+    x[:, :half].add_(across[:, None, :].to(x.dtype))
+    x[:, half:].add_(down[:, :, None].to(x.dtype))
+    return x

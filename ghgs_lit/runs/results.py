@@ -33,15 +33,20 @@ def metric_names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row if name not in KEYS))
 
 
+def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
+    """Rows by (method, views, targets), then by subject."""
+    groups: dict[tuple, dict[str, list[Row]]] = {}
+    for row in rows:
+        key = (row["method"], row["views"], row["targets"])
+        groups.setdefault(key, {}).setdefault(row["subject"], []).append(row)
+    return groups
+
+
 def summarize(rows: Sequence[Row]) -> list[Row]:
     """Means over subjects for each method, number of views and kind of target.
 
     A subject's targets are averaged first, so that each subject counts once.
     """
-    groups: dict[tuple, dict[str, list[Row]]] = {}
-    for row in rows:
-        key = (row["method"], row["views"], row["targets"])
-        groups.setdefault(key, {}).setdefault(row["subject"], []).append(row)
     names = metric_names(rows)
     return [
         {
@@ -49,7 +54,7 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
             "subjects": len(subjects),
             **{name: mean(mean(row.get(name) for row in own) for own in subjects.values()) for name in names},
         }
-        for key, subjects in groups.items()
+        for key, subjects in by_protocol(rows).items()
     ]
 
 

@@ -4,7 +4,7 @@ A run is identified by its configuration, never by the name of its directory.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -16,7 +16,7 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.results import METHOD, mean, metric_names, read_results
+from ghgs_lit.runs.results import METHOD, by_protocol, mean, metric_names, read_results
 
 ABLATIONS = {
     (False, False): "neither",
@@ -162,15 +162,6 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     )
 
 
-def _groups(rows: Sequence[Mapping[str, Any]]) -> Iterator[tuple[tuple, dict[str, list]]]:
-    """Rows by method, views and targets, then by subject."""
-    groups: dict[tuple, dict[str, list]] = {}
-    for row in rows:
-        key = (row["method"], row["views"], row["targets"])
-        groups.setdefault(key, {}).setdefault(row["subject"], []).append(row)
-    yield from groups.items()
-
-
 def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
     """The records of a ``metrics.json``."""
     content = read_results(path)
@@ -180,7 +171,7 @@ def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
     measured = {name: source["config"].get(name) for name in ("data", "metrics")}
     names = metric_names(content["rows"])
     records = []
-    for (method, views, targets), subjects in _groups(content["rows"]):
+    for (method, views, targets), subjects in by_protocol(content["rows"]).items():
         values = {
             subject: {n: v for n in names if (v := mean(row.get(n) for row in rows)) is not None}
             for subject, rows in subjects.items()

@@ -17,7 +17,7 @@ from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.heads.activations import split_activated
 from ghgs_lit.heads.dpt import DPTHead
-from ghgs_lit.heads.position import position_embedding
+from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -133,7 +133,7 @@ def test_dpt_positions(dtype):
     groups = _load(name)
     like = _inputs(groups, dtype)["like"]
     found = {
-        f"embed_{i}": position_embedding(channels, rows, columns, width / height, like)
+        f"embed_{i}": add_positions_(like.new_zeros(1, channels, rows, columns), width / height)[0]
         for i, (channels, rows, columns, height, width) in enumerate(CASES[name]["cases"])
     }
     expected = groups[DTYPES[dtype]]

@@ -10,7 +10,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.heads import dpt
 from ghgs_lit.heads.activations import split_activated, unit
 from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
-from ghgs_lit.heads.position import position_embedding
+from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
 
 
@@ -150,7 +150,7 @@ def test_positions_made_for_inference_serve_training():
 
 def test_positions_are_centred():
     """Position embeddings must be symmetric about the middle of the image."""
-    e = position_embedding(8, 4, 6, 1.5, torch.zeros(1, dtype=torch.float64))
+    e = add_positions_(torch.zeros(1, 8, 4, 6, dtype=torch.float64), 1.5)[0]
     sine = [0, 1, 4, 5]
     cosine = [2, 3, 6, 7]
     flipped = e.flip(1, 2)
