@@ -26,9 +26,7 @@ def ring(batch, views, height, width, spread=360.0, radius=2.0, zoom=0.8):
     """Cameras around the subject that look at it; elements differ by a rotation."""
     focal, principal = zoom * max(height, width), (width / 2 + 1, height / 2 - 1)
     place = {"center": tuple(CENTER.tolist()), "raised": 0.3, "radius": radius, "spread": spread}
-    return camera_ring(
-        views, height, width, batch, (focal, focal), principal, **place, spread=spread, turn=20.0
-    )
+    return camera_ring(views, height, width, batch, (focal, focal), principal, **place, turn=20.0)
 
 
 def ellipsoid(cameras, center=CENTER, radii=RADII):
