@@ -72,7 +72,8 @@ class Cameras(_TensorStruct):
     def centers(self) -> Float[Tensor, "*batch 3"]:
         """Camera centres in the world, ``-R^T t``."""
         rotation, translation = self.extrinsics[..., :3, :3], self.extrinsics[..., :3, 3]
-        return -(rotation.mT @ translation[..., None])[..., 0]
+        # Written out: a product of matrices would run in half precision under autocast.
+        return -(rotation * translation[..., :, None]).sum(-2)
 
     def __getitem__(self, index) -> "Cameras":
         return dataclasses.replace(self, intrinsics=self.intrinsics[index], extrinsics=self.extrinsics[index])

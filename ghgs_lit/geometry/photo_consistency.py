@@ -32,6 +32,13 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
     Returns:
         0 outside the subject, and where no other view has the point inside its mask.
     """
+    # All of it: half a pixel in bfloat16 is a different colour.
+    with torch.autocast(batch.masks.device.type, enabled=False):
+        return _sweep(batch, bounds, steps)
+
+
+def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
+    """:func:`photo_consistency` outside autocast."""
     b, v, height, width = batch.masks.shape
     near, far = at_least_float32(bounds.near), at_least_float32(bounds.far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
@@ -81,8 +88,7 @@ def _relations(cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
     """From pixels of view j to pixels of view k, ``z_k p_k = z_j turn p_j + shift``; cosine of their axes."""
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     rotation, translation = extrinsics[..., :3, :3], extrinsics[..., :3, 3:]
-    with torch.autocast(intrinsics.device.type, enabled=False):
-        relative = rotation[:, None] @ rotation[:, :, None].mT
-        turn = intrinsics[:, None] @ relative @ torch.linalg.inv(intrinsics)[:, :, None]
-        shift = intrinsics[:, None] @ (translation[:, None] - relative @ translation[:, :, None])
+    relative = rotation[:, None] @ rotation[:, :, None].mT
+    turn = intrinsics[:, None] @ relative @ torch.linalg.inv(intrinsics)[:, :, None]
+    shift = intrinsics[:, None] @ (translation[:, None] - relative @ translation[:, :, None])
     return turn, shift[..., 0], relative[..., 2, 2]

@@ -75,6 +75,18 @@ def test_the_surface_agrees_more_than_what_lies_behind_it():
     assert behind.mean() < at.mean() - 0.25
 
 
+@pytest.mark.parametrize("size", [56, 518])
+def test_half_precision_does_not_reach_the_sweep(size):
+    """A pixel rounded to bfloat16 lies in another place: training would see a broken guide."""
+    batch = make_batch(1, 4, size, size, spread=100.0)
+    bounds = DepthBounds(batch.depths, batch.depths + 0.05)
+    expected = photo_consistency(batch, bounds, 2)
+    centers = batch.cameras.centers
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(photo_consistency(batch, bounds, 2), expected)
+        assert torch.equal(batch.cameras.centers, centers)
+
+
 def test_opposite_views_say_nothing():
     """Views from opposite sides see no common surface and must not vote."""
     batch = make_batch(1, 2)

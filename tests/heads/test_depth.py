@@ -104,7 +104,7 @@ def test_depth_is_wide_under_autocast():
     assert found.depth.dtype == found.bounds.near.dtype == points.pixels.dtype == torch.float32
     assert torch.equal(found.bounds.near, expected.bounds.near)
     assert torch.equal(points.tokens, Unprojection()(expected, tokens, batch).tokens)
-    assert (found.depth - expected.depth).abs().max() < 0.05
+    assert (found.depth - expected.depth).abs()[batch.masks].max() < 0.005
 
 
 def test_values_that_are_not_finite_are_invalid_and_finite():

@@ -140,7 +140,7 @@ def test_attributes_are_wide_under_autocast():
         found = run(head, batch)
     for name in ("means", "quaternions", "scales", "opacities", "colors"):
         assert getattr(found, name).dtype == torch.float32
-    assert (found.means - expected.means).abs().max() < 0.01
+    assert (found.means - expected.means).abs().max() < 0.001
 
 
 @pytest.mark.parametrize(
