@@ -23,6 +23,8 @@ def build_data(config: Mapping[str, Any]) -> LightningDataModule:
 def with_trained_data(cfg: DictConfig) -> DictConfig:
     """``cfg`` with the data that its checkpoint was trained on, where no ``data`` was chosen.
 
+    A checkpoint of somebody else does not say where this machine writes: ``data.cache_dir`` is the default.
+
     Raises:
         InputError: there is no checkpoint, or it was not trained.
     """
@@ -35,7 +37,8 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
         raise InputError(
             f"data: expected data=... for weights that were imported ({cfg.checkpoint}); found none"
         )
-    return OmegaConf.merge({"data": trained["data"]}, cfg)
+    data = {key: None if key == "cache_dir" else value for key, value in trained["data"].items()}
+    return OmegaConf.merge({"data": data}, cfg)
 
 
 def pick_device(name: str) -> torch.device:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
@@ -19,12 +21,24 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
-from ghgs_lit.runs.job import in_sweep, needs_own_process, train_in_own_process, train_once, with_resume
+from ghgs_lit.runs.checks import check_config
+from ghgs_lit.runs.job import (
+    in_sweep,
+    is_multirun,
+    needs_own_process,
+    train_in_own_process,
+    train_once,
+    with_resume,
+)
 from ghgs_lit.runs.plan import print_single_plan
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 from ghgs_lit.training import GHGSModule, loggers, start
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
+from ghgs_lit.training.cost import TrainingCost
+from ghgs_lit.training.interruption import StopAtStep
+from ghgs_lit.training.optimization import require_whole_parameters
 
 
 def _quiet() -> None:
@@ -39,7 +53,9 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
     """Load ``init_from``, check ``resume``; returns the step to resume at, None for a new run."""
     start.check_start(config, directory)
     if config["init_from"] is not None and config["resume"] is None:
-        lines = start.initialize(model, config["init_from"], config["init_strict"])
+        lines = start.initialize(
+            model, config["init_from"], config["init_strict"], config["allow_random_encoder"]
+        )
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
             if differing := start.switched(config):
@@ -52,31 +68,61 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
     return step
 
 
-def build_trainer(config: dict[str, Any], directory: Path) -> L.Trainer:
-    """The Trainer with its loggers and callbacks, which all write below ``directory``."""
+def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -> L.Trainer:
+    """The Trainer with its loggers and callbacks, which all write below ``directory``.
+
+    Raises:
+        InputError: the Trainer refuses its settings, or the strategy divides parameters among processes.
+    """
     built = [
         build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()
     ]
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
     partial = build({**config["trainer"], "_partial_": True}, "trainer")
     try:
-        return partial(
+        trainer = partial(
             logger=built or False,
             plugins=[AtomicCheckpointIO()],
-            callbacks=callbacks,
+            callbacks=[*further, *callbacks],
             default_root_dir=str(directory),
-            enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
+            enable_checkpointing=any(isinstance(c, Checkpoint) for c in [*further, *callbacks]),
             enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
         )
     except (MisconfigurationException, TypeError, ValueError) as error:
         raise InputError(f"trainer: {error}") from None
+    require_whole_parameters(trainer)
+    return trainer
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """The verb: train and measure, in a sweep only what its run still lacks; returns the mean PSNR."""
+    """The verb: train and measure, in a sweep only what its run still lacks; returns the mean PSNR.
+
+    Raises:
+        Interrupted: on Ctrl-C and SIGTERM.
+    """
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
     if config["dry_run"]:
         return print_single_plan(config, run_directory)
+    check_config(config)
+    with interruptible():
+        try:
+            return _run(config, run_directory)
+        except Interrupted as stop:
+            if rank_zero_only.rank == 0 and not stop.explained:
+                print_how_to_go_on(stop, str(run_directory.path), _changes_to_go_on(run_directory))
+            raise
+
+
+def _changes_to_go_on(run_directory: RunDirectory) -> str:
+    """What to add to the command of a run that was interrupted."""
+    if is_multirun():
+        return f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
+    if run_directory.checkpoint is None:
+        return "another hydra.run.dir, or overwrite=true (there was no checkpoint yet)"
+    return f"hydra.run.dir={run_directory.path} resume={run_directory.checkpoint}"
+
+
+def _run(config: dict[str, Any], run_directory: RunDirectory) -> float | str | None:
     if needs_own_process(config):
         return train_in_own_process(run_directory)
     if rank_zero_only.rank == 0:
@@ -108,36 +154,72 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         model, renderer, build(config["loss"], "loss"), build(config["optimizer"], "optimizer"), config
     )
     _quiet()
-    trainer = build_trainer(config, directory)
+    cost = TrainingCost()
+    trainer = build_trainer(config, directory, cost, StopAtStep())
+    try:
+        fit(trainer, module, data, config, step, stats)
+        checkpoint = directory / "checkpoints" / "last.ckpt"
+        trainer.save_checkpoint(checkpoint)
+        if not trainer.is_global_zero:
+            return None
+        training = {
+            "steps": trainer.global_step,
+            "seconds": cost.seconds,
+            "peak_bytes": cost.peak_bytes,
+            "processes": trainer.world_size,
+        }
+        print(f"trained {trainer.global_step} steps in {cost.seconds:.0f} s: {checkpoint}", flush=True)
+        return measure_last(trainer, module, data, config, directory, training)
+    finally:
+        loggers.close(trainer.loggers)
+
+
+def fit(
+    trainer: L.Trainer,
+    module: GHGSModule,
+    data: L.LightningDataModule,
+    config: dict[str, Any],
+    step: int | None,
+    stats: dict[str, Any],
+) -> None:
+    """Train from ``step``, None for a new run; ``stats`` gets what was trained here, also of a part."""
     if step is not None:
         loggers.resume(trainer.loggers, step)
     loggers.log_hyperparameters(trainer.loggers, loggers.hyperparameters(config, choices(), overrides()))
-    device = trainer.strategy.root_device
     started = time.perf_counter()
-    trainer.fit(module, data, ckpt_path=config["resume"])
-    seconds = time.perf_counter() - started
-    if trainer.interrupted:
-        raise KeyboardInterrupt
-    stats |= {"steps": trainer.global_step - (step or 0), "seconds": seconds}
-    checkpoint = directory / "checkpoints" / "last.ckpt"
-    trainer.save_checkpoint(checkpoint)
-    if not trainer.is_global_zero:
-        return None
-    print(f"trained {trainer.global_step} steps in {seconds:.0f} s: {checkpoint}", flush=True)
+    try:
+        trainer.fit(module, data, ckpt_path=config["resume"])
+    finally:
+        stats |= {
+            "steps": max(trainer.global_step - (step or 0), 0),
+            "seconds": time.perf_counter() - started,
+        }
+
+
+def measure_last(
+    trainer: L.Trainer,
+    module: GHGSModule,
+    data: L.LightningDataModule,
+    config: dict[str, Any],
+    directory: Path,
+    training: dict[str, Any],
+) -> float:
+    """Measure the last weights and write the results; returns the mean PSNR of the first protocol."""
+    model, device = module.model, trainer.strategy.root_device
     path = measure_and_write(
-        {"model": ModelMethod(model.to(device).eval(), renderer)},
+        {"model": ModelMethod(model.to(device).eval(), module.renderer)},
         data,
         config,
         directory,
         device,
         verb="train",
         choices=choices(),
-        checkpoint=str(checkpoint.relative_to(directory)),
+        checkpoint="checkpoints/last.ckpt",
         parameters={
             "total": sum(p.numel() for p in model.parameters()),
             "trained": sum(p.numel() for p in model.parameters() if p.requires_grad),
         },
-        training={"steps": trainer.global_step, "seconds": seconds, "processes": trainer.world_size},
+        training=training,
         sessions=RunDirectory(directory).sessions(),
     )
     summary = read_results(path)["summary"]

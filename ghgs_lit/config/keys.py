@@ -6,7 +6,10 @@ from typing import Any
 #: Where a run writes, what it shows and how it shares the machine: no number depends on these.
 WITHOUT_INFLUENCE = (
     "hydra",
+    "allow_random_encoder",
     "dry_run",
+    "feature_cache.max_gb",
+    "overwrite",
     "print_config",
     "resume",
     "logger",

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
-from lightning import LightningDataModule
+from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
@@ -24,6 +24,23 @@ from ghgs_lit.errors import InputError, choice
 from ghgs_lit.types import Batch
 
 Targets = TargetProtocol | Mapping[str, Any]
+
+
+def trained_batches(trainer: Trainer | None, length: int) -> int:
+    """Batches that each process has trained on so far, also after a restart from a checkpoint.
+
+    The last step of an epoch takes the batches that are left, fewer than ``accumulate_grad_batches`` where
+    the epoch is no multiple.
+
+    Args:
+        trainer: None outside of training.
+        length: batches of an epoch.
+    """
+    if trainer is None:
+        return 0
+    length = min(length, trainer.num_training_batches)  # trainer.limit_train_batches
+    epochs, steps = divmod(trainer.global_step, math.ceil(length / trainer.accumulate_grad_batches))
+    return epochs * length + steps * trainer.accumulate_grad_batches
 
 
 class PhotographsDataModule(LightningDataModule):
@@ -93,13 +110,9 @@ class PhotographsDataModule(LightningDataModule):
         once = math.ceil(len(sampler.subjects) / (self.options.batch_size * world))
         length = self.options.steps_per_epoch or once
         batches = TrainingBatches(self.builder("train"), sampler, length, rank, world)
-        return self._loader(batches, sampler=StepSampler(batches, self._first_step))
-
-    def _first_step(self) -> int:
-        """Batches that each process has trained on so far, also after a restart from a checkpoint."""
-        if self.trainer is None:
-            return 0
-        return self.trainer.global_step * self.trainer.accumulate_grad_batches
+        return self._loader(
+            batches, sampler=StepSampler(batches, lambda: trained_batches(self.trainer, length))
+        )
 
     def evaluation_loader(
         self,

@@ -46,16 +46,27 @@ class FeatureCache:
             ``all`` keeps every patch: the same predictions as without a cache.
         margin: patches around the subject that are kept.
         dtype: of the files: ``float32``, ``float16`` or ``bfloat16``. The tokens come back in the encoder's.
+        max_gb: size of all files, 10^9 bytes; beyond it the oldest are deleted. None: no limit.
     """
 
     def __init__(
-        self, directory: str | Path, tokens: str = "subject", margin: int = 1, dtype: str = "float32"
+        self,
+        directory: str | Path,
+        tokens: str = "subject",
+        margin: int = 1,
+        dtype: str = "float32",
+        max_gb: float | None = None,
     ):
         choice("feature_cache.tokens", tokens, ("subject", "all"))
         choice("feature_cache.dtype", dtype, tuple(DTYPES))
         require(isinstance(margin, int) and margin >= 0, "feature_cache.margin", "0 or more patches", margin)
+        valid = max_gb is None or (isinstance(max_gb, (int, float)) and max_gb > 0)
+        require(valid, "feature_cache.max_gb", "null or a positive number of gigabytes", max_gb)
         self.directory, self.tokens, self.margin, self.dtype = Path(directory), tokens, margin, dtype
-        self.hits = self.made = self.written = 0
+        self.limit = None if max_gb is None else int(1e9 * max_gb)
+        self.hits = self.made = self.written = self.deleted = 0
+        # Bytes of all files: other runs may write too, so it is counted again before anything is deleted.
+        self._bytes = 0 if self.limit is None else sum(_size(file) for file in self._files())
         self._versions: list = []
         self._hash = ""
 
@@ -78,14 +89,29 @@ class FeatureCache:
 
     def report(self) -> str:
         """One line: how many samples were found and encoded, and the size of the cache."""
-        files = list(self.directory.glob("*/*.safetensors"))
-        size = sum(file.stat().st_size for file in files)
+        files = self._files()
+        size = sum(map(_size, files))
         kept = "all tokens" if self.tokens == "all" else f"tokens of the subject and {self.margin} around it"
         return (
             f"feature cache {self.directory}: {self.hits} found, {self.made} made"
             f" ({self.written / 1e6:.1f} MB; {kept}, {self.dtype});"
             f" {len(files)} files, {size / 1e6:.1f} MB in all"
+            + (f"; {self.deleted} old ones deleted (feature_cache.max_gb)" if self.deleted else "")
         )
+
+    def _files(self) -> list[Path]:
+        return list(self.directory.glob("*/*.safetensors"))
+
+    def _delete_oldest(self, newest: Path) -> None:
+        """Delete the files that were written first, until a tenth of the limit is free; keep ``newest``."""
+        files = sorted((file for file in self._files() if file != newest), key=_written)
+        self._bytes = _size(newest) + sum(map(_size, files))
+        for file in files:
+            if self._bytes <= 0.9 * self.limit:
+                break
+            self._bytes -= _size(file)
+            file.unlink(missing_ok=True)
+            self.deleted += 1
 
     def _element(
         self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None
@@ -97,8 +123,12 @@ class FeatureCache:
             with torch.no_grad():
                 tokens = encoder.encode(images, masks, bounds)
             stored = self._stored(tokens, masks)
-            self.written += _write(path, *stored)
+            size = _write(path, *stored)
+            self.written += size
+            self._bytes += size
             self.made += 1
+            if self.limit is not None and self._bytes > self.limit:
+                self._delete_oldest(path)
         else:
             self.hits += 1
         return _tokens(*stored, images.device)
@@ -155,6 +185,22 @@ def open_cache(options: Mapping[str, Any] | None, recalibrated: str) -> FeatureC
     if not options or options["directory"] is None:
         return None
     return FeatureCache(**{**options, "tokens": "all" if recalibrated == "all" else options["tokens"]})
+
+
+def _size(file: Path) -> int:
+    """Bytes of a file; 0 where another run has deleted it."""
+    try:
+        return file.stat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+def _written(file: Path) -> float:
+    """When a file was written; 0 where another run has deleted it."""
+    try:
+        return file.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
 
 
 def _add(digest, tensor: Tensor) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
+from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 from ghgs_lit.visualization.pictures import save_png, sheet
@@ -166,5 +167,6 @@ def measure_all(
         for kind, protocol in targets.items():
             loader = data.evaluation_loader(views=count, targets=protocol, split=split)
             for name, method in methods.items():
-                rows += measure(method, name, loader, kind, metrics, device, pictures, picture_count)
+                batches = track(loader, f"measuring {name}, {count} views, targets {kind}")
+                rows += measure(method, name, batches, kind, metrics, device, pictures, picture_count)
     return rows

@@ -12,12 +12,14 @@ from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ghgs_lit.config import resolve
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import BUSY, trains_in_several_processes
 from ghgs_lit.runs.plan import PlannedRun, print_plan, print_results
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
+from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between two looks at runs that other processes work on
@@ -26,9 +28,23 @@ Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobReturn]]:
-    """Run, or with ``dry_run`` only print, the grid of ``arguments`` and the sweeper's parameters."""
+    """Run, or with ``dry_run`` only print, the grid of ``arguments`` and the sweeper's parameters.
+
+    Raises:
+        Interrupted: on Ctrl-C and SIGTERM; no further run is started.
+    """
+    directory = Path(str(sweeper.config.hydra.sweep.dir)).resolve()
+    with interruptible():
+        try:
+            return _sweep(sweeper, arguments, directory)
+        except Interrupted as stop:
+            if not stop.explained:
+                print_how_to_go_on(stop, "the sweep", f"hydra.sweep.dir={directory}")
+            raise
+
+
+def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[Sequence[JobReturn]]:
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
-    directory = Path(str(config.hydra.sweep.dir)).resolve()
     planned = plan(
         combinations(sweeper.params, arguments),
         lambda overrides: loader.load_sweep_config(config, overrides),
@@ -38,6 +54,11 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []
+    require(
+        not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its own runs", True
+    )
+    for item in planned:
+        check_config(item.config)
     write_plan(planned, config, directory)
     returns = run_all(planned, sweeper.launcher.launch, sweeper.max_batch_size)
     print_results(planned, directory)

@@ -12,8 +12,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.runs.checks import check_directory
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.signals import STOP, Interrupted
 
 BUSY = "busy"
 """The return value of a job whose run another process works on."""
@@ -78,6 +80,8 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
             print(f"done before: {run.path}", flush=True)
             return run.metric
         config = with_resume(config, run)
+        if not in_sweep():
+            check_directory(run.path, config)
         with run.session(resumed=config["resume"]) as stats:
             return train(config, run.path, stats)
 
@@ -90,10 +94,23 @@ def train_in_own_process(run: RunDirectory) -> float | str | None:
     command = [sys.executable, "-m", "ghgs_lit", "train", *HydraConfig.get().overrides.task]
     command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
     mode = {_VARIABLE: "wait" if _waits() else "skip"}
-    done = subprocess.run(command, env={**os.environ, **mode}, check=False)
-    if done.returncode:
-        raise InputError(f"{run.path}: expected a job that succeeds; found exit code {done.returncode}")
+    code = _run_process(command, {**os.environ, **mode})
+    if code in [128 + number for number in STOP]:
+        raise Interrupted(code - 128)
+    if code:
+        raise InputError(f"{run.path}: expected a job that succeeds; found exit code {code}")
     return run.metric if run.done else BUSY
+
+
+def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
+    """The exit code of ``command``; a signal that stops this process is handed on, and awaited."""
+    with subprocess.Popen(command, env=environment) as process:
+        try:
+            return process.wait()
+        except Interrupted as stop:
+            process.send_signal(stop.number)
+            process.wait()
+            raise
 
 
 def trains_in_several_processes(config: Mapping[str, Any], launcher: str) -> bool:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import is_multirun
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
@@ -100,6 +101,19 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
     reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
+    print_refusals([item.config for item in planned])
+
+
+def print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
+    """Print why runs would be refused as they are configured, each reason once."""
+    reasons = {}
+    for config in configs:
+        try:
+            check_config(config)
+        except InputError as error:
+            reasons[str(error)] = None
+    for reason in reasons:
+        print(f"would be refused: {reason}", flush=True)
 
 
 def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
@@ -123,3 +137,4 @@ def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
     budget = _budget(config, expected_seconds(config, None))
     _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [budget]})
     print(f"nothing was run; outputs: {run.path}/ with {OUTPUTS}", flush=True)
+    print_refusals([config])

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from ghgs_lit.config.legacy import upgrade_provenance
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.provenance import config_hash
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """The version that is written; earlier ones are read too."""
 METHOD = "model"
 """The method of the rows of a trained model; others are baselines."""
@@ -102,7 +103,8 @@ def read_results(path: Path) -> dict[str, Any]:
     """Read a ``metrics.json``; its configurations are returned in today's keys.
 
     Raises:
-        InputError: the file is not a whole ``metrics.json``; the message names it.
+        InputError: the file is not a whole ``metrics.json``, or its configuration is not the one that was
+            measured; the message names it.
     """
     try:
         content = json.loads(path.read_text())
@@ -111,4 +113,10 @@ def read_results(path: Path) -> dict[str, Any]:
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found not in range(1, FORMAT_VERSION + 1):
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {found}")
-    return {**content, "provenance": upgrade_provenance(content.get("provenance", {}))}
+    source = content.get("provenance", {})
+    # The keys without influence changed since earlier versions, and with them the hashes.
+    if found == FORMAT_VERSION and "config" in source:
+        fitting, hashed = config_hash(source["config"]), source.get("config_hash")
+        expected = f"a configuration that fits its config_hash {hashed}"
+        require(fitting == hashed, f"{path}: provenance.config", expected, f"one of {fitting}")
+    return {**content, "provenance": upgrade_provenance(source)}

@@ -2,6 +2,7 @@
 
 import resource
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +12,21 @@ from lightning.pytorch.callbacks import Callback, ProgressBar
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torch import nn
 
+from ghgs_lit.runs.progress import Lines, clock, on_terminal
 from ghgs_lit.training.clock import PARTS
 from ghgs_lit.types import Batch
 
 
 class RunProgress(ProgressBar):
-    """One bar for the whole run, over its budget of steps or of time, not of epochs."""
+    """How far the run is, over its budget of steps or of time, not of epochs.
+
+    On a terminal a bar; elsewhere a line a minute. ``<run>/train.log`` gets the lines in both cases.
+    """
 
     def __init__(self):
         super().__init__()
         self._bar: Progress | None = None
+        self._lines: Lines | None = None
 
     def disable(self) -> None:
         """Called by Lightning in all processes but the first."""
@@ -31,6 +37,12 @@ class RunProgress(ProgressBar):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not getattr(self, "_is_enabled", True):
+            return
+        bar = on_terminal()
+        self._lines = Lines(Path(trainer.default_root_dir) / "train.log", printed=not bar)
+        self._first = None  # time, step and used budget of the first line, then of the last one
+        self._last = (time.monotonic(), trainer.global_step, pl_module.used_budget)
+        if not bar:
             return
         columns = (
             BarColumn(),
@@ -45,12 +57,31 @@ class RunProgress(ProgressBar):
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Batch, batch_idx: int
     ) -> None:
-        if self._bar is None:
-            return
+        if self._bar is not None:
+            text = f"step {trainer.global_step}  {self._numbers(trainer, pl_module)}"
+            self._bar.update(self._task, completed=pl_module.used_budget, text=text)
+        # Between two parts of an accumulated step there is nothing new.
+        if self._lines is not None and trainer.global_step > self._last[1] and self._lines.due():
+            self._say(trainer, pl_module)
+
+    def _numbers(self, trainer: L.Trainer, pl_module: L.LightningModule) -> str:
+        """Losses, and the results of the last validation."""
         shown = {k: v for k, v in self.get_metrics(trainer, pl_module).items() if k != "v_num"}
-        numbers = "  ".join(f"{name} {value:.4g}" for name, value in shown.items())
-        text = f"step {trainer.global_step}  {numbers}"
-        self._bar.update(self._task, completed=pl_module.used_budget, text=text)
+        return "  ".join(f"{name} {value:.4g}" for name, value in shown.items())
+
+    def _say(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        now = (time.monotonic(), trainer.global_step, pl_module.used_budget)
+        total = f" of {trainer.max_steps}" if trainer.max_steps > 0 else ""
+        parts = [f"step {now[1]}{total}", self._numbers(trainer, pl_module)]
+        if self._first is None:  # the first step compiles and fills caches: its time says nothing
+            self._first = now
+        else:
+            parts.append(f"{(now[0] - self._last[0]) / (now[1] - self._last[1]):.3g} s a step")
+            used = now[2] - self._first[2]
+            if used > 0:
+                parts.append(f"{clock((now[0] - self._first[0]) * (1 - now[2]) / used)} left")
+        self._lines.say("  ".join(parts))
+        self._last = now
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._stop()
@@ -89,15 +120,15 @@ class StepTime(Callback):
         self._hooks: list = []
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        clock = pl_module.clock
+        parts = pl_module.clock
         for name, before, part in self.STAGES:
             stage = getattr(pl_module.model, name, None)
             if isinstance(stage, nn.Module):
                 if before is not None:
-                    hook = stage.register_forward_pre_hook(lambda *_, part=before: clock.mark(part))
+                    hook = stage.register_forward_pre_hook(lambda *_, part=before: parts.mark(part))
                     self._hooks.append(hook)
-                self._hooks.append(stage.register_forward_hook(lambda *_, part=part: clock.mark(part)))
-        clock.start(pl_module.device)
+                self._hooks.append(stage.register_forward_hook(lambda *_, part=part: parts.mark(part)))
+        parts.start(pl_module.device)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         pl_module.clock.mark("data")

@@ -1,5 +1,6 @@
 """Checkpoints on disk: complete or not there at all, whenever the run is killed."""
 
+import hashlib
 import os
 import shutil
 from collections.abc import Mapping
@@ -18,6 +19,33 @@ from ghgs_lit.files import write_atomically
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
+def content_digest(checkpoint: Mapping[str, Any]) -> str:
+    """SHA-256 of all that training goes on from: weights, optimizer, schedule, loops and callbacks.
+
+    The configuration is left out: it is read in today's keys, and what differs from it is reported.
+    """
+    digest = hashlib.sha256()
+    _add({key: value for key, value in checkpoint.items() if key not in ("digest", "config")}, digest)
+    return digest.hexdigest()
+
+
+def _add(value: Any, digest: Any) -> None:
+    if isinstance(value, torch.Tensor):
+        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    elif isinstance(value, Mapping):
+        digest.update(f"mapping of {len(value)}".encode())
+        for key in value:
+            digest.update(repr(key).encode())
+            _add(value[key], digest)
+    elif isinstance(value, (list, tuple)):
+        digest.update(f"list of {len(value)}".encode())
+        for entry in value:
+            _add(entry, digest)
+    else:
+        digest.update(repr(value).encode())
+
+
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes checkpoints by :func:`ghgs_lit.files.write_atomically`.
 
@@ -29,7 +57,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any | None = None
     ) -> None:
         """Replace the file at ``path`` as a whole; ``storage_options`` are not used."""
-        write_atomically(path, lambda temporary: torch.save(checkpoint, temporary))
+        content = {**checkpoint, "digest": content_digest(checkpoint)}
+        write_atomically(path, lambda temporary: torch.save(content, temporary))
 
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
@@ -38,7 +67,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         return torch.load(path, map_location=map_location, weights_only=True)
 
 
-def _validates_now(trainer: L.Trainer) -> bool:
+def validates_now(trainer: L.Trainer) -> bool:
     """Whether validation follows this step, where validations are counted in steps."""
     every, by_steps = trainer.val_check_batch, trainer.check_val_every_n_epoch is None
     if not (by_steps and trainer.enable_validation and isinstance(every, int)):
@@ -84,7 +113,7 @@ class Checkpoints(ModelCheckpoint):
             return
         self._step = trainer.global_step
         # A restart does not repeat a validation that was due when the checkpoint was written.
-        if self.monitor is not None or not _validates_now(trainer):
+        if self.monitor is not None or not validates_now(trainer):
             super().on_train_batch_end(trainer, pl_module, *args)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:

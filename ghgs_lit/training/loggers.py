@@ -110,6 +110,16 @@ def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]],
             logger.save()
 
 
+def close(loggers: Sequence[Logger]) -> None:
+    """Write what is left and end the loggers' threads: the runs of a sweep share a process."""
+    for logger in loggers:
+        # One that was never used must not begin now.
+        if isinstance(logger, TensorBoardLogger) and logger._experiment is not None:
+            logger._experiment.close()
+        elif isinstance(logger, WandbLogger) and logger._experiment is not None:
+            logger._experiment.finish()
+
+
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others; only defined values."""
     return {

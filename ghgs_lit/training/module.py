@@ -124,8 +124,13 @@ class GHGSModule(L.LightningModule):
             raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
         return min(max(shares), 1.0)
 
+    @property
+    def _scaler(self) -> torch.amp.GradScaler | None:
+        """What scales the loss, so that gradients of half precision (``16-mixed``) do not vanish."""
+        return getattr(self.trainer.precision_plugin, "scaler", None)
+
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = self.optimization.build(self.model)
+        optimizer = self.optimization.build(self.model, fused=self._scaler is None)
 
         def factor(_: int) -> float:
             self.used_budget = self.progress()
@@ -137,22 +142,29 @@ class GHGSModule(L.LightningModule):
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
 
+        A scaler of the loss is undone before. Where it overflowed it skips the step and halves its factor;
+        only a gradient that overflows without any factor is an error.
+
         Raises:
             DivergedError: the norm is not finite (names a parameter).
         """
         self.optimization.drop_frozen_gradients(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip)
-        if not torch.isfinite(norm):
-            broken = [
-                name
-                for name, p in self.model.named_parameters()
-                if p.grad is not None and not torch.isfinite(p.grad).all()
-            ]
-            raise DivergedError(
-                f"step {self.global_step}: expected a finite gradient; found {norm.item()} in"
-                f" {len(broken)} parameters, first {broken[0] if broken else 'none'}"
-            )
-        self.log("train/gradient_norm", norm)
+        if torch.isfinite(norm):
+            self.log("train/gradient_norm", norm)
+        elif self._scaler is None or self._scaler.get_scale() <= 1:
+            raise self._diverged(norm)
+
+    def _diverged(self, norm: Tensor) -> DivergedError:
+        broken = [
+            name
+            for name, p in self.model.named_parameters()
+            if p.grad is not None and not torch.isfinite(p.grad).all()
+        ]
+        return DivergedError(
+            f"step {self.global_step}: expected a finite gradient; found {norm.item()} in"
+            f" {len(broken)} parameters, first {broken[0] if broken else 'none'}"
+        )
 
     def on_train_batch_end(self, *args: Any) -> None:
         # Called after all callbacks: what they did since the step ended is not counted.

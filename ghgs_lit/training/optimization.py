@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import lightning.pytorch as L
 import torch
+from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelParallelStrategy
 from torch import nn
 
 from ghgs_lit.errors import require
@@ -54,8 +56,13 @@ class Optimization:
         for prefix, share in self.freeze_until.items():
             require(0 <= share <= 1, f"optimizer.freeze_until.{prefix}", "a share in [0, 1]", share)
 
-    def build(self, model: nn.Module) -> torch.optim.AdamW:
+    def build(self, model: nn.Module, fused: bool = True) -> torch.optim.AdamW:
         """The optimizer of the parameters of ``model`` that are trained.
+
+        Args:
+            model: its parameters.
+            fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
+                where gradients cannot be clipped any more.
 
         Raises:
             InputError: ``freeze_until`` names no parameter.
@@ -70,7 +77,7 @@ class Optimization:
             betas=tuple(self.betas),
             eps=self.eps,
             weight_decay=self.weight_decay,
-            fused=True,
+            fused=fused,
         )
 
     def drop_frozen_gradients(self, model: nn.Module, progress: float) -> None:
@@ -89,3 +96,14 @@ class Optimization:
             return self.start_factor + (1 - self.start_factor) * progress / self.warmup
         fall = (progress - self.warmup) / (1 - self.warmup)
         return 1 + (self.end_factor - 1) * min(fall, 1.0)
+
+
+def require_whole_parameters(trainer: L.Trainer) -> None:
+    """Refuse strategies that divide parameters among processes: each would clip by the norm of its shard.
+
+    Raises:
+        InputError: such a strategy is configured.
+    """
+    sharded = isinstance(trainer.strategy, (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy))
+    expected = "auto or a kind of ddp, whose processes have all parameters to clip the gradient by"
+    require(not sharded, "trainer.strategy", expected, type(trainer.strategy).__name__)

@@ -8,6 +8,7 @@ from torch import nn
 
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.training.checkpoints import content_digest
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 from ghgs_lit.weights.switches import differences as differing_switches
 
@@ -35,7 +36,8 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
         The step of the checkpoint, and one line for each setting that this run changes.
 
     Raises:
-        InputError: not a checkpoint of a training run, or of another model (names the tensor).
+        InputError: not a checkpoint of a training run, of another model (names the tensor), or changed
+            since it was written.
     """
     checkpoint = read_checkpoint(path)
     for key in ("global_step", "optimizer_states"):
@@ -44,6 +46,10 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
                 f"{path}: expected a checkpoint of a training run; found none of its {key!r}"
                 " (init_from=... starts from weights alone)"
             )
+    digest = checkpoint.get("digest")  # earlier versions wrote none
+    if digest is not None:
+        found = content_digest(checkpoint)
+        require(found == digest, f"{path}: digest", f"{str(digest)[:12]}..., as written", f"{found[:12]}...")
     load_strictly(model, model_state(checkpoint), path)
     return checkpoint["global_step"], differences(checkpoint["config"], config)
 
@@ -58,21 +64,24 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def initialize(model: nn.Module, path: str | Path, strict: bool = False) -> list[str]:
+def initialize(
+    model: nn.Module, path: str | Path, strict: bool = False, random_frozen: bool = False
+) -> list[str]:
     """Load the weights at ``path`` that fit into ``model``.
 
     Args:
         model: gets the weights.
         path: a checkpoint of this project.
         strict: every tensor must fit.
+        random_frozen: parameters that do not learn may stay as initialised.
 
     Returns:
         One line for each tensor: ``loaded``, ``wrong shape`` and ``missing`` (both stay as initialised) or
         ``ignored`` (the model has no such tensor).
 
     Raises:
-        InputError: not a checkpoint of this project; nothing fits; with ``strict``, a tensor that does not
-            fit or is missing on either side (names it).
+        InputError: not a checkpoint of this project; nothing fits; a parameter that does not learn stays as
+            initialised; with ``strict``, a tensor that does not fit or is missing on either side (names it).
     """
     state, own = model_state(read_checkpoint(path)), model.state_dict()
     if strict:
@@ -91,6 +100,10 @@ def initialize(model: nn.Module, path: str | Path, strict: bool = False) -> list
             lines.append(f"loaded       {key} {here}")
     if not fitting:
         raise InputError(f"init_from: expected weights that fit the model; found none in {path}")
+    for name, parameter in model.named_parameters():
+        expected = "weights of a part that does not learn (allow_random_encoder=true does without)"
+        known = name in fitting or parameter.requires_grad or random_frozen
+        require(known, f"{path}: {name}", expected, "none that fit")
     model.load_state_dict(fitting, strict=False)
     return lines
 

@@ -8,6 +8,7 @@ from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.data.batches import StepSampler
+from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import (
     Batch,
@@ -110,11 +111,9 @@ class StepData(L.LightningDataModule):
         self.length = length
 
     def train_dataloader(self) -> DataLoader:
-        def first() -> int:
-            return self.trainer.global_step * self.trainer.accumulate_grad_batches
-
         steps = _Steps(self.length)
-        return DataLoader(steps, batch_size=None, collate_fn=lambda b: b, sampler=StepSampler(steps, first))
+        sampler = StepSampler(steps, lambda: trained_batches(self.trainer, self.length))
+        return DataLoader(steps, batch_size=None, collate_fn=lambda b: b, sampler=sampler)
 
     def val_dataloader(self) -> DataLoader:
         batches = [example_batch(seed=1000 + i) for i in range(2)]

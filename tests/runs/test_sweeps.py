@@ -18,6 +18,7 @@ from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
+from ghgs_lit.runs.signals import Interrupted
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
@@ -315,14 +316,14 @@ def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tm
     started = {}
     write_finished_run(tmp_path, {"seed": 1}, 31.0)
 
-    def fake(command, env, check):
-        started.update(command=command, env=env)
-        return type("Done", (), {"returncode": 0})
+    def fake(command, environment):
+        started.update(command=command, env=environment)
+        return started.get("code", 0)
 
     cfg = composed("trainer=ddp_cpu", "seed=5", "hydra.mode=MULTIRUN")
     cfg.hydra.runtime.choices["hydra/launcher"] = "joblib"
     monkeypatch.setattr(HydraConfig.instance(), "cfg", cfg)
-    monkeypatch.setattr(job.subprocess, "run", fake)
+    monkeypatch.setattr(job, "_run_process", fake)
     assert job.needs_own_process({"trainer": {"devices": 2}})
     assert job.train_in_own_process(RunDirectory(tmp_path)) == 31.0
     assert started["command"][2:] == [
@@ -334,6 +335,10 @@ def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tm
         "hydra.mode=RUN",
     ]
     assert started["env"]["GHGS_SWEEP_JOB"] == "skip"
+    started["code"] = 143
+    with pytest.raises(Interrupted) as stop:  # its own process was stopped, and so is the sweep
+        job.train_in_own_process(RunDirectory(tmp_path))
+    assert stop.value.code == 143
     cfg.hydra.runtime.choices["hydra/launcher"] = "submitit_slurm"
     assert not job.needs_own_process({"trainer": {"devices": 2}})
 
