@@ -7,7 +7,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.paths import conf_dir
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.config.schema import check
+from ghgs_lit.errors import InputError
 
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
@@ -26,12 +27,11 @@ def resolve(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as plain data, interpolations resolved.
 
     Raises:
-        InputError: a value is missing, or the seed is impossible.
+        InputError: a value is missing, or of the wrong type or range.
     """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     data = OmegaConf.to_container(cfg, resolve=True)
-    seed = data.get("seed", 0)
-    require(isinstance(seed, int) and 0 <= seed < 2**32, "seed", "an integer from 0 to 4294967295", seed)
+    check(data)
     return data
