@@ -23,6 +23,22 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
         return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
 
 
+def check_groups(verb: str, cfg: DictConfig) -> None:
+    """Refuse a configuration that lacks a key or group of ``conf/<verb>.yaml``, as after ``~key``.
+
+    Raises:
+        InputError: names the key.
+    """
+    shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
+    for entry in shipped.pop("defaults"):
+        if isinstance(entry, dict):
+            shipped |= {name: option for name, option in entry.items() if option is not None}
+    for name in shipped:
+        # Hydra's own node is no part of what a verb gets.
+        if name not in cfg and name != "hydra" and not name.startswith("override "):
+            raise InputError(f"{name}: expected a key or group of ghgs {verb}; found none")
+
+
 def resolve(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as plain data, interpolations resolved.
 

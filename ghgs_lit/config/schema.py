@@ -65,13 +65,12 @@ def one_of(*names: str | int) -> Kind:
     return Kind(words, lambda value: not isinstance(value, bool) and value in names)
 
 
-def list_of(kind: Kind, *lengths: int) -> Kind:
-    """A list whose values are of ``kind``, of one of ``lengths`` (none: any length)."""
-    words = " or ".join(map(str, lengths))
+def list_of(kind: Kind, length: int | None = None) -> Kind:
+    """A list of ``length`` (None: any) values, each of ``kind``."""
     return Kind(
-        f"a list{f' of {words} values' * bool(lengths)} (each {kind.expected})",
+        f"a list{'' if length is None else f' of {length} values'} (each {kind.expected})",
         lambda value: (
-            isinstance(value, list) and (not lengths or len(value) in lengths) and all(map(kind.holds, value))
+            isinstance(value, list) and length in (None, len(value)) and all(map(kind.holds, value))
         ),
     )
 
@@ -137,7 +136,7 @@ KINDS: dict[str, Kind] = {
     "release": PATH,
     "reported": FLAG,
     "resume": PATH,
-    "runs": TEXT | TEXTS,
+    "runs": TEXT | Kind("a list of paths", lambda value: TEXTS.holds(value) and len(value) > 0),
     "seed": SEED,
     "splats.opacity": SHARE,
     "splats.sigma": POSITIVE,
@@ -232,13 +231,13 @@ KINDS: dict[str, Kind] = {
     "bounds.samples": integer(least=2, most=4096),
     "bounds.tolerance": integer(least=0),
     "compat.name": TEXT,
-    "*_head.dpt.features": WIDTH | NULL,
-    "*_head.dpt.out_channels": list_of(WIDTH, 4) | NULL,
-    "*_head.guide": FLAG,
-    "*_head.parameterization": TEXT,
-    "*_head.views": TEXT,
     "depth_head.consistency_depths": integer(least=0, most=4096),
+    "depth_head.dpt.features": WIDTH | NULL,
+    "depth_head.dpt.out_channels": list_of(WIDTH, 4) | NULL,
+    "depth_head.guide": FLAG,
+    "depth_head.parameterization": TEXT,
     "depth_head.start": number(above=0, below=1),
+    "depth_head.views": TEXT,
     "encoder.bounds_input": FLAG,
     "encoder.checkpointing": FLAG,
     "encoder.depth": integer(least=1, most=1024),
@@ -261,9 +260,14 @@ KINDS: dict[str, Kind] = {
     "gaussian_head.attributes.scale_*": POSITIVE,
     "gaussian_head.channels": WIDTH,
     "gaussian_head.color_limit": SHARE,
+    "gaussian_head.dpt.features": WIDTH | NULL,
+    "gaussian_head.dpt.out_channels": list_of(WIDTH, 4) | NULL,
+    "gaussian_head.guide": FLAG,
     "gaussian_head.hidden": list_of(WIDTH, 2),
+    "gaussian_head.parameterization": TEXT,
     "gaussian_head.photo_consistency": FLAG,
     "gaussian_head.pixels": TEXT,
+    "gaussian_head.views": TEXT,
     "model.name": TEXT,
     "model.pad": TEXT,
     "recalibration.k": COUNT,
@@ -384,7 +388,8 @@ def check(config: Mapping[str, Any], parent: str = "") -> None:
     target = config.get("_target_")
     if isinstance(target, str) and not target.startswith(("ghgs_lit.", "lightning.")):
         return  # a class of the user's own, whose keys may mean anything
-    for name, value in config.items():
+    # Nodes last: data.render.size repeats data.size, and a message about it would puzzle.
+    for name, value in sorted(config.items(), key=lambda item: isinstance(item[1], Mapping)):
         key = f"{parent}.{name}" if parent else str(name)
         kind, node = kind_of(key), is_node(key)
         if isinstance(value, Mapping) and (node or kind is None):
