@@ -25,18 +25,38 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     Args:
         path: the file to write.
         write: writes the whole content to the path that it is given.
+
+    Raises:
+        OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(path)
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(path)
         write(temporary)
         _sync(temporary)
         os.replace(temporary, path)
         _sync(path.parent)
+    except Exception as error:
+        # PyTorch and safetensors report a full disk by errors of their own.
+        cause = error if isinstance(error, OSError) else _refusal(temporary)
+        if cause is None or cause.errno is None:
+            raise
+        raise OSError(cause.errno, cause.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a folder that cannot be written to has no such file
+            temporary.unlink(missing_ok=True)
+
+
+def _refusal(path: Path) -> OSError | None:
+    """The system's reason not to write more to the file ``path``; None where it can be written."""
+    try:
+        with path.open("ab") as file:
+            file.write(bytes(1 << 20))
+    except OSError as error:
+        return error
+    return None
 
 
 def write_text_atomically(path: str | Path, text: str) -> None:

@@ -2,12 +2,15 @@
 
 import multiprocessing
 import os
+import resource
 import signal
 import socket
 import subprocess
 import sys
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from ghgs_lit.files import is_locked, lock, lock_owner, write_atomically, write_text_atomically
 
@@ -95,3 +98,37 @@ def test_a_lock_is_held_by_one_process_and_freed_by_its_death(tmp_path):
         assert is_locked(path)
     holder.join()
     assert not is_locked(path)
+
+
+def limited_write(kind, path, answers):
+    """In a process of its own: write 4 MB where files may have half of one, as on a disk that is full."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
+    content = {"weights": torch.zeros(1 << 20)}
+    write = {
+        "text": lambda temporary: temporary.write_text("x" * (4 << 20)),
+        "torch": lambda temporary: torch.save(content, temporary),
+        "safetensors": lambda temporary: save_file(content, temporary),
+    }[kind]
+    try:
+        write_atomically(path, write)
+    except BaseException as error:
+        answers.put((type(error), str(error)))
+
+
+@pytest.mark.parametrize("kind", ["text", "torch", "safetensors"])
+def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, kind):
+    """PyTorch and safetensors hide the system's reason in errors of their own, without a path."""
+    context = multiprocessing.get_context("fork")
+    answers, path = context.Queue(), tmp_path / "last.ckpt"
+    process = context.Process(target=limited_write, args=(kind, path, answers))
+    process.start()
+    answer = answers.get(timeout=60)
+    process.join(60)
+    assert answer == (OSError, f"[Errno 27] File too large: '{path}'")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bug_in_the_writer_keeps_its_type(tmp_path):
+    """Only what the system refuses is bad input."""
+    with pytest.raises(KeyError, match="bug"):
+        write_atomically(tmp_path / "x", lambda temporary: {}["bug"])

@@ -9,16 +9,13 @@ from dataclasses import dataclass
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
 
-from ghgs_lit.config.paths import conf_dir
-from ghgs_lit.errors import InputError
+from ghgs_lit.cli.messages import BAD_INPUT, BadUsage, check_flags, did_you_mean, one_line, raised_by_hydra
+from ghgs_lit.config import check_groups, conf_dir, resolve
 from ghgs_lit.runs.job import register_resolvers
 
-BAD_INPUT = (InputError, FileNotFoundError)
 register_resolvers()  # on import, so that the processes of a launcher have them too
 
 # verb: (what it does, an example)
@@ -33,11 +30,11 @@ VERBS = {
     ),
     "evaluate": (
         "measure a checkpoint or the baselines",
-        "ghgs evaluate checkpoint=runs/train/.../last.ckpt",
+        "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt",
     ),
     "predict": (
         "turn photographs into a splat (PLY) and a turntable",
-        "ghgs predict checkpoint=last.ckpt subject=0",
+        "ghgs predict checkpoint=runs/train/.../checkpoints/last.ckpt subject=0",
     ),
     "import": (
         "published weights to a checkpoint",
@@ -45,7 +42,7 @@ VERBS = {
     ),
     "export": (
         "a checkpoint to the published names",
-        "ghgs export checkpoint=last.ckpt vggt=vggt.safetensors release=release.pth",
+        "ghgs export checkpoint=checkpoints/last.ckpt vggt=vggt.safetensors release=release.pth",
     ),
     "table": ("collect a sweep into the paper's table", "ghgs table runs=runs/train/sweep_..."),
 }
@@ -80,12 +77,15 @@ class Verb:
         # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
         sys.argv = list(self.argv)
         try:
+            # Before the verb's module is imported, which takes seconds.
+            check_groups(self.name, cfg)
+            resolve(cfg)
             return importlib.import_module(module_of(self.name)).run(cfg)
         except BAD_INPUT as error:
             # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
             if self.wants_trace or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
-            print(f"ghgs {self.name}: {_one_line(error)}", file=sys.stderr)
+            print(f"ghgs {self.name}: {one_line(error)}", file=sys.stderr)
             raise SystemExit(1) from error
 
 
@@ -106,17 +106,6 @@ def _completion_argv(argv: list[str]) -> list[str] | None:
     return [argv[0], words[1], *argv[1:]]
 
 
-def _one_line(error: Exception) -> str:
-    """The messages of a configuration error and of its cause, on one line."""
-    texts = [str(error)]
-    if error.__cause__ is not None and not isinstance(error, BAD_INPUT):
-        texts.append(str(error.__cause__))
-    words = " ".join(" ".join(texts).split())
-    if "Could not find 'hydra/" in words:
-        words += " (launchers and sweepers come with the extras cluster, ray and optuna)"
-    return words.replace("To append to your config use +", "this verb has no such key; to add it: +")
-
-
 def _renamed(verb: str, argument: str) -> str:
     """``argument`` with the key ``runs`` for ``table sweep=<directory>``: to Hydra ``sweep`` is a group."""
     return argument.replace("sweep=", "runs=", 1) if (verb, argument[:6]) == ("table", "sweep=") else argument
@@ -129,11 +118,15 @@ def _run(verb: str, argv: list[str]) -> int:
     sys.argv = [argv[0], *(_renamed(verb, argument) for argument in argv[2:])]
     task = Verb(verb, tuple(argv), wants_trace)
     try:
+        check_flags(sys.argv[1:])
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
-    except (*BAD_INPUT, HydraException, OmegaConfBaseException) as error:
-        if wants_trace:
+    except BadUsage as error:
+        print(f"ghgs {verb}: {error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        if wants_trace or not (isinstance(error, BAD_INPUT) or raised_by_hydra(error)):
             raise
-        print(f"ghgs {verb}: {_one_line(error)}", file=sys.stderr)
+        print(f"ghgs {verb}: {one_line(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(f"ghgs {verb}: interrupted", file=sys.stderr)
@@ -156,7 +149,8 @@ def main() -> int:
         print(importlib.metadata.version("ghgs-lit"))
         return 0
     if argv[1] not in VERBS:
-        print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}", file=sys.stderr)
+        hint = did_you_mean(argv[1], VERBS)
+        print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}{hint}", file=sys.stderr)
         return 2
     return _run(argv[1], argv)
 

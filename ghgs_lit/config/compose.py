@@ -7,7 +7,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.paths import conf_dir
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.config.schema import check
+from ghgs_lit.errors import InputError
 
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
@@ -22,16 +23,31 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
         return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
 
 
+def check_groups(verb: str, cfg: DictConfig) -> None:
+    """Refuse a configuration that lacks a key or group of ``conf/<verb>.yaml``, as after ``~key``.
+
+    Raises:
+        InputError: names the key.
+    """
+    shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
+    for entry in shipped.pop("defaults"):
+        if isinstance(entry, dict):
+            shipped |= {name: option for name, option in entry.items() if option is not None}
+    for name in shipped:
+        # Hydra's own node is no part of what a verb gets.
+        if name not in cfg and name != "hydra" and not name.startswith("override "):
+            raise InputError(f"{name}: expected a key or group of ghgs {verb}; found none")
+
+
 def resolve(cfg: DictConfig) -> dict[str, Any]:
     """The configuration as plain data, interpolations resolved.
 
     Raises:
-        InputError: a value is missing, or the seed is impossible.
+        InputError: a value is missing, or of the wrong type or range.
     """
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     data = OmegaConf.to_container(cfg, resolve=True)
-    seed = data.get("seed", 0)
-    require(isinstance(seed, int) and 0 <= seed < 2**32, "seed", "an integer from 0 to 4294967295", seed)
+    check(data)
     return data

@@ -1,6 +1,7 @@
 """The command line: verbs, one-line errors, exit codes, completion."""
 
 import importlib
+import sys
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -9,7 +10,7 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.cli import main as cli
 from ghgs_lit.cli.runtime import write_config
-from ghgs_lit.config import conf_dir
+from ghgs_lit.config import compose, conf_dir
 
 
 def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
@@ -63,6 +64,34 @@ def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys
     assert lines[0].startswith("ghgs train: ")
 
 
+def test_an_example_of_the_help_names_the_checkpoint_where_training_writes_it(monkeypatch, capsys):
+    """The example's path lacked the folder that training makes."""
+    _, out, _ = call(monkeypatch, capsys, "--help")
+    assert out.count(".ckpt") - out.count("out=") == out.count("checkpoints/last.ckpt")
+
+
+def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_path):
+    """Only bad input is one line: a bug must not look like it."""
+
+    class Module:
+        @staticmethod
+        def run(cfg):
+            raise KeyError("bug")
+
+    monkeypatch.setitem(sys.modules, cli.module_of("train"), Module)
+    with pytest.raises(KeyError, match="bug"):
+        call(monkeypatch, capsys, "train", f"hydra.run.dir={tmp_path}")
+
+
+def test_a_bad_value_is_refused_before_the_verb_is_imported(monkeypatch, capsys, tmp_path):
+    """The check must not wait for PyTorch, and nothing may be rendered or downloaded before it."""
+    # An import of what is None in sys.modules fails.
+    monkeypatch.setitem(sys.modules, cli.module_of("prepare"), None)
+    code, _, err = call(monkeypatch, capsys, "prepare", "data.size=100000", f"hydra.run.dir={tmp_path}")
+    assert code == 1
+    assert "data.size: expected an integer >= 1 and <= 8192" in err
+
+
 def test_verb_help_and_cfg_are_hydras(monkeypatch, capsys):
     """Hydra's own flags must reach it: they list the groups and the composed configuration."""
     code, out, _ = call(monkeypatch, capsys, "train", "--help")
@@ -90,13 +119,11 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
     class Module:
         @staticmethod
         def run(cfg):
-            import sys
-
             seen["argv"] = list(sys.argv)
 
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: Module)
-    cli.Verb("train", ("ghgs", "train", "seed=1"))(None)
+    monkeypatch.setitem(sys.modules, cli.module_of("train"), Module)
+    cli.Verb("train", ("ghgs", "train", "seed=1"))(compose("train"))
     assert seen["argv"] == ["ghgs", "train", "seed=1"]
 
 
