@@ -7,7 +7,7 @@
 
 Commands are the lines of ``bash`` blocks, ``python`` blocks as a whole, and commands in running text. Each
 document gets an empty folder with links to what a checkout has. Three tables say where a run differs from the
-text: NOT_RUN (left out, with the reason), SMALL (small settings, and stand-ins for the reader's own files), and
+text: NOT_RUN (left out, with the reason), SMALL (small settings, and stand-ins for files of the reader) and
 BEFORE (what a document expects to be there). One line is printed for each command; the exit code is 1 if one
 fails.
 """
