@@ -6,10 +6,10 @@ BIN    := $(VENV)/bin
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench clean
+.PHONY: help setup demo test test-pythons documents lint format bench clean
 
 help: ## List the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(BIN)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -25,6 +25,12 @@ demo: setup ## Generate people, train the four ablations, evaluate with 3, 4, 5 
 test: setup ## Run the whole test suite (CPU)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
+test-pythons: ## Run it on the oldest and the newest Python (those that are installed)
+	bash scripts/test_pythons.sh
+
+documents: setup ## Run every command of README and docs, with small settings (minutes)
+	$(BIN)/python scripts/check_documents.py
+
 lint: setup ## Check style, and which part imports which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -38,4 +44,4 @@ bench: setup ## Measure the rasterizer against its peers (minutes)
 	$(BIN)/python benchmarks/rasterizer.py --quick
 
 clean: ## Remove the virtual environment and caches, keep runs
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-* .pytest_cache .ruff_cache .hypothesis

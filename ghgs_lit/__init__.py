@@ -6,15 +6,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ghgs_lit.model import GHGS
     from ghgs_lit.rendering import render
-    from ghgs_lit.types import Batch, Gaussians
+    from ghgs_lit.types import Batch, Cameras, Gaussians
 
 _MODULES = {
     "GHGS": "ghgs_lit.model",
     "Batch": "ghgs_lit.types",
+    "Cameras": "ghgs_lit.types",
     "Gaussians": "ghgs_lit.types",
     "render": "ghgs_lit.rendering",
 }
-__all__ = ["GHGS", "Batch", "Gaussians", "render"]
+__all__ = ["GHGS", "Batch", "Cameras", "Gaussians", "render"]
 
 
 def __getattr__(name: str):

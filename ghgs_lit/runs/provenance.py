@@ -64,5 +64,5 @@ def provenance(config: Mapping[str, Any], **facts: Any) -> dict[str, Any]:
         "git": git_state(),
         "versions": versions(),
         "machine": {"platform": platform.platform(), "processor": platform.machine()},
-        "written": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
+        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }

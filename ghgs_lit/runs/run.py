@@ -11,7 +11,7 @@ import json
 import os
 import socket
 from collections.abc import Iterator
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ghgs_lit.files import is_locked, lock, lock_owner
 from ghgs_lit.runs.results import read_results
 
 
-class State(str, Enum):
+class State(StrEnum):
     """How far a run is."""
 
     DONE = "done"
@@ -125,4 +125,4 @@ class RunDirectory:
 
 
 def _now() -> str:
-    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="milliseconds")
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")

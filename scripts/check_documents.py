@@ -1,0 +1,338 @@
+"""Run every command of the documentation as it is printed, document by document, in the order of the text.
+
+    python scripts/check_documents.py                          # everything that can run here
+    python scripts/check_documents.py README.md docs/data.md   # some documents
+    python scripts/check_documents.py --fast                   # what ends within seconds, and what that needs
+    python scripts/check_documents.py --list                   # what would be run, and what not and why
+
+Commands are the lines of ``bash`` blocks, ``python`` blocks as a whole, and commands in running text. Each
+document gets an empty folder with links to what a checkout has. Three tables say where a run differs from the
+text: NOT_RUN (left out, with the reason), SMALL (small settings, and stand-ins for files of the reader) and
+BEFORE (what a document expects to be there). One line is printed for each command; the exit code is 1 if one
+fails.
+"""
+
+import argparse
+import importlib.util
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LIMIT = 600  # seconds for one command
+
+PUBLISHED = "needs published weights"
+NETWORK = "needs a package index"
+# A pattern at the beginning of a command, and why such a command is not run.
+NOT_RUN = [
+    (r"make (?!demo$|bench$)", "sets up an environment, or is what continuous integration runs"),
+    (r"\w+=\S+ make demo", NETWORK),
+    (r"pip install", NETWORK),
+    (r"source ", "the commands run in the environment of this script"),
+    (r"ghgs import", PUBLISHED),
+    (r"ghgs \w+ checkpoint=release\.ckpt", PUBLISHED),
+    (r"ghgs train (?!.*dry_run).*encoder=vggt_1b", PUBLISHED),
+    (r"ghgs train (?!.*dry_run).*trainer=gpu", "needs a GPU"),
+    (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
+    (r"ghgs train .*hydra/launcher=ray", "needs the extra `ray`"),
+    (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
+    (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
+    (r"python benchmarks/(weights|attention)\.py", "measures models of the published size"),
+    (r"python benchmarks/encoder\.py (?!--size vggt_small)", "measures models of the published size"),
+]
+if importlib.util.find_spec("smplx") is None:
+    NOT_RUN.append((r"ghgs .*data\.smpl_model=", "needs the package smplx"))
+
+CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
+TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1"
+SHORT = "trainer.max_steps=2 trainer.val_check_interval=2 trainer.limit_val_batches=1"
+FEW = "miniature.size=128 miniature.people.train=2 miniature.people.val=1"
+TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a command that trains
+# A pattern, what is put in its place, and why.
+SMALL = [
+    (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
+    (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
+    (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
+    (r" init_from=start\.ckpt", "", PUBLISHED),
+    (r"runs/train/<time>", "runs/train/$(ls runs/train | grep ^20 | tail -n 1)", "the last run"),
+    (r"<run>", "runs/before", "a small run"),
+    (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
+    (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
+    (r"their_results\.json", "docs/example_others.json", "a complete file"),
+    (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1", "small photographs"),
+    (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
+    (r"^(ghgs prepare task=miniature.*)", rf"\1 {FEW}", "few people"),
+    (r"^(python benchmarks/loading\.py.*)", r"\1 --seconds 1 --size 128 --workers 0,1", "one second"),
+    (r"^(python scripts/check_resume\.py)(?: --steps 40 --kill-at 20)?(.*)",
+     rf"\1\2 --steps 12 --kill-at 6 --every 3 {TINY}", "twelve steps"),
+    (r"^(ghgs train (?!.*dry_run).*sweep=table\d.*)", r"\1 dry_run=true", "needs a GPU: planned only"),
+    (r"(?<=seed=1,2),3(,4)?", "", "two seeds"),
+    (TRAIN + r".*experiment=demo.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
+    (TRAIN + r".*data.root=rendered.*)", r"\1 data.size=56", "56 x 56 pixels"),
+    (TRAIN + r"(?!.*vggt_nano).*experiment=(?:thuman2|zju_mocap|humman).*)", rf"\1 {CPU}", "no GPU"),
+    (TRAIN + r".*experiment=zju_mocap.*)", r"\1 data.size=112", "112 x 112 pixels"),
+    (TRAIN + r".*)", rf"\1 {SHORT}", "two steps"),
+]  # fmt: skip
+
+_SCANS = "ghgs prepare task=miniature data=thuman2 data.source={} miniature.size=64 miniature.people.train=2"
+_RENDER = "ghgs prepare task=render data=scans data.source={} data.root=rendered data.render.size=60"
+_RUN = f"ghgs train experiment=demo {TINY} {SHORT}"
+_SWEEP = f"{_RUN} -m ablation=full,neither logger=none callbacks=none hydra.sweep.dir=runs/train/paper"
+_CHECKPOINTS = (
+    f"{_RUN} hydra.run.dir=runs/mine",
+    *(f"cp runs/mine/checkpoints/last.ckpt {n}.ckpt" for n in "ab"),
+)
+# Photographs of static cameras in the layout of docs/template, from rendered scans.
+_PHOTOGRAPHS = """python - <<'END'
+from pathlib import Path
+import numpy as np
+from PIL import Image
+for phase in ("train", "val"):
+    root = Path("rendered", phase)
+    for person in sorted(p.name[:-4] for p in (root / "img").glob("*_000")):
+        folder = Path("photographs", phase, person)
+        folder.mkdir(parents=True)
+        names = [f"{person}_{position:03d}" for position in range(0, 16, 2)]
+        for camera, name in enumerate(names):
+            image = Image.open(root / "img" / name / "0.jpg")
+            mask = Image.open(root / "mask" / name / "0.png").convert("L")
+            image.putalpha(mask.point(lambda value: 255 * (value > 0)))
+            image.save(folder / f"{camera}.png")
+        cameras = {kind: [np.load(root / "parm" / name / f"0_{kind[:-1]}.npy") for name in names]
+                   for kind in ("intrinsics", "extrinsics")}
+        np.savez(folder / "cameras.npz", **cameras)
+        np.save(folder / "body.npy", np.random.default_rng(0).normal(size=(99, 3)) * 0.2)
+END"""
+# A document, and the commands that make what its reader has.
+BEFORE = {
+    "docs/add_a_data_set.md": (_SCANS.format("scans"), _RENDER.format("scans"), _PHOTOGRAPHS),
+    "docs/data.md": (
+        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
+        _SCANS.format("THuman2.0_Release"),
+    ),
+    "docs/encoder.md": _CHECKPOINTS,
+    "docs/sweeps.md": (_SWEEP,),
+    "docs/tables.md": (_SWEEP,),
+    "docs/training.md": (f"{_RUN} hydra.run.dir=runs/before",),
+}  # fmt: skip
+# Names that Python blocks of a document take as given.
+GIVEN = {
+    "docs/rasterizer.md": """
+import torch
+from ghgs_lit import Cameras, Gaussians
+near, one = torch.rand(50, 3) + torch.tensor([0, 0, 2]), torch.ones(50)
+gaussians = Gaussians(near, torch.rand(50, 4), torch.rand(50, 3) / 9, one / 2, torch.rand(50, 3), (50,))
+cameras = Cameras(torch.tensor([[[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]]), torch.eye(4)[None, None], 32, 32)
+""",
+}
+# Beginnings of the commands of a document that end within seconds, and of those that they need.
+FAST = {
+    "README.md": r"ghgs \S*--help|ghgs train --help|.*dry_run=true|ghgs prepare .*(my_scans|rendered)|"
+    r"ghgs train experiment=scans .*runs/mine|ghgs predict|#python",
+    "docs/first_day.md": r".*dry_run=true",
+    "docs/rasterizer.md": r"#python",
+    "docs/sweeps.md": r".*dry_run=true",
+    "docs/tables.md": r"ghgs table",
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of a document; ``text`` as printed, without continuation lines and comments."""
+
+    document: str
+    line: int
+    text: str
+    is_python: bool = False
+
+    @property
+    def title(self) -> str:
+        return f"python, {self.text.count(chr(10)) + 1} lines" if self.is_python else self.text
+
+    @property
+    def key(self) -> str:
+        """What the patterns of the tables are matched with."""
+        return "#python" if self.is_python else self.text
+
+    @property
+    def reason(self) -> str | None:
+        """Why it is not run; None: it is."""
+        return next((why for pattern, why in NOT_RUN if re.match(pattern, self.key)), None)
+
+    @property
+    def is_fast(self) -> bool:
+        return self.document in FAST and re.match(FAST[self.document], self.key) is not None
+
+    def script(self) -> tuple[str, list[str]]:
+        """What is run, and the reasons for which it differs from the text."""
+        if self.is_python:
+            return GIVEN.get(self.document, "") + self.text, []
+        text, reasons = self.text, []
+        for pattern, instead, why in SMALL:
+            changed = re.sub(pattern, instead, text)
+            if changed != text:
+                text, reasons = changed, [*reasons, why]
+        return text, reasons
+
+
+def documents() -> list[str]:
+    """All documents that have commands, relative to the repository."""
+    found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [path.relative_to(ROOT).as_posix() for path in found]
+
+
+def commands(document: str) -> list[Command]:
+    """The commands of a document in the order of the text; one that is said twice counts once."""
+    text = (ROOT / document).read_text()
+    found = [*_in_blocks(document, text), *_in_prose(document, text)]
+    first: dict[str, Command] = {}
+    for command in sorted(found, key=lambda c: c.line):
+        first.setdefault(command.text, command)
+    return list(first.values())
+
+
+def _in_blocks(document: str, text: str) -> Iterator[Command]:
+    for block in re.finditer(r"^```(bash|python)\n(.*?)^```", text, re.M | re.S):
+        first = text.count("\n", 0, block.start()) + 2
+        if block[1] == "python":
+            yield Command(document, first, block[2], is_python=True)
+            continue
+        joined, start = "", first
+        for number, line in enumerate(block[2].splitlines(), first):
+            joined, start = (joined + line.strip(), start) if joined else (line.strip(), number)
+            if joined.endswith("\\"):
+                joined = joined[:-1]
+                continue
+            command = re.sub(r"(^|\s+)#\s.*", "", joined)
+            joined = ""
+            if command:
+                yield Command(document, start, command)
+
+
+def _in_prose(document: str, text: str) -> Iterator[Command]:
+    """Code spans that begin like a command and have an argument; names of verbs alone are not run."""
+    prose = re.sub(r"^```.*?^```", lambda block: "\n" * block[0].count("\n"), text, flags=re.M | re.S)
+    program = r"(?:ghgs --help|ghgs\s\w+\s\S*(?:=|--help)|python \w+/|make \w|pip install|tensorboard )"
+    for span in re.finditer(rf"(?<!`)`((?:\w+=\S+ )?{program}[^`]*)`(?!`)", prose):
+        yield Command(document, prose.count("\n", 0, span.start()) + 1, " ".join(span[1].split()))
+
+
+class Reader:
+    """Runs commands in a folder of its own, as a reader of one document would."""
+
+    def __init__(self, folder: Path, document: str) -> None:
+        self.folder = folder / document.replace("/", "_").removesuffix(".md")
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        for name in ("docs", "scripts", "benchmarks"):
+            (self.folder / name).symlink_to(ROOT / name)
+        programs = folder / "bin"
+        programs.mkdir(exist_ok=True)
+        for name, arguments in {"python": "", "ghgs": "-m ghgs_lit"}.items():
+            (programs / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {arguments} "$@"\n')
+            (programs / name).chmod(0o755)
+        path = os.pathsep.join([str(programs), str(Path(sys.executable).parent), os.environ["PATH"]])
+        python_path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+        self.environment = {**os.environ, "PATH": path, "PYTHONPATH": python_path}
+        self.environment.setdefault("GHGS_CACHE", str(folder / "cache"))
+        self.exported: list[str] = []
+
+    def run(self, text: str, is_python: bool = False) -> tuple[int, float, str]:
+        """Exit code, seconds and output of a command."""
+        script = "\n".join(["set -e", *self.exported, text])
+        argv = [sys.executable, "-c", text] if is_python else ["bash", "-c", script]
+        start = time.monotonic()
+        process = subprocess.Popen(
+            argv, cwd=self.folder, env=self.environment, stdin=subprocess.DEVNULL, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+        try:
+            output, _ = process.communicate(timeout=LIMIT)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output = f"{process.communicate()[0]}\nstopped after {LIMIT} s"
+        self.exported += re.findall(r"\bexport \w+=\S+", text) if process.returncode == 0 else []
+        return process.returncode, time.monotonic() - start, output
+
+
+def check(document: str, folder: Path, fast: bool = False, listed: bool = False) -> Counter:
+    """Run the commands of one document and print a line for each.
+
+    Args:
+        document: relative to the repository.
+        folder: where the document's folder is made.
+        fast: only what ends within seconds.
+        listed: only print what would be run.
+
+    Returns:
+        How many commands ran, failed, and were left out.
+    """
+    count: Counter = Counter()
+    chosen = [c for c in commands(document) if not fast or (c.is_fast and c.reason is None)]
+    reader = Reader(folder, document)
+    needs_files = [c for c in chosen if c.reason is None and not re.search(r"--help|dry_run=true", c.text)]
+    if needs_files and not listed:
+        for text in BEFORE.get(document, ()):
+            _one(reader, f"{document} (before)", text.splitlines()[0], text, False, [], count)
+    for command in chosen:
+        place = f"{document}:{command.line}"
+        script, reasons = command.script()
+        if command.reason is not None:
+            count["not run"] += 1
+            print(f"not run            {place}  {command.title}  ({command.reason})", flush=True)
+        elif listed:
+            print(f"run                {place}  {command.title}{_why(reasons)}")
+        else:
+            _one(reader, place, command.title, script, command.is_python, reasons, count)
+    return count
+
+
+def _one(
+    reader: Reader, place: str, title: str, script: str, is_python: bool, reasons: list[str], count: Counter
+) -> None:
+    code, seconds, output = reader.run(script, is_python)
+    count["failed" if code else "ran"] += 1
+    print(
+        f"{'ran' if code == 0 else 'FAILED':<7}{seconds:5.0f} s {code:>4}  {place}  {title}{_why(reasons)}",
+        flush=True,
+    )
+    if code:
+        print(f"    as run: {script}\n    " + "\n    ".join(output.strip().splitlines()[-15:]), flush=True)
+
+
+def _why(reasons: Sequence[str]) -> str:
+    return f"  ({'; '.join(dict.fromkeys(reasons))})" if reasons else ""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("documents", nargs="*", help="relative to the repository; none: all")
+    parser.add_argument(
+        "--fast", action="store_true", help="only what ends within seconds, and what that needs"
+    )
+    parser.add_argument("--list", action="store_true", help="print what would be run")
+    parser.add_argument("--folder", type=Path, help="where commands are run; none: a temporary folder")
+    given = parser.parse_args(arguments)
+    unknown = sorted(set(given.documents) - set(documents()))
+    if unknown:
+        parser.error(f"expected documents of {', '.join(documents())}; found {unknown[0]}")
+    total: Counter = Counter()
+    with tempfile.TemporaryDirectory(prefix="documents") as temporary:
+        folder = (given.folder or Path(temporary)).resolve()
+        for document in given.documents or documents():
+            total += check(document, folder, given.fast, given.list)
+    print(", ".join(f"{total[kind]} {kind}" for kind in ("ran", "failed", "not run")))
+    return 1 if total["failed"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,160 @@
+"""Paths, config groups, keys and names in the documents exist, and their commands of some seconds run."""
+
+import importlib.util
+import pydoc
+import re
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CONF = REPOSITORY / "conf"
+VERBS = ("train", "evaluate", "predict", "prepare", "table", "import", "export")
+# What a reader makes, and options and names that are not in this repository.
+MADE = ("conf/data/my_people.yaml", "conf/sweep/<name>.yaml")
+OPTIONS = {
+    "data": {"my_people"},
+    "hydra/launcher": {"joblib", "ray", "submitit_local"},
+    "hydra/sweeper": {"optuna"},
+}
+NO_MODULES = {"ghgs_lit.plugins", "ghgs_lit.others"}  # a group of entry points, and the format of a file
+
+
+def _script(name: str):
+    spec = importlib.util.spec_from_file_location(name, REPOSITORY / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+check_documents = _script("check_documents")
+DOCUMENTS = check_documents.documents()
+
+
+def code(document: str) -> list[str]:
+    """Code of a document, each span on one line: in running text, and in blocks except Python."""
+    text = (REPOSITORY / document).read_text()
+    blocks = re.findall(r"^```(?!python)\w*\n(.*?)^```", text, re.M | re.S)
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    return [" ".join(s.split()) for s in [*re.findall(r"(?<!`)`([^`]+)`(?!`)", prose), *blocks]]
+
+
+@lru_cache
+def groups() -> dict[str, set[str]]:
+    """Options of each config group, such as ``bounds: box, hull, none``."""
+    found: dict[str, set[str]] = {}
+    for path in CONF.rglob("*.yaml"):
+        group = path.parent.relative_to(CONF).as_posix()
+        found.setdefault(group, set(OPTIONS.get(group, ()))).add(path.stem)
+    found.pop(".")
+    return found
+
+
+@lru_cache
+def keys() -> frozenset[str]:
+    """Dotted keys of all verbs and of every option of every group, inner nodes included."""
+    found: set[str] = set()
+
+    def collect(node: object, prefix: str = "") -> None:
+        for name, value in node.items() if isinstance(node, dict) else ():
+            found.add(f"{prefix}{name}")
+            collect(value, f"{prefix}{name}.")
+
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        runs = [(verb, []) for verb in VERBS]
+        for group, options in groups().items():
+            if "/" not in group and group not in ("experiment", "sweep"):
+                shipped = options - OPTIONS.get(group, set())
+                runs += [("train", [f"{group}={option}"]) for option in sorted(shipped)]
+        for verb, overrides in runs:
+            collect(OmegaConf.to_container(compose(verb, overrides=overrides), resolve=False))
+    return frozenset(found)
+
+
+def is_key(name: str) -> bool:
+    """Whether a verb has the key; within its section a text may leave the beginning out."""
+    return name in keys() or any(key.endswith(f".{name}") for key in keys())
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_paths_exist(document):
+    """A file that was moved must not live on in links and paths of the documents."""
+    text, folder = (REPOSITORY / document).read_text(), (REPOSITORY / document).parent
+    links = {t.split("#")[0] for t in re.findall(r"\]\(([^)\s]+)\)", text) if not t.startswith("http")}
+    missing = [link for link in links if link and not (folder / link).exists()]
+    rooms = r"(?<![\w/.])((?:ghgs_lit|conf|docs|scripts|tests|benchmarks)/[\w./<>-]*)"
+    named = {path.rstrip("/.") for span in code(document) for path in re.findall(rooms, span)}
+    missing += [p for p in named if "<" not in p and p not in MADE and not (REPOSITORY / p).exists()]
+    assert not missing
+
+
+def test_rooms_exist():
+    """The tables of CONTRIBUTING must name folders and files of today's package."""
+    cells = re.findall(r"^\|(.+)\|$", (REPOSITORY / "CONTRIBUTING.md").read_text(), re.M)
+    named = {n for cell in cells for n in re.findall(r"`([\w/]+\.(?:py|yaml)|[\w/]+/)`", cell)}
+    named |= {n for cell in cells for n in re.findall(r"`(\w+)`", cell.split("|")[0])}
+    assert len(named) > 20
+    assert not [n for n in named if not any((REPOSITORY / root / n).exists() for root in ("ghgs_lit", "."))]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_names_of_the_package_exist(document):
+    """``ghgs_lit.data.reader.Reader`` and the like must be importable, also in Python blocks."""
+    text = (REPOSITORY / document).read_text()
+    named = {name.rstrip(".") for name in re.findall(r"(?<![\w/])ghgs_lit(?:\.[A-Za-z]\w*)+", text)}
+    assert not [name for name in named - NO_MODULES if pydoc.locate(name) is None]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_options_and_keys_exist(document):
+    """Every ``group=option`` must be a file of ``conf``, and every ``key=value`` a key of some verb."""
+    wrong = []
+    for span in code(document):
+        # values of Python, in calls, are none of a configuration
+        for name, value in re.findall(r"(?<![\w.$<{+/-])([a-z][\w./]*)=([^\s'`]*)", span):
+            if name in groups():
+                options = re.findall(r"[a-z]\w*", value) if re.match(r"[a-z]", value) else []
+                wrong += [f"{name}={option}" for option in options if option not in groups()[name] | {"null"}]
+            elif not re.match(r"True|False|\(", value) and not name.startswith("hydra.") and not is_key(name):
+                wrong.append(f"{name}={value}")
+        dotted = re.fullmatch(r"([a-z_]+)(?:\.[a-z_]+)+", span)
+        is_file = re.search(r"\.(json|jsonl|csv|md|py|yaml|npy|npz|pth|pt|ckpt|db|ply|txt|png|tex)$", span)
+        if dotted and not is_file and dotted[1] in keys() and not is_key(span):
+            wrong.append(span)
+    assert not wrong
+
+
+def test_commands_are_read_whole(tmp_path, monkeypatch):
+    """Continuation lines, comments, Python blocks and commands in running text must all be found."""
+    text = "`ghgs table\nruns=x` `ghgs table`\n```bash\n# no\nghgs train a=1 \\\n    'b=#2'  # yes\n```\n"
+    (tmp_path / "a.md").write_text(f"{text}```python\nx = 1\ny = 2\n```\n")
+    monkeypatch.setattr(check_documents, "ROOT", tmp_path)
+    found = check_documents.commands("a.md")
+    assert [(c.line, c.text) for c in found] == [
+        (1, "ghgs table runs=x"),
+        (5, "ghgs train a=1 'b=#2'"),
+        (9, "x = 1\ny = 2\n"),
+    ]
+
+
+def test_a_command_that_fails_is_reported(tmp_path, monkeypatch, capsys):
+    """A script that hides failures would pass every document."""
+    (tmp_path / "README.md").write_text("```bash\ntrue\nghgs no_such_verb\n```\n")
+    monkeypatch.setattr(check_documents, "ROOT", tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
+    assert check_documents.main(["README.md", "--folder", str(tmp_path / "out")]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("ran ")
+    assert lines[1].startswith("FAILED ")
+    assert lines[-1] == "1 ran, 1 failed, 0 not run"
+
+
+@pytest.mark.parametrize("document", check_documents.FAST)
+def test_fast_commands_run(document, tmp_path):
+    """Commands of the documents that take seconds must run as printed (all of them: `make documents`)."""
+    assert check_documents.main(["--fast", document, "--folder", str(tmp_path)]) == 0
