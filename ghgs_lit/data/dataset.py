@@ -60,6 +60,11 @@ class DataSet(ABC):
         return
 
     @property
+    def facts(self) -> dict[str, str]:
+        """What readers of results must know about how the files are read."""
+        return {"name": self.name}
+
+    @property
     def folder(self) -> Path:
         """The folder ``root``.
 
