@@ -44,6 +44,10 @@ class DataSet(ABC):
     def reader(self, phase: str, strict: bool = True) -> Reader:
         """The photographs of ``train`` or ``val``; ``strict`` as for :class:`Reader`."""
 
+    def has(self, phase: str) -> bool:
+        """Whether there are subjects of a phase; data without ``train`` can be evaluated."""
+        return True
+
     def prepare(self) -> None:
         """Make what training needs and is missing; called once, before any process reads."""
         return

@@ -64,6 +64,12 @@ class Rendered(DataSet):
         """Names of the subjects of a phase; None: all that are found."""
         return None
 
+    def has(self, phase: str) -> bool:
+        names = self.subject_names(phase)
+        if names is None:
+            return (self.folder / phase).is_dir() or bool(Completeness(self.folder).plan.get(phase))
+        return len(names) > 0
+
     def further_bodies(self) -> BodyReader | None:
         """Where bodies are read from that are not among the renders."""
         return None
