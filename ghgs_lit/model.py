@@ -86,6 +86,11 @@ class GHGS(nn.Module):
         choice("precision", name, PRECISIONS)
         self._precision = name
 
+    @property
+    def side_multiple(self) -> int:
+        """What height and width of photographs must be divisible by, in pixels."""
+        return 1 if pad_to_patches in self.crops else self.encoder.patch_size
+
     def forward(self, batch: Batch) -> Prediction:
         """Gaussians, depths and points of a batch.
 
@@ -93,7 +98,7 @@ class GHGS(nn.Module):
             InputError: :func:`check_batch` refuses the batch.
         """
         patch = self.encoder.patch_size
-        check_batch(batch, 1 if pad_to_patches in self.crops else patch)
+        check_batch(batch, self.side_multiple)
         # From whole photographs: a crop hides what lies at its border, padding invents something there.
         bounds = self.bounds(batch)
         crops = []

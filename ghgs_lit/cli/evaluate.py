@@ -5,7 +5,7 @@ from typing import Any
 import lightning.pytorch as L
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import build_data, choices, pick_device, with_trained_data
+from ghgs_lit.cli.inputs import build_data, check_size, choices, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.encoder import open_cache
@@ -52,6 +52,9 @@ def run(cfg: DictConfig) -> None:
     methods, facts = _methods(config, device)
     cache = methods["model"].model.feature_cache if "model" in methods else None
     data = build_data(config)
+    for method in methods.values():
+        if isinstance(method, ModelMethod):
+            check_size(data, method.model)
     data.prepare_data()
     facts |= {"verb": "evaluate", "choices": choices()}
     path = measure_and_write(methods, data, config, directory, device, **facts)

@@ -5,19 +5,31 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch import LightningDataModule
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config import build
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.model import GHGS
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
-def build_data(config: Mapping[str, Any]) -> LightningDataModule:
+def build_data(config: Mapping[str, Any]) -> PhotographsDataModule:
     """The configured data with its view and target protocols."""
     return build(
         config["data"], "data", views=config["views"], targets=config["targets"], seed=config["seed"]
     )
+
+
+def check_size(data: PhotographsDataModule, model: GHGS) -> None:
+    """Refuse photographs that ``model`` cannot take, before any of them is made or read.
+
+    Raises:
+        InputError: their sides are not divisible by the model's patch.
+    """
+    size, multiple = data.options.size, model.side_multiple
+    expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
+    require(not any(side % multiple for side in size), "data.size", expected, list(size))
 
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:

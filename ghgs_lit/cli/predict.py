@@ -6,7 +6,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import build_data, pick_device, with_trained_data
+from ghgs_lit.cli.inputs import build_data, check_size, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError, require
@@ -42,6 +42,7 @@ def run(cfg: DictConfig) -> None:
     model.precision = config["precision"]
     renderer = build(config["renderer"], "renderer")
     data = build_data(config)
+    check_size(data, model)
     data.prepare_data()
     batch = subject_batch(data, config["subject"], config["split"]).to(device)
     name = batch.subjects[0]

@@ -40,7 +40,7 @@ def render(data: PhotographsDataModule) -> None:
     else:
         data.prepare_data()
     for phase in PHASES:
-        log.info("%s: %d subjects", phase, len(data.subjects(phase)))
+        log.info("%s: %d subjects", phase, len(data.subjects(phase)) if data.dataset.has(phase) else 0)
 
 
 def check(data: PhotographsDataModule, folder: Path, min_iou: float) -> None:

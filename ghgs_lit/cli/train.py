@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import build_data, choices, overrides
+from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder import open_cache
@@ -146,6 +146,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     L.seed_everything(config["seed"], workers=True, verbose=False)
     data = build_data(config)
     model = GHGS.from_config(config)
+    check_size(data, model)
     model.feature_cache = open_cache(config.get("feature_cache"), model.recalibration.tokens)
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)

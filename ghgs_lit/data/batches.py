@@ -12,8 +12,8 @@ from torch.utils.data import Dataset, DistributedSampler
 from ghgs_lit.config.settings import image_size, set_fields
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name, subject_rng
-from ghgs_lit.data.view import View
-from ghgs_lit.errors import require
+from ghgs_lit.data.view import RESAMPLINGS, View
+from ghgs_lit.errors import choice, require
 from ghgs_lit.types import Batch, Cameras, Targets
 
 
@@ -24,6 +24,7 @@ class BatchOptions:
     Attributes:
         size: side or (height, width) of the inputs in pixels.
         target_size: the same of the targets (null: as ``size``).
+        resampling: how photographs get this size, as for :func:`ghgs_lit.data.view.resize_view`.
         batch_size: samples of one step in each process.
         steps_per_epoch: null passes once over the subjects.
         body_vertices: number of vertices drawn from each body, always the same ones (null: all).
@@ -38,6 +39,7 @@ class BatchOptions:
 
     size: int | Sequence[int]
     target_size: int | Sequence[int] | None = None
+    resampling: str = "area"
     batch_size: int = 1
     steps_per_epoch: int | None = None
     body_vertices: int | None = 4096
@@ -55,6 +57,7 @@ class BatchOptions:
             require(value is None or value >= 1, f"data.{key}", "at least 1 or null", value)
         for key in ("workers", "cache_images_mb"):
             require(getattr(self, key) >= 0, f"data.{key}", "at least 0", getattr(self, key))
+        choice("data.resampling", self.resampling, RESAMPLINGS)
         size = image_size("data.size", self.size)
         target = size if self.target_size is None else image_size("data.target_size", self.target_size)
         positions = {int(k): list(v) for k, v in (self.evaluation_positions or {}).items()}

@@ -156,6 +156,11 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:
         return report
     for phase in PHASES:
         try:
+            if phase == "train" and not dataset.has(phase):
+                report.notes.append(
+                    "train: expected subjects to train on; found none (evaluation needs none)"
+                )
+                continue
             reader = dataset.reader(phase, strict=False)
         except InputError as error:
             report.problems.append(str(error))
@@ -167,7 +172,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:
         report.problems += [seen.problem for seen in found.seen if seen.problem]
         report.notes += _notes(dataset.published.get(phase), phase, reader, found)
     if not report.problems:
-        report.problems += _cannot_sample(data, targets)
+        report.problems += _cannot_sample(data, targets, "train" in report.phases)
     report.problems = list(dict.fromkeys(report.problems))
     return report
 
@@ -220,10 +225,11 @@ def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> li
     return notes
 
 
-def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol) -> list[str]:
+def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol, training: bool) -> list[str]:
     """Why the protocols cannot draw their samples from what is there, if they cannot."""
     try:
-        data.training_sampler(targets)
+        if training:
+            data.training_sampler(targets)
         data.evaluation_loader(targets=targets)
     except InputError as error:
         return [str(error)]

@@ -73,6 +73,11 @@ class PhotographsDataModule(LightningDataModule):
         self.seed = seed
         self._builders: dict[str, BatchBuilder] = {}
 
+    @property
+    def facts(self) -> dict[str, str]:
+        """What readers of results must know about how the data was read."""
+        return {**self.dataset.facts, "resampling": self.options.resampling}
+
     def prepare_data(self) -> None:
         self.dataset.prepare()
 
@@ -81,9 +86,9 @@ class PhotographsDataModule(LightningDataModule):
         choice("split", phase, PHASES)
         if phase not in self._builders:
             o, reader = self.options, self.dataset.reader(phase)
-            inputs = targets = Photographs(reader, o.size, o.cache_images_mb)
+            inputs = targets = Photographs(reader, o.size, o.cache_images_mb, o.resampling)
             if o.target_size != o.size:
-                targets = Photographs(reader, o.target_size, o.cache_images_mb)
+                targets = Photographs(reader, o.target_size, o.cache_images_mb, o.resampling)
             self._builders[phase] = BatchBuilder(inputs, targets, o.apply_mask, o.body_vertices, o.depths)
         return self._builders[phase]
 

@@ -44,6 +44,10 @@ class DataSet(ABC):
     def reader(self, phase: str, strict: bool = True) -> Reader:
         """The photographs of ``train`` or ``val``; ``strict`` as for :class:`Reader`."""
 
+    def has(self, phase: str) -> bool:
+        """Whether there are subjects of a phase; data without ``train`` can be evaluated."""
+        return True
+
     def prepare(self) -> None:
         """Make what training needs and is missing; called once, before any process reads."""
         return
@@ -58,6 +62,11 @@ class DataSet(ABC):
     def check_targets(self, targets: TargetProtocol) -> None:
         """Refuse a configured target protocol whose views this data set never has."""
         return
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What readers of results must know about how the files are read."""
+        return {"name": self.name}
 
     @property
     def folder(self) -> Path:

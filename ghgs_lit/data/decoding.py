@@ -6,12 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
+from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 
 # How far from the image's centre a principal point may lie, as a fraction of the side.
 _OFF_CENTRE = 0.25
+# How far from a proper rotation a stored one may be: rounding, but no other unit or axis.
+_ROTATION_TOLERANCE = 1e-3
+# Modes of images that convert to RGB without a loss of range, and the EXIF orientation that changes nothing.
+_EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
 Shapes = Sequence[tuple[int | None, ...]]
@@ -33,8 +38,22 @@ def read_image(path: Path) -> Image.Image:
     return image
 
 
-def to_rgb(image: Image.Image) -> np.ndarray:
-    """[h, w, 3] uint8 from an image of any mode."""
+def read_photograph(path: Path) -> np.ndarray:
+    """[h, w, 3] uint8 from an image of 8 bits a channel (grey, palette, RGB or CMYK, with or without alpha).
+
+    Raises:
+        InputError: it is missing or cannot be decoded, has other values, or is to be turned when it is shown.
+    """
+    image = read_image(path)
+    if image.mode not in _EIGHT_BITS:
+        raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
+    turn = image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT)
+    if turn != _UPRIGHT:
+        # Programs disagree on whether a calibration belongs to the stored or to the turned pixels.
+        raise InputError(
+            f"{path}: expected a photograph that is stored as it is shown (its mask and camera fit these "
+            f"pixels); found EXIF orientation {turn}"
+        )
     return np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
 
 
@@ -46,9 +65,11 @@ def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
         size: (height, width) of its photograph, which it must have too.
 
     Raises:
-        InputError: it is missing, cannot be decoded, or has another size.
+        InputError: it is missing, cannot be decoded, has another size, or is no map of whole numbers.
     """
     array = np.asarray(read_image(path))
+    if array.dtype.kind not in "bui":
+        raise InputError(f"{path}: expected whole numbers; found {array.dtype}")
     if array.shape[:2] != size:
         raise InputError(
             f"{path}: expected the size of its photograph, {size[0]}x{size[1]}; "
@@ -102,7 +123,7 @@ def _describe(shapes: Shapes) -> str:
 
 
 def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
-    """Finite intrinsics [3, 3] with focal lengths above 0, float64.
+    """Finite intrinsics [3, 3] with focal lengths above 0 and the last row 0 0 1, float64.
 
     Raises:
         InputError: they are not; it names ``place``.
@@ -112,6 +133,7 @@ def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
         raise InputError(
             f"{place}: expected focal lengths above 0; found {intrinsics[0, 0]}, {intrinsics[1, 1]}"
         )
+    _check_last_row(place, intrinsics)
     return intrinsics
 
 
@@ -121,12 +143,50 @@ def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
     Raises:
         InputError: they are not; it names ``place``.
     """
-    extrinsics = np.concatenate((check_array(place, extrinsics, [(3, 4), (4, 4)])[:3], [[0, 0, 0, 1]]))
+    extrinsics = check_array(place, extrinsics, [(3, 4), (4, 4)])
+    if len(extrinsics) == 3:
+        extrinsics = np.concatenate((extrinsics, [[0, 0, 0, 1]]))
+    _check_last_row(place, extrinsics)
     rotation = extrinsics[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         found = np.round(rotation, 3).tolist()
         raise InputError(f"{place}: expected a rotation in the first three columns; found {found}")
     return extrinsics
+
+
+def _check_last_row(place: Path | str, matrix: np.ndarray) -> None:
+    """Refuse a camera's matrix that is transposed or scaled as a whole."""
+    expected = np.eye(len(matrix))[-1]
+    if np.abs(matrix[-1] - expected).max() > 1e-6:
+        raise InputError(
+            f"{place}: expected the last row {expected.astype(int).tolist()}; found {matrix[-1].tolist()}"
+        )
+
+
+def check_view(place: Path | str, view: View) -> None:
+    """Refuse values that are not a :class:`View`'s, such as photographs of floats or masks of numbers.
+
+    Args:
+        place: how messages refer to the photograph.
+        view: what a reader gave.
+
+    Raises:
+        InputError: an array has another shape or type, or the camera is bad.
+    """
+    size = np.shape(view.mask)
+    arrays = {"image": (view.image, (*size, 3), np.uint8), "mask": (view.mask, size, np.bool_)}
+    if view.inverse_depth is not None:
+        arrays["inverse_depth"] = (view.inverse_depth, size, np.uint16)
+    for name, (array, shape, dtype) in arrays.items():
+        if len(size) != 2 or np.shape(array) != shape or getattr(array, "dtype", None) != dtype:
+            expected = f"{dtype.__name__} of {'x'.join(map(str, shape))}"
+            found = (
+                f"{getattr(array, 'dtype', type(array).__name__)} of {'x'.join(map(str, np.shape(array)))}"
+            )
+            raise InputError(f"{place}: {name}: expected {expected}; found {found}")
+    check_intrinsics(f"{place}: intrinsics", view.intrinsics)
+    check_extrinsics(f"{place}: extrinsics", view.extrinsics)
 
 
 def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:

@@ -23,9 +23,8 @@ from ghgs_lit.data.decoding import (
     check_extrinsics,
     check_intrinsics,
     read_array,
-    read_image,
     read_map,
-    to_rgb,
+    read_photograph,
 )
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
@@ -57,9 +56,19 @@ class Rendered(DataSet):
         super().__post_init__()
         choice("data.pixel_centers", self.pixel_centers, _PIXEL_CENTERS)
 
+    @property
+    def facts(self) -> dict[str, str]:
+        return {**super().facts, "pixel_centers": self.pixel_centers}
+
     def subject_names(self, phase: str) -> list[str] | None:
         """Names of the subjects of a phase; None: all that are found."""
         return None
+
+    def has(self, phase: str) -> bool:
+        names = self.subject_names(phase)
+        if names is None:
+            return (self.folder / phase).is_dir() or bool(Completeness(self.folder).plan.get(phase))
+        return len(names) > 0
 
     def further_bodies(self) -> BodyReader | None:
         """Where bodies are read from that are not among the renders."""
@@ -156,8 +165,8 @@ class Layout(Reader):
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         stem = self._folder(name, "img", position) / str(view)
         paths = [stem.with_suffix(suffix) for suffix in _IMAGE_SUFFIXES]
-        image = read_image(next((path for path in paths if path.exists()), paths[0]))
-        size = (image.height, image.width)
+        image = read_photograph(next((path for path in paths if path.exists()), paths[0]))
+        size = image.shape[:2]
         mask = read_map(self._folder(name, "mask", position) / f"{view}.png", size)
         path = self._folder(name, "depth", position) / f"{view}.png"
         inverse = None
@@ -165,12 +174,16 @@ class Layout(Reader):
             inverse = read_map(path, size)
             if inverse.dtype == np.uint8:
                 raise InputError(f"{path}: expected 16 bits of inverse depth; found 8")
+            if inverse.min() < 0 or inverse.max() > np.iinfo(np.uint16).max:
+                raise InputError(
+                    f"{path}: expected 16 bits of inverse depth; found {inverse.min()} to {inverse.max()}"
+                )
             inverse = inverse.astype(np.uint16)
         intrinsics, extrinsics = _read_camera(self._folder(name, "parm", position), view)
         intrinsics[:2, 2] += self._shift
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
         return View(
-            image=to_rgb(image),
+            image=image,
             mask=mask > mask.max() / 2,
             inverse_depth=inverse,
             intrinsics=intrinsics.astype(np.float32),

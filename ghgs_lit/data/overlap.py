@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ghgs_lit.data.view import View, resize_image
+from ghgs_lit.data.resampling import area_image
+from ghgs_lit.data.view import View
 
 # Fewer vertices than this do not fill a silhouette.
 MIN_VERTICES = 500
@@ -59,7 +60,7 @@ def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
     cells = min(_CELLS, int(1.2 * np.sqrt(len(vertices))))
     cell = max(np.ptp(pixels[:, 1]) / cells, 1.0)
     rows, columns = max(round(height / cell), 1), max(round(width / cell), 1)
-    share = resize_image(np.repeat(view.mask[..., None] * np.uint8(255), 3, -1), rows, columns)[..., 0]
+    share = area_image(np.repeat(view.mask[..., None] * np.uint8(255), 3, -1), rows, columns)[..., 0]
     hit = np.zeros((rows, columns), bool)
     row = (pixels[:, 1] * rows / height).astype(int)
     column = (pixels[:, 0] * columns / width).astype(int)

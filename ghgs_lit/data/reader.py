@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ghgs_lit.data.decoding import check_array, check_view
 from ghgs_lit.data.view import View, resize_view
 from ghgs_lit.errors import InputError, require
 
@@ -118,11 +119,18 @@ class Photographs:
         reader: decodes the files.
         size: (height, width) in pixels; None keeps the stored size.
         cache_mb: MiB of decoded views and bodies kept in each process; the least recently used go first.
+        resampling: as for :func:`resize_view`.
     """
 
-    def __init__(self, reader: Reader, size: tuple[int, int] | None = None, cache_mb: float = 0) -> None:
+    def __init__(
+        self,
+        reader: Reader,
+        size: tuple[int, int] | None = None,
+        cache_mb: float = 0,
+        resampling: str = "area",
+    ) -> None:
         require(cache_mb >= 0, "data.cache_images_mb", "at least 0", cache_mb)
-        self.reader, self.size = reader, size
+        self.reader, self.size, self.resampling = reader, size, resampling
         self.cached_bytes, self.cache_bytes = 0, int(cache_mb * 2**20)
         self._cache: OrderedDict[tuple, View | np.ndarray | None] = OrderedDict()
 
@@ -130,21 +138,34 @@ class Photographs:
         """One photograph, resized together with its intrinsics; arguments as :meth:`Reader.read_view`.
 
         Raises:
-            InputError: a file is missing or bad, or the mask is empty.
+            InputError: a file is missing or bad, the reader gives something else than a :class:`View` has, or
+                the mask is empty.
         """
 
         def read() -> View:
             stored = self.reader.read_view(name, position, view, depth)
+            place = self.reader.place(name, position, view)
+            check_view(place, stored)
             if not stored.mask.any():
-                place = self.reader.place(name, position, view)
                 raise InputError(f"{place}: expected a subject in the mask; found none")
-            return stored if self.size is None else resize_view(stored, *self.size)
+            return stored if self.size is None else resize_view(stored, *self.size, self.resampling)
 
         return self._cached((name, position, view, depth), read)
 
     def body(self, name: str) -> np.ndarray | None:
-        """Body vertices as :meth:`Reader.read_body`."""
-        return self._cached((name,), lambda: self.reader.read_body(name))
+        """Body vertices as :meth:`Reader.read_body`.
+
+        Raises:
+            InputError: they are bad.
+        """
+
+        def read() -> np.ndarray | None:
+            vertices = self.reader.read_body(name)
+            if vertices is not None:
+                check_array(f"{name}: body", vertices, [(None, 3)])
+            return vertices
+
+        return self._cached((name,), read)
 
     def _cached(self, key: tuple, read: Callable[[], Any]) -> Any:
         if key in self._cache:

@@ -1,10 +1,13 @@
-"""One photograph with its mask, depth and camera, and how it is resized."""
+"""One photograph with its mask, depth and camera."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from PIL import Image
 
+from ghgs_lit.data.resampling import area_image, area_mask, centered_depth, release_image, release_mask
+
+#: How photographs are resized: by exact areas, or as the authors' code does.
+RESAMPLINGS = ("area", "release")
 _DEPTH_SCALE = 1 << 15
 
 
@@ -61,37 +64,28 @@ def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, ext
     return View(image, mask, None, intrinsics.astype(np.float32), extrinsics.astype(np.float32))
 
 
-def resize_view(view: View, height: int, width: int) -> View:
-    """Resize the image by area, mask and depth to the nearest value, and scale the intrinsics."""
+def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
+    """Resize a photograph with its mask and depth map, and scale its intrinsics.
+
+    Args:
+        view: the photograph.
+        height, width: the new size in pixels.
+        resampling: one of :data:`RESAMPLINGS`. ``area`` keeps everything at its place; ``release`` resizes
+            photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Depth is
+            that at the centres of the mask's new pixels in both.
+    """
     h, w = view.mask.shape
     if (h, w) == (height, width):
         return view
-    scale = np.array([[width / w], [height / h]], np.float64)
     intrinsics = view.intrinsics.astype(np.float64)
-    intrinsics[:2] *= scale
-    depth = view.inverse_depth
+    intrinsics[:2] *= np.array([[width / w], [height / h]])
+    resize = {"area": (area_image, area_mask), "release": (release_image, release_mask)}
+    image, mask = resize[resampling]
+    inverse, subject = view.inverse_depth, mask(view.mask, height, width)
     return replace(
         view,
-        image=resize_image(view.image, height, width),
-        mask=_resize_nearest(view.mask, height, width),
-        inverse_depth=None if depth is None else _resize_nearest(depth, height, width),
+        image=image(view.image, height, width),
+        mask=subject,
+        inverse_depth=None if inverse is None else centered_depth(inverse, height, width) * subject,
         intrinsics=intrinsics.astype(np.float32),
     )
-
-
-def resize_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width, 3] uint8: the mean over the area of each new pixel; bicubic when it grows."""
-    h, w = image.shape[:2]
-    if (h, w) == (height, width):
-        return image
-    if h % height == w % width == 0:  # a quarter of the time of the general case
-        return np.asarray(Image.fromarray(image).reduce((w // width, h // height)))
-    method = Image.Resampling.BOX if width <= w and height <= h else Image.Resampling.BICUBIC
-    return np.asarray(Image.fromarray(image).resize((width, height), method))
-
-
-def _resize_nearest(array: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The value at the centre of each new pixel, so that mask and depth agree and mix no surfaces."""
-    rows = ((np.arange(height) + 0.5) * array.shape[0] / height).astype(int)
-    columns = ((np.arange(width) + 0.5) * array.shape[1] / width).astype(int)
-    return np.ascontiguousarray(array[rows[:, None], columns])

@@ -84,7 +84,7 @@ def measure_and_write(
     source = provenance(
         config,
         seed=config["seed"],
-        data={"name": config["data"].get("name"), "split": evaluation["split"]},
+        data={**data.facts, "split": evaluation["split"]},
         protocol={
             "metrics": metrics.protocol,
             "views": evaluation["views"],

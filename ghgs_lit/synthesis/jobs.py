@@ -1,14 +1,15 @@
 """Renders many people into the layout: in several processes, resumable, the same files for the same seed.
 
-Workers are spawned (a fork of a process that runs threads may hang), so a script that calls
-:func:`render_people` needs ``if __name__ == "__main__":``. Workers write into workspaces only; the process
-that holds the lock moves finished subjects to their place.
+Workers are spawned (a fork of a process that runs threads may hang): each imports the script that called
+:func:`render_people`, which therefore needs ``if __name__ == "__main__":``. Workers write into workspaces
+only; the process that holds the lock moves finished subjects to their place.
 """
 
 import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -27,7 +28,7 @@ from ghgs_lit.config.settings import from_config, image_size, set_fields
 from ghgs_lit.data.layout import position_name
 from ghgs_lit.data.sampling import VIEW_NUMBERS, subject_rng
 from ghgs_lit.data.view import View, encode_depth
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
@@ -35,6 +36,7 @@ from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.writing import write_body, write_view
 
+_GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: increase it when photographs of the same settings would change.
 RENDER_VERSION = 1
 
@@ -166,8 +168,9 @@ def render_people(
         How many subjects were rendered now.
 
     Raises:
-        InputError: ``root`` holds something else, or a person is bad.
+        InputError: ``root`` holds something else, a person is bad, or the script has no main guard.
     """
+    _check_main_guard()
     require(workers is None or workers >= 0, "data.render_workers", "at least 0 or null", workers)
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
@@ -211,9 +214,21 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
             for future in as_completed(futures):
                 yield future.result()
         except BrokenProcessPool as error:
-            raise RuntimeError("a rendering process died (out of memory?); run again to go on") from error
+            raise RuntimeError(
+                f"a rendering process died: the script lacks `{_GUARD}`, or memory ran out (repeat to go on)"
+            ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _check_main_guard() -> None:
+    """End a worker that runs the calling script again: it would wait for its parent, and that for it."""
+    # Set by multiprocessing while a spawned process imports the main module of its parent.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise InputError(
+            f"{sys.argv[0]}: expected `{_GUARD}` around what a script does (rendering processes import it), "
+            "or data.render_workers=0; found neither"
+        )
 
 
 def _start_worker() -> None:

@@ -1,14 +1,24 @@
-"""``ghgs prepare task=miniature``: a small data set of built-in people in a published layout."""
+"""``ghgs prepare task=miniature``: a small data set of built-in people in a published layout.
 
-from collections.abc import Callable, Mapping
+A folder that is written gets the marker ``miniature.json``, which lists its files, so that real data of the
+same names is never overwritten.
+"""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from ghgs_lit.data.dataset import DataSet, required_folder
 from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
+from ghgs_lit.files import write_text_atomically
 from ghgs_lit.synthesis.miniatures import humman, thuman2, zju_mocap
 from ghgs_lit.synthesis.thuman2 import THuman2
+
+#: In each folder that a miniature was written to: which files are its own.
+MARKER = "miniature.json"
 
 
 def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
@@ -24,7 +34,8 @@ def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed:
         The folders that were written.
 
     Raises:
-        InputError: no layout is published for the data set, or it has no folder.
+        InputError: no layout is published for the data set, it has no folder, or files lie there that are not
+            a miniature's.
     """
     for kind, make in _MAKERS.items():
         if isinstance(dataset, kind):
@@ -36,24 +47,73 @@ def _root(dataset: DataSet) -> Path:
     return required_folder("data.root", "a folder to write to", dataset.root)
 
 
+@contextlib.contextmanager
+def _writing(*folders: Path) -> Iterator[None]:
+    """Refuse folders that hold anything but a miniature; mark as its own what is written into them.
+
+    Raises:
+        InputError: a folder holds other files.
+    """
+    for folder in folders:
+        _check_own(folder)
+    for folder in folders:
+        _mark(folder, None)
+    yield
+    for folder in folders:
+        _mark(folder, _files(folder))
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(
+        p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir() and p.name != MARKER
+    )
+
+
+def _mark(folder: Path, files: list[str] | None) -> None:
+    """Note the files of a miniature; None while they are written, so that a killed run can be repeated."""
+    write_text_atomically(folder / MARKER, json.dumps({"files": files}, indent=1))
+
+
+def _check_own(folder: Path) -> None:
+    """Refuse a folder with files that no miniature wrote."""
+    marker = folder / MARKER
+    found = _files(folder) if folder.is_dir() else []
+    if marker.is_file():
+        own = json.loads(marker.read_text())["files"]
+        found = [] if own is None else sorted(set(found) - set(own))
+    if found:
+        raise InputError(
+            f"{folder}: expected an empty folder, or a miniature and nothing else; found "
+            f"{len(found)} other files such as {found[0]}"
+        )
+
+
 def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     chosen = []
     for phase, splits in dataset.splits.items():
         chosen += [s for split in splits for s in split.sequences][: people[phase]]
-    return zju_mocap.make(_root(dataset), chosen, size, seed)
+    root = _root(dataset)
+    with _writing(root):
+        return zju_mocap.make(root, chosen, size, seed)
 
 
 def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    return humman.make(_root(dataset), dataset.split["val"], people, size, seed)
+    root = _root(dataset)
+    with _writing(root, humman.body_models(root)):
+        return humman.make(root, dataset.split["val"], people, size, seed)
 
 
 def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     """Raw scans in ``source`` if it is given, else renders in ``root`` as the published scripts make them."""
     if dataset.source is not None:
-        return [thuman2.make_raw(dataset.source_folder, people, size, seed)]
+        source = dataset.source_folder
+        with _writing(source, thuman2.fit_folder(source)):
+            return [thuman2.make_raw(source, people, size, seed)]
     if dataset.root is None:
         raise InputError("data.root: expected a folder for renders, or data.source for scans; found none")
-    return [thuman2.make(_root(dataset), people, size, seed)]
+    root = _root(dataset)
+    with _writing(root):
+        return [thuman2.make(root, people, size, seed)]
 
 
 _MAKERS: dict[type[DataSet], Callable[..., list[Path]]] = {

@@ -89,7 +89,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
     )  # fmt: skip
     assert code == 0
     content = json.loads(Path("run/metrics.json").read_text())
-    assert content["provenance"]["data"] == {"name": "my_people", "split": "val"}
+    assert content["provenance"]["data"] == {"name": "my_people", "resampling": "area", "split": "val"}
     assert content["provenance"]["training"]["steps"] == 2
     # One subject; every camera that is not an input is a target.
     before = {row["target"]: row["psnr"] for row in content["rows"]}

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import subprocess
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,6 +162,38 @@ def test_workers_end_with_the_process_that_started_them(scans, tmp_path, signal_
     while any(map(lives, workers)) and time.monotonic() < limit:
         time.sleep(0.05)
     assert not any(map(lives, workers))
+
+
+UNGUARDED = """
+import sys
+from pathlib import Path
+from ghgs_lit.synthesis.jobs import render_people
+from ghgs_lit.synthesis.scans import ScanSource
+from tests.helpers.people import RIG, TINY
+
+Path(sys.argv[1], str(__import__("os").getpid())).touch()
+root, scans = map(Path, sys.argv[2:])
+render_people(root, {"train": ["s0", "s1"]}, ScanSource(scans), RIG, TINY, 0, workers=2)
+"""
+
+
+def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
+    """Its workers run the script again and would wait for their parent, which waits for them, for ever."""
+    script, pids = tmp_path / "script.py", tmp_path / "pids"
+    script.write_text(UNGUARDED)
+    pids.mkdir()
+    ended = subprocess.run(
+        [sys.executable, script, pids, tmp_path / "out", scans],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    assert ended.returncode == 1
+    assert 'the script lacks `if __name__ == "__main__":`' in ended.stderr.splitlines()[-1]
+    assert f'{script}: expected `if __name__ == "__main__":` around' in ended.stderr
+    assert not any(lives(int(p.name)) for p in pids.iterdir())
 
 
 def test_several_workers_make_the_same_files(scans, reference, tmp_path):

@@ -59,6 +59,9 @@ class HuMMan(DataSet):
         names = (p.name for p in self.folder.iterdir() if p.is_dir() and _SEQUENCE.fullmatch(p.name))
         return sorted(set(names) - set(self.split["val"]))
 
+    def has(self, phase: str) -> bool:
+        return len(self.sequences(phase)) > 0
+
     def reader(self, phase: str, strict: bool = True) -> HuMManReader:
         names, limit = self.sequences(phase), self.limit[phase]
         model = None if self.smpl_model is None else Path(self.smpl_model).expanduser()

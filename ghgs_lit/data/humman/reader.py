@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ghgs_lit.data.decoding import check_center, check_name, read_image, read_map, to_rgb
+from ghgs_lit.data.decoding import check_center, check_name, read_image, read_map, read_photograph
 from ghgs_lit.data.humman.cameras import KINECTS, Calibration, read_calibration
 from ghgs_lit.data.humman.depth import surface_points
 from ghgs_lit.data.humman.smpl import Body, read_parameters
@@ -98,7 +98,7 @@ class HuMManReader(FrameReader):
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
         frame = self.frames[name]
         path = _file(frame.folder, "kinect_color", position, frame.number)
-        image = to_rgb(read_image(path))
+        image = read_photograph(path)
         mask = self._mask(frame, position, image.shape[:2])
         intrinsics = frame.cameras.intrinsics[position]
         check_center(path, intrinsics, *image.shape[:2])

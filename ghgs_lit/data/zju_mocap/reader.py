@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ghgs_lit.config.settings import set_fields
-from ghgs_lit.data.decoding import check_center, check_name, read_array, read_image, read_map, to_rgb
+from ghgs_lit.data.decoding import check_center, check_name, read_array, read_map, read_photograph
 from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
@@ -122,7 +122,7 @@ class ZJUMoCapReader(FrameReader):
         frame = self.frames[name]
         photograph = frame.annotations.frames[frame.index][position]
         path = _find(frame.folder, photograph, photograph.suffix)
-        image = to_rgb(read_image(path))
+        image = read_photograph(path)
         mask = self._mask(frame.folder, photograph, image.shape[:2])
         intrinsics = frame.annotations.intrinsics[position]
         check_center(path, intrinsics, *image.shape[:2])

@@ -58,7 +58,12 @@ def make(
         folder.mkdir(parents=True, exist_ok=True)
         _write_sequence(folder, size / _COLOR[1], frames, (seed, index), manual=index >= len(training))
         folders.append(folder)
-    return [*folders, write_stand_in(root.with_name(f"{root.name}_body_models"))]
+    return [*folders, write_stand_in(body_models(root))]
+
+
+def body_models(root: Path) -> Path:
+    """The folder of the stand-in for SMPL, beside the sequences in ``root``."""
+    return root.with_name(f"{root.name}_body_models")
 
 
 def _write_sequence(

@@ -94,10 +94,15 @@ def make_raw(source: Path, people: Mapping[str, int], size: int, seed: int) -> P
     for name in (name for phase in listed.values() for name in phase):
         scan = _scan(name, seed)
         _write_obj(source / name, name, scan.mesh, 2 * size)
-        _write_fit(source.parent / FIT_FOLDER / name, scan, subject_rng(seed + 1, name))
+        _write_fit(fit_folder(source) / name, scan, subject_rng(seed + 1, name))
     for phase, phase_names in listed.items():
         (source / f"split_{phase}.txt").write_text("".join(f"{name}\n" for name in phase_names))
     return source
+
+
+def fit_folder(source: Path) -> Path:
+    """The folder of the fits, beside the scans in ``source``."""
+    return source.parent / FIT_FOLDER
 
 
 def _write_obj(folder: Path, name: str, mesh: TexturedMesh, texture_size: int) -> None:

@@ -1,0 +1,55 @@
+"""``ghgs prepare`` on data that is incomplete on purpose, and what is refused before anything is made."""
+
+import json
+
+import pytest
+
+from ghgs_lit.config import build, compose
+from tests.cli.test_main import call
+from tests.helpers.people import write_obj_scan
+
+RENDER = ("render.size=42", "render.samples=1", "render.positions=[0,4,8,12]", "render_workers=0", "size=42")
+
+
+@pytest.fixture
+def scans(tmp_path):
+    for name in ("s0", "s1"):
+        write_obj_scan(tmp_path / "scans", name)
+    return tmp_path / "scans"
+
+
+def test_data_without_training_people_can_be_made_and_evaluated(monkeypatch, capsys, scans, tmp_path):
+    """A split with an empty ``train`` renders its val people, and task=check passes with a note."""
+    keys = ["data=scans", f"data.source={scans}", f"data.root={tmp_path / 'out'}"]
+    keys += [f"data.{key}" for key in RENDER] + ["data.split={train: [], val: [s0, s1]}"]
+    run = (f"hydra.run.dir={tmp_path / 'run'}",)
+    code, _, err = call(monkeypatch, capsys, "prepare", "task=render", *keys, *run)
+    assert (code, err.count("expected")) == (0, 0)
+    code, _, err = call(monkeypatch, capsys, "prepare", "task=check", *keys, *run)
+    assert code == 0, err
+    content = json.loads((tmp_path / "run" / "check.json").read_text())
+    assert [phase["subjects"] for phase in content["phases"].values()] == [2]
+    assert content["notes"][0].startswith("train: expected subjects to train on; found none")
+    cfg = compose("prepare", keys)
+    data = build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=0)
+    assert next(iter(data.evaluation_loader())).subjects == ("s0",)
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ("train", "data.size=150", "encoder=vggt_nano"),
+        ("evaluate", "data=synthetic", "baselines=[untrained]", "data.size=[140,150]", "device=cpu"),
+    ],
+)
+def test_a_size_that_the_model_cannot_take_is_refused_before_rendering(monkeypatch, capsys, tmp_path, argv):
+    """data.size=150 with a patch of 14: no person is rendered first."""
+
+    def rendered(*_, **__):
+        raise AssertionError("rendered before the check")
+
+    monkeypatch.setattr("ghgs_lit.synthesis.datasets.render_people", rendered)
+    run = (f"data.cache_dir={tmp_path}", f"hydra.run.dir={tmp_path / 'run'}")
+    code, _, err = call(monkeypatch, capsys, *argv, *run)
+    assert code == 1
+    assert "data.size: expected sides divisible by the patch size 14 (or model.pad=multiple); found [1" in err
