@@ -13,7 +13,8 @@ from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
 from ghgs_lit.encoder import FeatureCache, VGGTEncoder
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.crop import crop_to_subject, pad_to_patches
+from ghgs_lit.geometry.crop import crops_to_subject, pad_to_patches
+from ghgs_lit.geometry.groups import Group, join_groups, select_elements
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
@@ -71,7 +72,7 @@ class GHGS(nn.Module):
         self.unprojection = unprojection
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
-        self.crops = [pad_to_patches] * (pad == "multiple") + [crop_to_subject] * crop
+        self.crop, self.pad = crop, pad
         #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | None = None
         self.precision = "inherit"
@@ -93,26 +94,34 @@ class GHGS(nn.Module):
             InputError: :func:`check_batch` refuses the batch.
         """
         patch = self.encoder.patch_size
-        check_batch(batch, 1 if pad_to_patches in self.crops else patch)
+        pads = self.pad == "multiple"
+        check_batch(batch, 1 if pads else patch)
         # From whole photographs: a crop hides what lies at its border, padding invents something there.
         bounds = self.bounds(batch)
-        crops = []
-        for crop_of in self.crops:
-            crop = crop_of(batch.masks, patch)
-            if crop is not None:
-                batch, bounds = crop.cut_batch(batch), crop.cut_bounds(bounds)
-                crops.append(crop)
+        padding = pad_to_patches(batch.masks, patch) if pads else None
+        if padding is not None:
+            batch, bounds = padding.cut_batch(batch), padding.cut_bounds(bounds)
         with precision_of(self.precision, batch.images.device):
-            tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache)
-            tokens = self._in_heads_precision(tokens)
-            depth_maps = self.depth_head(tokens, batch, bounds)
-            points = self.unprojection(depth_maps, tokens, batch)
-            tokens = self.recalibration(tokens, points, batch)
-            gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
-        prediction = Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps)
-        for crop in reversed(crops):
-            prediction = crop.paste_prediction(prediction)
-        return prediction
+            prediction = self._cropped_stages(batch, bounds) if self.crop else self._stages(batch, bounds)[0]
+        return prediction if padding is None else padding.paste_prediction(prediction)
+
+    def _stages(self, batch: Batch, bounds: DepthBounds | None) -> tuple[Prediction, Tokens]:
+        tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache)
+        tokens = self._in_heads_precision(tokens)
+        depth_maps = self.depth_head(tokens, batch, bounds)
+        points = self.unprojection(depth_maps, tokens, batch)
+        tokens = self.recalibration(tokens, points, batch)
+        gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
+        return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps), tokens
+
+    def _cropped_stages(self, batch: Batch, bounds: DepthBounds | None) -> Prediction:
+        """The stages on crops around the subject; elements whose crops have one size run together."""
+        groups = []
+        for elements, crop in crops_to_subject(batch.masks, self.encoder.patch_size):
+            part, own = select_elements(batch, bounds, elements)
+            prediction, tokens = self._stages(crop.cut_batch(part), crop.cut_bounds(own))
+            groups.append(Group(elements, crop.paste_prediction(prediction), tokens.image))
+        return groups[0].prediction if len(groups) == 1 else join_groups(groups)
 
     def _in_heads_precision(self, tokens: Tokens) -> Tokens:
         """Tokens of an encoder whose weights are in half precision, for heads whose weights are not."""
