@@ -299,6 +299,47 @@ def bad_batches():
     }
 
 
+def spoiled(name, index, value):
+    tensor = getattr(make_batch(1, 2), name).clone()
+    tensor[index] = value
+    return {name: tensor}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (spoiled("images", (0, 1, 2, 0, 0), torch.nan), r"batch.images: expected finite .*\[\[0, 1\]\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), torch.inf), r"batch.images: .*\[\[0, 0\]\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), 255.0), r"batch.images: .*within \[0, 1\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), -0.5), r"batch.images: .*within \[0, 1\]"),
+        (spoiled("depths", (0, 1, 3, 3), torch.nan), r"batch.depths: .*\[\[0, 1\]\]"),
+        (spoiled("depths", (0, 1, 3, 3), -1.0), r"batch.depths: expected finite depths"),
+        ({"body_vertices": [torch.tensor([[0.0, torch.nan, 0.0]])]}, r"batch.body_vertices: .* element 0"),
+        ({"images": torch.zeros(1, 2, 3, 56, 56, dtype=torch.uint8)}, r"batch.images: .*torch.uint8"),
+        ({"masks": torch.ones(1, 2, 56, 56, dtype=torch.uint8)}, r"batch.masks: .*torch.uint8"),
+    ],
+)  # fmt: skip
+def test_broken_values_are_refused_where_they_are(changes, message):
+    """One NaN in the background left no Gaussian, in silence; photographs as uint8 gave colours of 254."""
+    batch = make_batch(1, 2)
+    for name, value in changes.items():
+        object.__setattr__(batch, name, value)  # the types' own checks run in tests only
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match=message):
+        model(batch)
+
+
+def test_checks_of_values_can_be_left_out():
+    """Somebody who checked the values already pays nothing; others are refused by the model."""
+    bad = dataclasses.replace(make_batch(1, 2), **spoiled("images", (0, 1, 2, 0, 0), torch.nan))
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
+        model(bad)
+    model.check_inputs = False
+    model(bad)
+    assert not GHGS.from_config(config("model.check_inputs=false")).check_inputs
+
+
 @pytest.mark.parametrize("message", list(bad_batches()))
 def test_a_bad_batch_is_refused_by_name(message):
     """Bad input must be refused with the name of the field."""
