@@ -118,6 +118,7 @@ class Batch(_TensorStruct):
 
     ``body_vertices`` are points of the body's surface in metres, ``depths`` true z-depths in metres (0 where
     there is none); both None where the data set has none. ``views`` names the photographs of each subject.
+    ``corners`` is the pixel (row, column) of the photograph at which each image begins; None: (0, 0).
     """
 
     images: Float[Tensor, "B V 3 H W"]
@@ -128,6 +129,7 @@ class Batch(_TensorStruct):
     depths: Float[Tensor, "B V H W"] | None = None
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
+    corners: Int[Tensor, "B V 2"] | None = None
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import operator
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ from torch import nn
 
 import ghgs_lit
 from ghgs_lit.bounds import NoBounds, SubjectBox
+from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.geometry.unprojection import Unprojection
@@ -20,16 +22,10 @@ from ghgs_lit.model import GHGS, check_batch
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Cameras, DepthBounds, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
-from tests.helpers.models import close, config, make_model
-from tests.helpers.scenes import CASES, fixture, make_batch
+from tests.helpers.models import ATTRIBUTES, close, config, make_model
+from tests.helpers.scenes import CASES, fixture, hard_subjects, make_batch, stack
 
-
-def element(batch, b):
-    index = slice(b, b + 1)
-    return Batch(
-        batch.images[index], batch.masks[index], batch.cameras[index], depths=batch.depths[index],
-        body_vertices=None,
-    )  # fmt: skip
+PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
 
 
 class GivenTokens(nn.Module):
@@ -99,17 +95,45 @@ def test_the_pipeline_matches_the_release(dtype):
         torch.testing.assert_close(layer, target, atol=bounds[f"fused_{index}"], rtol=0)
 
 
-@pytest.mark.parametrize("model_name", ["paper", "hull"])
-def test_a_batch_of_two_equals_two_singles(model_name):
-    """A result must not depend on the other subjects of its batch."""
-    batch = make_batch(2, 3)
-    model = make_model(f"model={model_name}").eval()
+@pytest.mark.parametrize("skip", PRESETS)
+@pytest.mark.parametrize("kind", ["model=paper", "model=hull", "compat=release"])
+def test_a_batch_equals_its_elements_one_by_one(kind, skip):
+    """A result must not depend on the other subjects of its batch: one crop for all moved depths by 11 mm."""
+    singles = list(hard_subjects().values())
+    model = make_model(kind, f"skip={skip}").eval()
     with torch.no_grad():
-        together = model(batch)
-        for b in range(2):
-            alone = model(element(batch, b))
+        together = model(stack(singles))
+        tokens = []
+        for b, single in enumerate(singles):
+            alone = model(single)
+            tokens.append(alone.points.tokens)
             close(together.gaussians[b], alone.gaussians)
+            assert torch.equal(together.gaussians[b].image - 3 * b, alone.gaussians.image)
+            assert torch.equal(together.gaussians[b].pixel, alone.gaussians.pixel)
             assert torch.equal(together.depth_valid[b], alone.depth_valid[0])
+            valid = alone.depth_valid[0]
+            for name in ("depth", "depth_maps.confidence", "points.pixels"):
+                found, expected = (operator.attrgetter(name)(p) for p in (together, alone))
+                torch.testing.assert_close(found[b][valid], expected[0][valid], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(together.points.tokens, torch.cat(tokens), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("skip", PRESETS)
+@pytest.mark.parametrize("name", list(hard_subjects()))
+def test_extreme_masks_give_one_finite_gaussian_for_each_pixel(name, skip):
+    """Empty, full and single-pixel masks, two people, a subject at the border: nothing is lost or NaN."""
+    batch = hard_subjects()[name]
+    with torch.no_grad():
+        prediction = make_model(f"skip={skip}")(batch)
+        gaussians = prediction.gaussians
+        assert gaussians.splits == (batch.masks.sum().item(),)
+        assert all(getattr(gaussians, field).isfinite().all() for field in ATTRIBUTES)
+        assert torch.equal(prediction.depth_valid, batch.masks)
+        image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+        assert torch.equal(gaussians.image, image)
+        assert torch.equal(gaussians.pixel, pixel)
+        if skip == "exact":
+            close(gaussians, make_model("skip=none")(batch).gaussians)
 
 
 @pytest.mark.parametrize(
@@ -208,12 +232,15 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
     assert config("model=hull", "recalibration=paper")["recalibration"]["s_min"] == 0.01
 
 
-def test_order_of_later_views_does_not_matter():
-    """The order of the later views must not change the Gaussians."""
-    batch = make_batch(1, 4)
-    order = torch.tensor([0, 3, 1, 2])  # the encoder treats the first view apart
+@pytest.mark.parametrize("ablation", ["full", "neither"])
+@pytest.mark.parametrize("skip", PRESETS)
+def test_order_of_later_views_does_not_matter(skip, ablation):
+    """The order of the later views must not change the Gaussians (the encoder treats the first apart)."""
+    batch = make_batch(1, 4, zoom=0.6)
+    order = torch.tensor([0, 3, 1, 2])
     swapped = Batch(batch.images[:, order], batch.masks[:, order], batch.cameras[:, order])
-    model = make_model().double()
+    # On the image plane ties at the last distance are broken by the order of views: leave none out.
+    model = make_model(f"skip={skip}", f"ablation={ablation}", "recalibration.k=1000").double()
     double = torch.float64
     wide = [Batch(x.images.to(double), x.masks, x.cameras.to(double)) for x in (batch, swapped)]
     with torch.no_grad():
@@ -270,6 +297,47 @@ def bad_batches():
             batch, masks=changed(batch.masks, 1, False)
         ),
     }
+
+
+def spoiled(name, index, value):
+    tensor = getattr(make_batch(1, 2), name).clone()
+    tensor[index] = value
+    return {name: tensor}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (spoiled("images", (0, 1, 2, 0, 0), torch.nan), r"batch.images: expected finite .*\[\[0, 1\]\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), torch.inf), r"batch.images: .*\[\[0, 0\]\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), 255.0), r"batch.images: .*within \[0, 1\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), -0.5), r"batch.images: .*within \[0, 1\]"),
+        (spoiled("depths", (0, 1, 3, 3), torch.nan), r"batch.depths: .*\[\[0, 1\]\]"),
+        (spoiled("depths", (0, 1, 3, 3), -1.0), r"batch.depths: expected finite depths"),
+        ({"body_vertices": [torch.tensor([[0.0, torch.nan, 0.0]])]}, r"batch.body_vertices: .* element 0"),
+        ({"images": torch.zeros(1, 2, 3, 56, 56, dtype=torch.uint8)}, r"batch.images: .*torch.uint8"),
+        ({"masks": torch.ones(1, 2, 56, 56, dtype=torch.uint8)}, r"batch.masks: .*torch.uint8"),
+    ],
+)  # fmt: skip
+def test_broken_values_are_refused_where_they_are(changes, message):
+    """One NaN in the background left no Gaussian, in silence; photographs as uint8 gave colours of 254."""
+    batch = make_batch(1, 2)
+    for name, value in changes.items():
+        object.__setattr__(batch, name, value)  # the types' own checks run in tests only
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match=message):
+        model(batch)
+
+
+def test_checks_of_values_can_be_left_out():
+    """Somebody who checked the values already pays nothing; others are refused by the model."""
+    bad = dataclasses.replace(make_batch(1, 2), **spoiled("images", (0, 1, 2, 0, 0), torch.nan))
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
+        model(bad)
+    model.check_inputs = False
+    model(bad)
+    assert not GHGS.from_config(config("model.check_inputs=false")).check_inputs
 
 
 @pytest.mark.parametrize("message", list(bad_batches()))

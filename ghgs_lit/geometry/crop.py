@@ -48,7 +48,14 @@ class Crop(ABC):
             masks=self.cut(batch.masks, False),
             depths=None if batch.depths is None else self.cut(batch.depths),
             cameras=batch.cameras.cropped(self.top, self.left, self.height, self.width),
+            corners=self._corners(batch),
         )
+
+    def _corners(self, batch: Batch) -> Int[Tensor, "B V 2"]:
+        shape, device = batch.masks.shape[:2], batch.masks.device
+        starts = (torch.as_tensor(start, device=device).expand(shape) for start in (self.top, self.left))
+        corners = torch.stack(tuple(starts), dim=-1)
+        return corners if batch.corners is None else corners + batch.corners
 
     def paste_prediction(self, prediction: Prediction) -> Prediction:
         """The prediction of a cut batch on the photographs; nothing is valid outside the crop."""
@@ -148,25 +155,40 @@ def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> PaddedCrop 
     return PaddedCrop(-(missing[0] // 2), -(missing[1] // 2), *sides, full=(height, width))
 
 
-def crop_to_subject(masks: Bool[Tensor, "B V H W"], multiple: int, margin: int = 2) -> SubjectCrop:
-    """Crops that hold the mask of every view.
+def crops_to_subject(
+    masks: Bool[Tensor, "B V H W"], multiple: int, margin: int = 2
+) -> list[tuple[Int[Tensor, " n"], SubjectCrop]]:
+    """Crops that hold the mask of every view, for each group of elements with crops of one size.
 
-    One size serves the whole batch: that of the largest mask. A view with an empty mask gets the middle of
-    its image.
+    One size serves the views of an element: that of its largest mask. It does not depend on the other
+    elements. A view with an empty mask gets the middle of its image.
 
     Args:
         masks: of the photographs.
         multiple: sides are rounded up to it; the patch size, which divides the photographs.
         margin: pixels around the mask, where the photograph has them.
+
+    Returns:
+        The elements of each group, and their crop.
     """
-    starts, sizes = [], []
+    middles, sizes = [], []
     for axis in (2, 3):
         length = masks.shape[axis]
         first, last = first_and_last(masks.any(5 - axis))
         first, last = (torch.where(last < 0, length // 2, end) for end in (first, last))
-        needed = int((last - first).max()) + 1 + 2 * margin
-        size = min(-(-needed // multiple) * multiple, length)
-        sizes.append(size)
+        needed = (last - first).amax(1) + 1 + 2 * margin
+        sizes.append((-(-needed // multiple) * multiple).clamp(max=length))
+        middles.append(first + last + 1)
+    groups: dict[tuple[int, int], list[int]] = {}
+    for element, size in enumerate(torch.stack(sizes, -1).tolist()):
+        groups.setdefault(tuple(size), []).append(element)
+    full, found = tuple(masks.shape[2:]), []
+    for size, elements in groups.items():
+        index = torch.tensor(elements, device=masks.device)
         # Integer division keeps the middle; the clamp keeps the crop inside the image.
-        starts.append(((first + last + 1 - size) // 2).clamp(0, length - size))
-    return SubjectCrop(*starts, *sizes, full=tuple(masks.shape[2:]))
+        starts = [
+            ((middle[index] - side) // 2).clamp(0, length - side)
+            for middle, side, length in zip(middles, size, full, strict=True)
+        ]
+        found.append((index, SubjectCrop(*starts, *size, full=full)))
+    return found

@@ -115,16 +115,16 @@ def ssim_map(
     """Structural similarity (Wang et al. 2004), K = 0.01, 0.03, moments in float32 or wider.
 
     Args:
-        image, target: at least as large as the window.
+        image, target: at least as large as the window; of any size with ``zeros``.
         padding: ``valid`` gives only the pixels whose window lies inside the image (scikit-image averages
             these); the others keep the image's size: ``reflect`` mirrors the image at its border
             (torchmetrics), ``zeros`` surrounds it with black (the authors' evaluation).
     """
     choice("ssim.padding", padding, PADDINGS)
     found = tuple(image.shape[-2:])
-    require(
-        min(found) >= SSIM_WINDOW, "ssim", f"images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels", found
-    )
+    large = padding == "zeros" or min(found) >= SSIM_WINDOW
+    expected = f"images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, or padding zeros"
+    require(large, "ssim", expected, found)
     with torch.autocast(image.device.type, enabled=False):
         x, y = at_least_float32(image), at_least_float32(target)
         if padding != "valid":

@@ -43,8 +43,15 @@ def attention_of(
     element = tokens.image // batch.masks.shape[1]
     chosen = (takes_part & (element == element[query])).nonzero()[:, 0]
     place = int((chosen == query).nonzero())
-    positions = recalibration.positions(tokens, points)[chosen]
-    near = nearest_neighbors(positions, tokens.image[chosen], recalibration.k, recalibration.neighbors)
+    positions = recalibration.positions(tokens, points, batch)[chosen]
+    places = recalibration.places(tokens, batch)
+    near = nearest_neighbors(
+        positions,
+        tokens.image[chosen],
+        recalibration.k,
+        recalibration.neighbors,
+        None if places is None else places[chosen],
+    )
     block, valid = recalibration.block, near.valid[place]
     cosines = neighbor_cosines(tokens.semantic[chosen], near) if block.similarity != "none" else None
     weights = [block.attention_weights(layer[chosen], place, near, cosines) for layer in tokens.latent]

@@ -26,9 +26,13 @@ class Neighbors:
 
 @torch.no_grad()
 def nearest_neighbors(
-    points: Float[Tensor, "n d"], view: Int[Tensor, " n"], k: int, mode: str = "all"
+    points: Float[Tensor, "n d"],
+    view: Int[Tensor, " n"],
+    k: int,
+    mode: str = "all",
+    places: Int[Tensor, " n"] | None = None,
 ) -> Neighbors:
-    """The ``min(k, n)`` nearest points of each point, nearest first, ties by index.
+    """The ``min(k, n)`` nearest points of each point, nearest first.
 
     Distances are computed from differences in float32 or wider (the expansion into products would lose
     digits far from the origin).
@@ -38,56 +42,85 @@ def nearest_neighbors(
         view: the view of each token.
         k: number of neighbours.
         mode: ``all`` searches all views, the point itself included; ``other_views`` all views but the
-            query's own (where there is no such point, the query itself); ``mixed`` takes up to ``k // 2``
-            from the query's own view, itself included, and the rest from other views.
+            query's own (where there is no such point, the query itself); ``mixed`` takes ``k // 2`` from the
+            query's own view, itself included, before the rest from other views; where one of the two has too
+            few, the other one fills up.
+        places: a number of each token's place, for points that have equal distances by construction. The
+            place whose number is nearest to the query's comes first, so that opposite places alternate, and
+            at each place the views take turns, the query's own first. None: ties by index.
     """
     choice("recalibration.neighbors", mode, MODES)
     require(k >= 1, "recalibration.k", "1 or more", k)
     points = at_least_float32(points)
     n = points.shape[0]
+    k = min(k, n)
+    views = 0 if places is None or n == 0 else int(view.max() - view.min()) + 1
     # Filled, not concatenated: small results between freed distances would keep that memory occupied.
-    index = torch.empty(n, min(k, n), dtype=torch.int64, device=points.device)
+    index = torch.empty(n, k, dtype=torch.int64, device=points.device)
     valid = torch.empty_like(index, dtype=torch.bool)
     for rows in even_parts(n, _BLOCK // max(n, 1)):
-        part = _nearest_to_block(points, view, rows, min(k, n), mode)
+        distance = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
+        ranks = None if places is None else _turns(places, view, views, rows)
+        part = _nearest_to_block(distance, ranks, view, rows, k, mode)
         index[rows], valid[rows] = part.index, part.valid
     return Neighbors(index, valid)
 
 
-def _nearest_to_block(points: Tensor, view: Tensor, block: slice, k: int, mode: str) -> Neighbors:
-    distance = torch.cdist(points[block], points, compute_mode="donot_use_mm_for_euclid_dist")
+def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "m n"]:
+    """Ranks of tokens at equal distances from the queries of a block; see ``places``."""
+    apart = places - places[block, None]
+    return (2 * apart.abs() + (apart < 0)) * views + (view - view[block, None]) % views
+
+
+def _nearest_to_block(
+    distance: Tensor, ranks: Tensor | None, view: Tensor, block: slice, k: int, mode: str
+) -> Neighbors:
     if mode == "all":
-        index = _smallest(distance, k)
+        index = _smallest(distance, ranks, k)
         return Neighbors(index, torch.ones_like(index, dtype=torch.bool))
     same = view[block, None] == view
-    other = _allowed(distance, ~same, k if mode == "other_views" else k - k // 2)
+    other = _allowed(distance, ranks, ~same, k)
     if mode == "mixed":
-        own = _allowed(distance, same, k // 2)
-        return Neighbors(
-            torch.cat((own.index, other.index), dim=1), torch.cat((own.valid, other.valid), dim=1)
-        )
+        return _shared(_allowed(distance, ranks, same, k), other, k)
     alone = ~other.valid.any(1)
-    query = torch.arange(len(points), device=points.device)[block]
+    query = torch.arange(len(view), device=view.device)[block]
     index = torch.where(alone[:, None], query[:, None], other.index)
-    first = torch.arange(index.shape[1], device=points.device) == 0
+    first = torch.arange(index.shape[1], device=view.device) == 0
     return Neighbors(index, other.valid | (alone[:, None] & first))
 
 
-def _allowed(distance: Tensor, mask: Tensor, k: int) -> Neighbors:
+def _shared(own: Neighbors, other: Neighbors, k: int) -> Neighbors:
+    """``k // 2`` of ``own`` and the rest of ``other``, and more of one where the other has too few."""
+    own_count, other_count = (found.valid.sum(1, keepdim=True) for found in (own, other))
+    from_own = torch.minimum(own_count, (k - other_count).clamp(min=k // 2))
+    place = torch.arange(k, device=from_own.device)
+    taken = torch.cat((place < from_own, place < k - from_own), dim=1)
+    # Both together have k points at least: exactly k are taken.
+    return Neighbors(
+        torch.cat((own.index, other.index), dim=1)[taken].view_as(own.index), torch.ones_like(own.valid)
+    )
+
+
+def _allowed(distance: Tensor, ranks: Tensor | None, mask: Tensor, k: int) -> Neighbors:
     """The nearest points inside ``mask``; the distances of all others become NaN, which sorts last."""
-    index = _smallest(torch.where(mask, distance, float("nan")), k)
+    distance = torch.where(distance.isnan(), float("inf"), distance)
+    index = _smallest(torch.where(mask, distance, float("nan")), ranks, k)
     return Neighbors(index, mask.gather(1, index))
 
 
-def _smallest(distance: Float[Tensor, "m n"], k: int) -> Int[Tensor, "m k"]:
-    """Columns of the ``k`` smallest values of each row, ascending, ties by column; NaN is largest.
+def _smallest(distance: Float[Tensor, "m n"], ranks: Int[Tensor, "m n"] | None, k: int) -> Int[Tensor, "m k"]:
+    """Columns of the ``k`` smallest values of each row, ascending, ties by rank or column; NaN is largest.
 
-    ``topk`` does not define the order of equal values, so the column is part of the key: the bits of a
-    non-negative float32 sort like its value, and the column fills the lower half.
+    ``topk`` does not define the order of equal values, so the rank is part of the key: the bits of a
+    non-negative float32 sort like its value, and the rank fills the lower half.
     """
     if distance.dtype == torch.float64:
-        return distance.sort(dim=1, stable=True).indices[:, :k]
-    column = torch.arange(distance.shape[1], device=distance.device)
+        if ranks is None:
+            return distance.sort(dim=1, stable=True).indices[:, :k]
+        order = ranks.argsort(dim=1)
+        return order.gather(1, distance.gather(1, order).sort(dim=1, stable=True).indices[:, :k])
+    if ranks is None:
+        ranks = torch.arange(distance.shape[1], device=distance.device)
     # The sign of inf - inf is negative on some machines; abs() clears it.
-    key = (distance.abs().view(torch.int32).long() << 32) | column
-    return key.topk(k, dim=1, largest=False).values & 0xFFFFFFFF
+    key = (distance.abs().view(torch.int32).long() << 32) | ranks
+    return key.topk(k, dim=1, largest=False).indices

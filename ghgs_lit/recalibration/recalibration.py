@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
@@ -19,6 +19,9 @@ from ghgs_lit.types import Batch, Points, Tokens
 #: Number of cosines that are held at once (bounds memory).
 _COSINES = 1 << 21
 
+#: More than the columns of a photograph: numbers its pixels in reading order.
+_ROW = 1 << 15
+
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
 
@@ -32,7 +35,7 @@ class Recalibration(nn.Module):
         similarity: see :class:`SemanticAttention`.
         s_min: see :class:`SemanticAttention`.
         neighborhood: where distances are measured: ``xyz``, between token points; ``image_plane``, between
-            token centres in units of the image's longer side, shared by all views (the paper without
+            token centres in pixels of the whole photographs, as if all views were one (the paper without
             unprojection); ``feature``, between directions of the semantic features.
         neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
         tokens: which tokens take part: ``subject``, those with a valid point, others pass unchanged; ``all``,
@@ -64,7 +67,7 @@ class Recalibration(nn.Module):
         Args:
             tokens: from the encoder.
             points: of the same tokens.
-            batch: the number of elements and views is read.
+            batch: the number of elements and views is read, and where images were cut from photographs.
         """
         batch_size, views = batch.masks.shape[:2]
         chosen = self.takes_part(points).nonzero()[:, 0]
@@ -74,10 +77,14 @@ class Recalibration(nn.Module):
 
         image = part(tokens.image)
         counts = torch.bincount(image // views, minlength=batch_size).tolist()
+        places = self.places(tokens, batch)
         neighbors = [
-            nearest_neighbors(positions, views_of, self.k, self.neighbors)
-            for positions, views_of in zip(
-                part(self.positions(tokens, points)).split(counts), image.split(counts), strict=True
+            nearest_neighbors(positions, views_of, self.k, self.neighbors, places_of)
+            for positions, views_of, places_of in zip(
+                part(self.positions(tokens, points, batch)).split(counts),
+                image.split(counts),
+                [None] * batch_size if places is None else part(places).split(counts),
+                strict=True,
             )
         ]
         cosines = None
@@ -94,13 +101,27 @@ class Recalibration(nn.Module):
         """Which tokens are recalibrated and can be neighbours."""
         return points.tokens_valid | (self.tokens == "all")
 
-    def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
+    def positions(self, tokens: Tokens, points: Points, batch: Batch) -> Float[Tensor, "N d"]:
         """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
         if self.neighborhood == "xyz":
             return points.tokens.detach()
         if self.neighborhood == "feature":
             return F.normalize(at_least_float32(tokens.semantic), dim=-1)
-        return (torch.stack((tokens.column, tokens.row), dim=-1) + 0.5) / max(tokens.grid[2:])
+        # Half pixels are exact in float32, so that equal distances are equal numbers.
+        return token_corners(tokens, batch) + tokens.patch_size / 2
+
+    def places(self, tokens: Tokens, batch: Batch) -> Int[Tensor, " N"] | None:
+        """The ``places`` of :func:`nearest_neighbors`; None where equal distances are an accident."""
+        if self.neighborhood != "image_plane":
+            return None
+        row, column = token_corners(tokens, batch).unbind(-1)
+        return row * _ROW + column
+
+
+def token_corners(tokens: Tokens, batch: Batch) -> Int[Tensor, "N 2"]:
+    """The first pixel (row, column) of each token's patch in the whole photograph."""
+    inside = torch.stack((tokens.row, tokens.column), dim=-1) * tokens.patch_size
+    return inside if batch.corners is None else inside + batch.corners.flatten(0, 1)[tokens.image]
 
 
 @torch.no_grad()

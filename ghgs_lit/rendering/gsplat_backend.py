@@ -9,7 +9,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
-_FIXED = ("alpha_max", "alpha_min", "stop", "extent", "frustum_margin")
+_FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
 
 
 class BackendUnavailable(ValueError):
@@ -43,8 +43,18 @@ def load():
 def rasterize(
     gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
-    """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`."""
+    """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
+
+    A limit of alpha below the one that is compiled into gsplat applies to opacities: alphas differ by at most
+    ``1 - alpha_max`` from those of the other backends, where an opacity is above it.
+    """
     default = RasterSettings()
+    require(
+        settings.alpha_max <= default.alpha_max,
+        "renderer.settings.alpha_max",
+        f"at most {default.alpha_max}, which is compiled into gsplat",
+        settings.alpha_max,
+    )
     for name in _FIXED:
         value, fixed = getattr(settings, name), getattr(default, name)
         require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)
@@ -69,11 +79,13 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
             cameras.shape[0], channels + 2, cameras.height, cameras.width, device=gaussians.means.device
         )
     safe = _sanitized(gaussians)
+    # Opacities above the limit keep their gradient, as they do beside the middle of a splat elsewhere.
+    opacities = safe.opacities - (safe.opacities - settings.alpha_max).clamp(min=0).detach()
     values, alpha, _ = rasterization(
         means=safe.means,
         quats=safe.quaternions,
         scales=safe.scales,
-        opacities=safe.opacities,
+        opacities=opacities,
         colors=safe.colors,
         viewmats=cameras.extrinsics.float(),
         Ks=cameras.intrinsics.float(),

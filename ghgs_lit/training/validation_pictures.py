@@ -109,7 +109,7 @@ class Attention(_FirstSubjects):
         super().__init__(subjects)
         require(token is None or len(token) == 3, "callbacks.attention.token", "null or 3 numbers", token)
         self.token = None if token is None else tuple(token)
-        self._hook, self._seen = None, None
+        self._hook, self._seen = None, []
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         super().on_validation_epoch_start(trainer, pl_module)
@@ -117,15 +117,22 @@ class Attention(_FirstSubjects):
         if self._left and isinstance(stage, Recalibration):
             self._hook = stage.register_forward_pre_hook(self._see)
 
+    def on_validation_batch_start(self, *args: Any) -> None:
+        self._seen = []
+
     def _see(self, stage: Recalibration, inputs: tuple) -> None:
-        self._seen = (stage, *inputs)
+        self._seen.append((stage, *inputs))
 
     def show(
         self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
     ) -> None:
-        if self._seen is None:
+        # Subjects whose crops differ in size go through the stage apart.
+        calls = [call for call in self._seen if len(self._seen) == 1 or name in call[-1].subjects]
+        if not calls:
             return
-        stage, tokens, points, seen_batch = self._seen
+        stage, tokens, points, seen_batch = calls[0]
+        if name in seen_batch.subjects:
+            element = seen_batch.subjects.index(name)
         token = chosen_token(tokens, points, element, self.token)
         attention = None if token is None else attention_of(stage, tokens, points, seen_batch, token)
         if attention is not None:
@@ -140,7 +147,7 @@ class Attention(_FirstSubjects):
     def _forget(self) -> None:
         if self._hook is not None:
             self._hook.remove()
-        self._hook, self._seen = None, None
+        self._hook, self._seen = None, []
 
 
 class PointClouds(_FirstSubjects):

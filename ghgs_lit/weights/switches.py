@@ -15,7 +15,7 @@ def release_switches() -> dict[tuple[str, ...], Any]:
     node = OmegaConf.to_container(OmegaConf.load(conf_dir() / "compat" / "release.yaml"))
     for choice in node["defaults"]:
         ((group, option),) = ((key.removeprefix("override /"), value) for key, value in choice.items())
-        if group != "metrics":
+        if group not in ("metrics", "renderer"):  # no parts of the model
             node[group] = OmegaConf.to_container(OmegaConf.load(conf_dir() / group / f"{option}.yaml"))
     return {
         (group, key): value

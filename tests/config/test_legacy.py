@@ -87,7 +87,7 @@ def test_an_old_configuration_builds_the_same_model(name):
     assert shapes[0]
     assert (type(old.bounds), old.unprojection) == (type(new.bounds), new.unprojection)
     assert vars(old.bounds) == vars(new.bounds)
-    assert (old.crops, old.depth_head.views) == (new.crops, new.depth_head.views)
+    assert (old.crop, old.pad, old.depth_head.views) == (new.crop, new.pad, new.depth_head.views)
     assert (old.gaussian_head.views, old.gaussian_head.pixels) == ("subject", "subject")
 
 

@@ -1,12 +1,13 @@
 """An analytic subject in front of a ring of cameras, for the tests of the stages."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from safetensors.torch import load_file
 
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Cameras
 from tests.helpers.cameras import camera_ring
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -52,3 +53,38 @@ def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
     masks, depths = ellipsoid(cameras)
     images = torch.rand(batch, views, 3, height, width, generator=torch.Generator().manual_seed(3))
     return Batch(images * masks[:, :, None], masks, cameras, depths=depths)
+
+
+def stack(batches):
+    """One batch of several, which have photographs, masks, cameras and depths of one size."""
+    tensors = {
+        name: torch.cat([getattr(batch, name) for batch in batches]) for name in ("images", "masks", "depths")
+    }
+    intrinsics, extrinsics = (
+        torch.cat([getattr(batch.cameras, name) for batch in batches])
+        for name in ("intrinsics", "extrinsics")
+    )
+    height, width = batches[0].masks.shape[2:]
+    return Batch(cameras=Cameras(intrinsics, extrinsics, height, width), **tensors)
+
+
+def hard_subjects():
+    """Batches of one whose masks are extreme, by name; their crops differ in size."""
+    found = {"small": make_batch(zoom=0.5), "touching_the_border": make_batch(zoom=1.6)}
+    for name in ("empty_in_one_view", "full_in_one_view", "single_pixel"):
+        batch = make_batch(zoom=0.6)
+        masks = batch.masks.clone()
+        if name == "single_pixel":
+            masks[:] = False
+            masks[:, :, 27, 29] = True
+        else:
+            masks[0, 1] = name == "full_in_one_view"
+        found[name] = replace(batch, masks=masks)
+    batch = make_batch(zoom=0.6)
+    (first, near), (second, far) = (
+        ellipsoid(batch.cameras, CENTER + torch.tensor([shift, 0.0, 0.1]), RADII * 0.5)
+        for shift in (-0.4, 0.3)
+    )
+    depths = torch.where(first & ~(second & (far < near)), near, far)
+    found["two_people"] = replace(batch, masks=first | second, depths=depths)
+    return found

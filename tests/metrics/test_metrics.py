@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from scipy.signal import convolve2d
 from torchmetrics.functional.image import (
     peak_signal_noise_ratio,
     structural_similarity_index_measure,
@@ -136,6 +137,29 @@ def test_equal_images_and_empty_regions_are_defined():
     metric.update(image, image, ~nobody)
     assert metric.compute().item() == pytest.approx(PSNR_CAP)
     assert depth_error_mm(torch.ones(3, 30, 41), torch.ones(3, 30, 41), nobody).isnan()
+
+
+@pytest.mark.parametrize("size", [(10, 10), (3, 40), (1, 1)])
+def test_ssim_of_images_below_the_window_is_padded_as_in_the_release(size):
+    """The authors' evaluation surrounds images of any size with black; only its protocol does."""
+    image, target = torch.rand(
+        2, 2, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    x = np.arange(11) - 5.0
+    window = np.exp(-(x**2) / (2 * 1.5**2))
+    window = np.outer(window, window) / window.sum() ** 2
+
+    def blur(values):
+        return np.stack([convolve2d(v, window, mode="same") for v in values])
+
+    a, b = image[0].numpy(), target[0].numpy()
+    ma, mb = blur(a), blur(b)
+    similarity = (2 * ma * mb + 1e-4) * (2 * (blur(a * b) - ma * mb) + 9e-4)
+    similarity /= (ma**2 + mb**2 + 1e-4) * (blur(a * a) - ma**2 + blur(b * b) - mb**2 + 9e-4)
+    assert ssim(image, target, "zeros")[0].item() == pytest.approx(similarity.mean(), abs=1e-9)
+    for padding in ("reflect", "valid"):
+        with pytest.raises(InputError, match="ssim: expected images of at least 11x11"):
+            ssim(image, target, padding)
 
 
 def test_ssim_of_a_region_is_the_mean_of_its_windows():

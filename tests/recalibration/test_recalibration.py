@@ -33,7 +33,9 @@ def literal_neighbors(points, view, i, k, mode):
         return order[:k]
     if mode == "other_views":
         return other[:k] or [i]
-    return own[: k // 2] + other[: k - k // 2]
+    k = min(k, len(points))
+    from_own = min(len(own), max(k // 2, k - len(other)))
+    return own[:from_own] + other[: k - from_own]
 
 
 def literal_attention(block, x, points, semantic, view, k, mode):
@@ -137,6 +139,64 @@ def test_recalibration_is_the_literal_equations(similarity, neighbors):
                 neighbors,
             )
         torch.testing.assert_close(layer, expected, atol=1e-6, rtol=0)  # cosines are float32
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("k", [1, 2, 3, 7, 64])
+def test_mixed_neighbors_are_never_too_few(k, dtype):
+    """``mixed`` with k = 1, one token, one view or fewer tokens than k gave NaN or dropped neighbours."""
+    for counts in ([1], [1, 1], [9], [3, 6], [1, 2, 40], [30, 30, 0, 4]):
+        view = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+        points = torch.rand(len(view), 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
+        found = nearest_neighbors(points, view, k, "mixed")
+        assert found.index.shape == (len(view), min(k, len(view)))
+        assert found.valid.all()
+        for i, row in enumerate(found.index.tolist()):
+            assert row == literal_neighbors(points, view, i, k, "mixed")
+    tokens, points, batch = scene(((1, 0, 0), (1, 2, 0)))
+    found = make(neighbors="mixed", k=k)(tokens, points, batch)
+    assert all(layer.isfinite().all() for layer in found.latent)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("mode", MODES)
+def test_ties_on_the_image_plane_favor_no_view_and_no_side(mode, dtype):
+    """Views share their places there, so most distances are equal; lower views had a quarter more."""
+    tokens, points, batch = scene(((144, 144, 144, 144),), grid=(12, 12))
+    module = make(neighborhood="image_plane", k=48, neighbors=mode)
+    position = module.positions(tokens, points, batch).to(dtype)
+    near = nearest_neighbors(position, tokens.image, 48, mode, module.places(tokens, batch))
+    inside = (tokens.row - 5.5).abs().maximum((tokens.column - 5.5).abs()) < 2
+    index = near.index[inside]
+    turn = (tokens.image[index] - tokens.image[inside, None]) % 4
+    counts = [(turn == t).sum(1) for t in range(4)]
+    expected = {"all": [12] * 4, "other_views": [0, 16, 16, 16], "mixed": [24, 8, 8, 8]}[mode]
+    assert [c.float().mean().item() for c in counts] == expected
+    assert all(c.min() == c.max() for c in counts)
+    # The neighbours of one view lie around the query: within one place of balanced.
+    offset = position[index] - position[inside, None]
+    for t in range(4):
+        drift = torch.where((turn == t)[..., None], offset, 0).sum(1) / tokens.patch_size
+        assert drift.abs().max() <= 3
+    # Distances come first: nothing nearer is left out.
+    distance = torch.cdist(position[inside], position)
+    if mode == "all":
+        farthest = distance.gather(1, index).amax(1)
+        assert torch.equal(farthest, distance.sort(1).values[:, 47])
+
+
+def test_neighbors_on_the_image_plane_are_those_of_whole_photographs():
+    """A crop around the subject in each view must not align the views for the ablation."""
+    tokens, points, batch = scene(((16, 16, 16),))
+    module = make(neighborhood="image_plane", k=5)
+    corners = torch.tensor([[[0, 0], [2, 6], [4, 1]]])
+    cut = dataclasses.replace(batch, corners=corners)
+    position = module.positions(tokens, points, cut)
+    place = 2 * torch.stack((tokens.row, tokens.column), -1) + 1 + corners[0][tokens.image]
+    assert torch.equal(position, place.float())
+    assert not torch.equal(module(tokens, points, cut).latent[0], module(tokens, points, batch).latent[0])
+    padded = dataclasses.replace(batch, corners=torch.full((1, 3, 2), -3))
+    assert torch.equal(module(tokens, points, padded).latent[0], module(tokens, points, batch).latent[0])
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0])
@@ -252,10 +312,10 @@ def test_neighborhoods():
         after = make(neighborhood=name)(tokens, far, batch)
         assert torch.equal(after.latent[0], before.latent[0]) == (name != "xyz")
     assert not torch.equal(outputs["image_plane"].latent[0], outputs["feature"].latent[0])
-    position = make(neighborhood="image_plane").positions(tokens, points)
+    position = make(neighborhood="image_plane").positions(tokens, points, batch)
     assert torch.equal(position[:16], position[16:32])
-    assert position.min() == 0.125
-    assert position.max() == 0.875
+    assert position.min() == 1.0  # pixels: half a patch
+    assert position.max() == 7.0
 
 
 @pytest.mark.parametrize("similarity", SIMILARITIES)

@@ -3,10 +3,13 @@
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
+from ghgs_lit.config import compose as project_compose
 from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import Renderer, render
+from ghgs_lit.types import Cameras, Gaussians
 from tests.helpers.splats import camera_ring, cloud
 
 NAMES = sorted(path.stem for path in (conf_dir() / "renderer").glob("*.yaml"))
@@ -18,7 +21,7 @@ def test_every_config_builds_a_renderer(name):
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         options = dict(compose(f"renderer/{name}").renderer)
     assert options.pop("_target_") == "ghgs_lit.rendering.Renderer"
-    assert Renderer(**options).backend == name
+    assert Renderer(**options).backend == {"release": "auto"}.get(name, name)
 
 
 @pytest.mark.parametrize(
@@ -47,6 +50,26 @@ def test_auto_is_the_cpu_backend_for_cpu_tensors():
     """``auto`` renders CPU tensors by the CPU backend."""
     gaussians, views = cloud(20), camera_ring(2, 20, 30)
     assert torch.equal(Renderer()(gaussians, views).image, render(gaussians, views, "cpu").image)
+
+
+@pytest.mark.parametrize("verb", ["train", "evaluate"])
+def test_the_release_renders_with_its_own_constants(verb):
+    """A splat 0.1 m from the camera cost 4 dB: the authors cull below 0.2 m and cap alpha at 0.99."""
+    nodes = [
+        OmegaConf.to_container(project_compose(verb, overrides).renderer)
+        for overrides in ([], ["compat=release"], ["compat=release", "renderer.near=0.05"])
+    ]
+    renderers = [Renderer(**{k: v for k, v in node.items() if k != "_target_"}) for node in nodes]
+    assert [renderer.near for renderer in renderers] == [0.01, 0.2, 0.05]
+    assert [renderer.settings.alpha_max for renderer in renderers] == [0.999, 0.99, 0.99]
+    views = Cameras(torch.tensor([[[[20.0, 0, 5], [0, 20, 5], [0, 0, 1]]]]), torch.eye(4)[None, None], 10, 10)
+    splats = Gaussians(
+        torch.tensor([[0, 0, 0.1], [0, 0, 1.0]]), torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), 0.5),
+        torch.ones(2), torch.tensor([[1.0, 0, 0], [0, 1.0, 0]]), (2,),
+    )  # fmt: skip
+    near, release, _ = (renderer(splats, views).image[0, 0, :, 5, 5] for renderer in renderers)
+    assert near.argmax() == 0
+    torch.testing.assert_close(release, torch.tensor([0.0, 0.99, 0.0]), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

@@ -1,6 +1,7 @@
 """Published weights are imported strictly, run, and are exported unchanged."""
 
 import re
+import warnings
 
 import pytest
 import torch
@@ -289,6 +290,19 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
         assert code == 1
         assert err.strip().startswith(f"ghgs import: {message}")
         assert len(err.strip().splitlines()) == 1
+
+
+def test_crops_with_the_authors_weights_give_a_warning(tmp_path):
+    """Their error is not known there: scales moved by 17 % in a trial, without a word."""
+    (vggt, release), _ = write_published(tmp_path)
+    out = tmp_path / "out.ckpt"
+    import_weights(config("skip=balanced"), out, str(vggt), str(release))
+    with pytest.warns(UserWarning, match=r"out\.ckpt: expected skip=none or skip=exact; found crops"):
+        GHGS.from_checkpoint(out)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        import_weights(config(), out, str(vggt), str(release))
+        GHGS.from_checkpoint(out)
 
 
 def test_switches_that_differ_from_the_releases_are_listed():
