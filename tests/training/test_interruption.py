@@ -52,8 +52,8 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, number, a
     whole = Cut()
     expected = fit(tmp_path / "whole", whole, **options)
     before = handlers()
+    first = Cut()
     with interruptible(), pytest.raises(Interrupted) as stop:
-        first = Cut()
         fit(tmp_path / "cut", first, more=[Signal(at, number, validating), StopAtStep()], **options)
     assert stop.value.code == 128 + number
     assert handlers() == before

@@ -152,7 +152,9 @@ def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumul
         in_epoch = -(-5 // accumulate)
         trained = steps // in_epoch * 5 + steps % in_epoch * accumulate
         drawn = drawn[:trained]
-        monkeypatch.setattr(_Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1])
+        monkeypatch.setattr(
+            _Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1]
+        )
         fit(tmp_path, Cut(), resume=last, accumulate_grad_batches=accumulate)
     # 16 steps: full epochs of 5 batches, then what is left.
     epochs, rest = divmod(STEPS, -(-5 // accumulate))
