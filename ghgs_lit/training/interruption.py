@@ -30,6 +30,7 @@ class StopAtStep(Checkpoint):
         self.received = 0
         self._since = 0.0
         self._step = 0
+        self._saved = 0  # the signal, once the checkpoint is written
         self._before = handlers()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -45,24 +46,33 @@ class StopAtStep(Checkpoint):
             print("stopping after this step; again: at once", flush=True)
 
     def on_train_batch_end(self, trainer: L.Trainer, *args: Any) -> None:
-        """Stop here, unless the step is not complete or a validation is due first."""
+        """Save here, unless the step is not complete or a validation is due first."""
         # Between two parts of an accumulated step the gradients so far would be lost.
         if trainer.global_step == self._step:
             return
         self._step = trainer.global_step
         if not validates_now(trainer):
-            self._stop(trainer)
+            self._save(trainer)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Stop after the validation of a step."""
+        """Save after the validation of a step."""
         if not trainer.sanity_checking:
-            self._stop(trainer)
+            self._save(trainer)
 
-    def _stop(self, trainer: L.Trainer) -> None:
+    def _save(self, trainer: L.Trainer) -> None:
         number = self.received
         if trainer.world_size > 1:
             mine = torch.tensor(number, device=trainer.strategy.root_device)
             number = int(trainer.strategy.reduce(mine, reduce_op="max"))
         if number:
             trainer.save_checkpoint(Path(trainer.default_root_dir) / "checkpoints" / "last.ckpt")
-            raise Interrupted(number)
+            self._saved = number
+
+    def on_train_batch_start(self, *args: Any) -> None:
+        """End once the numbers of the step are logged, which comes after all other hooks of the step."""
+        if self._saved:
+            raise Interrupted(self._saved)
+
+    def on_train_epoch_end(self, *args: Any) -> None:
+        """As above, where no batch follows."""
+        self.on_train_batch_start()

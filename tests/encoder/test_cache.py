@@ -2,6 +2,7 @@
 
 import dataclasses
 import multiprocessing
+import os
 
 import pytest
 import torch
@@ -181,7 +182,28 @@ def test_the_report_says_how_much_there_is(tmp_path):
     )
 
 
-@pytest.mark.parametrize("option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}])
+def test_the_oldest_files_make_room(tmp_path):
+    """A training of days must not fill the disk: the size is bounded and the newest samples stay."""
+    encoder = make()
+    first = FeatureCache(tmp_path, tokens="all")
+    encoder(*views(seed=1), cache=first)
+    one = first.written
+    for place, file in enumerate(tmp_path.glob("*/*")):
+        os.utime(file, (place, place))
+    cache = FeatureCache(tmp_path, tokens="all", max_gb=2.5 * one / 1e9)
+    for seed in (2, 3, 4):
+        encoder(*views(seed=seed), cache=cache)
+        assert sum(file.stat().st_size for file in tmp_path.glob("*/*")) <= 2.5 * one
+    assert (cache.made, cache.deleted) == (3, 2)
+    assert "2 old ones deleted (feature_cache.max_gb)" in cache.report()
+    encoder(*views(seed=4), cache=cache)
+    encoder(*views(seed=1), cache=cache)
+    assert (cache.hits, cache.made) == (1, 4)
+
+
+@pytest.mark.parametrize(
+    "option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}, {"max_gb": 0}, {"max_gb": "many"}]
+)
 def test_impossible_options_are_refused(tmp_path, option):
     """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=f"feature_cache.{next(iter(option))}"):

@@ -4,6 +4,8 @@ import json
 import multiprocessing
 import os
 import signal
+import socket
+import sys
 import time
 
 import pytest
@@ -18,7 +20,7 @@ from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
-from ghgs_lit.runs.signals import Interrupted
+from ghgs_lit.runs.signals import Interrupted, interruptible
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
@@ -111,6 +113,43 @@ def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monke
     assert outcomes == ["interrupted", "done"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, number):
+    """Batch systems and ``&&`` read the exit code; the line says how the sweep goes on."""
+
+    def stopped(config, directory, stats):
+        (directory / "started").touch()
+        os.kill(os.getpid(), number)
+        time.sleep(10)
+
+    monkeypatch.setattr(train_verb, "train", stopped)
+    code, _, err = sweep("seed=1,2,3")
+    assert code == 128 + number
+    assert len(list(sweep.directory.glob("*/started"))) == 1
+    (line,) = [line for line in err.splitlines() if "to go on" in line]
+    assert f"hydra.sweep.dir={sweep.directory}" in line
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    code, out, _ = sweep("seed=1,2,3")
+    assert code == 0
+    assert "3 runs: 3 done" in out
+
+
+def test_a_job_in_its_own_process_is_stopped_and_awaited(tmp_path):
+    """A signal to a sweep must reach its job, which saves a checkpoint before it ends."""
+    note = tmp_path / "note"
+    script = (
+        "import os, signal, sys, time, pathlib\n"
+        f"def stop(*_): time.sleep(0.3); pathlib.Path({str(note)!r}).write_text('saved'); sys.exit(143)\n"
+        "signal.signal(signal.SIGTERM, stop)\n"
+        "os.kill(os.getppid(), signal.SIGTERM)\n"
+        "time.sleep(60)\n"
+    )
+    with interruptible(), pytest.raises(Interrupted) as stop:
+        job._run_process([sys.executable, "-c", script], os.environ)
+    assert stop.value.code == 143
+    assert note.read_text() == "saved"
+
+
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
     """One bad run must not cost the rest of the night."""
 
@@ -148,6 +187,29 @@ def test_results_that_are_not_whole_are_no_results(tmp_path):
     write_finished_run(run.path, {"seed": 1})
     assert run.state == State.DONE
     assert run.metric == 20.0
+
+
+def test_results_whose_configuration_was_changed_are_refused(tmp_path):
+    """A changed seed in ``metrics.json`` would move the run to another row of a table."""
+    write_finished_run(tmp_path, {"seed": 1})
+    path = tmp_path / "metrics.json"
+    content = json.loads(path.read_text())
+    content["provenance"]["config"]["seed"] = 2
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"metrics\.json: provenance\.config: expected .* config_hash"):
+        read_results(path)
+
+
+def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):
+    """The half-written file of a killed process is removed by the next one, and is no result."""
+    child = SPAWN.Process(target=os.getpid)
+    child.start()
+    child.join()
+    half = tmp_path / f".metrics.json.{socket.gethostname()}.{child.pid}.tmp"
+    half.write_text("{")
+    assert not RunDirectory(tmp_path).done
+    write_finished_run(tmp_path, {"seed": 1})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.csv", "metrics.json"]
 
 
 def test_results_of_an_earlier_version_are_read_in_todays_names(tmp_path, monkeypatch):

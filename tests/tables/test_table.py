@@ -175,7 +175,7 @@ def test_results_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"metrics\.json"):
         read_sweep([tmp_path])
     path.write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="format_version 1 to 2; found 99"):
+    with pytest.raises(InputError, match="format_version 1 to 3; found 99"):
         read_results(path)
     with pytest.raises(InputError, match="at least one"):
         write_results(tmp_path, [], {})

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import threading
 
 import lightning.pytorch as L
 import pytest
@@ -18,6 +19,7 @@ from ghgs_lit.training.clock import PARTS, StepClock
 from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
+    close,
     final_numbers,
     hyperparameters,
     log_hyperparameters,
@@ -159,6 +161,21 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
     assert [row["b"] for row in rows] == ["", "1", "", "1", "", "1", "", ""]
     scalars = events(tmp_path / "tensorboard").Scalars("a")
     assert [(e.step, e.value) for e in scalars] == list(enumerate(expected))
+
+
+def test_runs_of_a_sweep_leave_no_threads(tmp_path):
+    """Each run of a long sweep left the writer of TensorBoard and its memory behind."""
+    before = threading.active_count()
+    for number in range(3):
+        of_run = loggers(tmp_path / str(number))
+        log_hyperparameters(of_run, {"seed": number})
+        for logger in of_run:
+            logger.log_metrics({"a": 1.0}, 0)
+            logger.finalize("success")  # as Lightning does when training ends
+        log_results(of_run, [{"views": 4, "targets": "release", "psnr": 30.0}], 1)
+        close(of_run)
+        assert events(tmp_path / str(number) / "tensorboard").Scalars("hparam/psnr")[0].value == 30
+    assert threading.active_count() == before
 
 
 def test_hyperparameters_are_choices_and_changes():

@@ -1,5 +1,6 @@
 """The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
 
+import re
 from datetime import timedelta
 from types import SimpleNamespace
 
@@ -8,13 +9,17 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.plugins.precision import MixedPrecision
+from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
+from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress, StepTime
 from ghgs_lit.training.checkpoints import Checkpoints
+from ghgs_lit.training.optimization import require_whole_parameters
 from ghgs_lit.training.validation_pictures import Pictures
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 from tests.helpers.training import Standin, example_batch, flat_renderer
@@ -46,6 +51,13 @@ def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
         check_val_every_n_epoch=None,
         **{**defaults, **options},
     )
+
+
+def infinitely_steep(gaussians, cameras):
+    """The flat renderer with an infinite gradient."""
+    rendering = flat_renderer(gaussians, cameras)
+    zero = (rendering.image - rendering.image.detach()).abs()
+    return type(rendering)(rendering.image + zero.sqrt(), rendering.alpha, rendering.depth)
 
 
 def loader(count=3) -> DataLoader:
@@ -141,14 +153,8 @@ def test_a_loss_that_is_no_number_names_its_step_term_and_subjects(tmp_path):
 
 def test_a_gradient_that_is_no_number_names_a_parameter(tmp_path):
     """A finite loss with an infinite gradient must not reach the weights."""
-
-    def broken(gaussians, cameras):
-        rendering = flat_renderer(gaussians, cameras)
-        zero = (rendering.image - rendering.image.detach()).abs()
-        return type(rendering)(rendering.image + zero.sqrt(), rendering.alpha, rendering.depth)
-
     with pytest.raises(DivergedError, match=r"step 0: .*finite gradient.* first shift"):
-        trainer(tmp_path).fit(module(broken, render_l1=1.0), loader())
+        trainer(tmp_path).fit(module(infinitely_steep, render_l1=1.0), loader())
 
 
 def test_the_gradient_is_clipped(tmp_path):
@@ -168,6 +174,79 @@ def test_the_gradient_is_clipped(tmp_path):
     subject.log = lambda *_, **__: None
     subject.configure_gradient_clipping(None)
     assert subject.model.depth.grad.item() == pytest.approx(0.5, rel=1e-4)
+
+
+def scaled(folder, scale: float, steps: int = 3, renderer=flat_renderer, **weights):
+    """Train in float16 with a scaled loss, on a CPU; returns the norms before clipping, module and scaler."""
+    scaler = torch.amp.GradScaler("cpu", init_scale=scale)
+    norms = []
+    subject = GHGSModule(
+        Standin(), renderer, Losses(weights or {"depth": 1.0}), Optimization(lr=0.1, clip=0.5), CONFIG
+    )
+    real = subject.log
+    subject.log = lambda name, value, **o: (
+        norms.append(value.item()) if "norm" in name else None,
+        real(name, value, **o),
+    )
+    trainer(folder, steps=steps, plugins=[MixedPrecision("16-mixed", "cpu", scaler)]).fit(subject, loader(1))
+    return norms, subject, scaler
+
+
+def test_a_scaled_loss_is_unscaled_before_the_gradient_is_clipped(tmp_path):
+    """With 16-mixed the norm that is clipped and logged is that of the loss, not of its multiple."""
+    plain, _, _ = scaled(tmp_path / "a", scale=1.0)
+    many, subject, _ = scaled(tmp_path / "b", scale=4096.0)
+    assert many == pytest.approx(plain, rel=1e-3)
+    assert len(many) == 3
+    assert not subject.optimizers().optimizer.defaults["fused"]
+
+
+def test_a_step_whose_scaled_gradient_overflows_is_skipped(tmp_path):
+    """Overflow is how the scale is found; without a scale it is an error as in float32."""
+    norms, subject, scaler = scaled(tmp_path / "a", scale=2.0**127, steps=2, depth=100.0)
+    assert norms == []
+    assert subject.model.depth.item() == 2.5
+    assert scaler.get_scale() == 2.0**125
+    with pytest.raises(DivergedError, match="step 0: expected a finite gradient"):
+        scaled(tmp_path / "b", scale=1.0, renderer=infinitely_steep, render_l1=1.0)
+
+
+def test_strategies_that_divide_parameters_are_refused():
+    """Each process would clip by the norm of its shard."""
+    with pytest.raises(InputError, match=r"trainer\.strategy: .*clip.*FSDPStrategy"):
+        require_whole_parameters(SimpleNamespace(strategy=object.__new__(FSDPStrategy)))
+    require_whole_parameters(SimpleNamespace(strategy=SingleDeviceStrategy()))
+
+
+def test_without_a_terminal_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):
+    """A log of a batch job shows step, loss, seconds a step, time left and validation, as does train.log."""
+    monkeypatch.setattr("ghgs_lit.training.callbacks.on_terminal", lambda: False)
+    monkeypatch.setattr("ghgs_lit.runs.progress.EVERY", 0.0)
+    monkeypatch.setattr(Lines.__init__, "__defaults__", (None, True, 0.0))
+    trainer(tmp_path, steps=12, callbacks=[RunProgress()]).fit(module(), loader(), loader(1))
+    lines = (tmp_path / "train.log").read_text().splitlines()
+    assert len(lines) == 12
+    assert set(lines) <= set(capsys.readouterr().out.splitlines())
+    assert re.fullmatch(r"\d\d:\d\d:\d\d step 1 of 12  loss/total \S+", lines[0])
+    last = r"step 11 of 12  loss/total \S+  val/psnr \S+  \S+ s a step  0:00:0\d left"
+    assert re.search(last, lines[10])
+
+
+def test_the_lines_come_once_a_minute(monkeypatch):
+    """A log of days has thousands of lines, not millions."""
+    now = iter([0.0, 0.0, 30.0, 60.0, 90.0, 125.0])
+    monkeypatch.setattr("ghgs_lit.runs.progress.time.monotonic", lambda: next(now))
+    lines = Lines(printed=False)
+    assert [lines.due() for _ in range(5)] == [True, False, True, False, True]
+
+
+def test_evaluation_says_how_far_it_is(capsys):
+    """Without a terminal a long evaluation prints lines as well."""
+    assert list(track([1, 2, 3], "measuring", every=0.0)) == [1, 2, 3]
+    assert [line.split(" ", 1)[1] for line in capsys.readouterr().out.splitlines()] == [
+        "measuring: 1 of 3, 0:00:00",
+        "measuring: 2 of 3, 0:00:00",
+    ]
 
 
 def test_frozen_parameters_stay_for_their_share_of_the_run(tmp_path):

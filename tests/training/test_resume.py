@@ -8,15 +8,18 @@ import lightning.pytorch as L
 import pytest
 import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, Checkpoints
+from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
 from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
-from tests.helpers.training import Standin, StepData, flat_renderer
+from ghgs_lit.training.validation_pictures import Pictures
+from tests.helpers.training import Standin, StepData, _Steps, flat_renderer
 
 STEPS = 16
 CONFIG = {"seed": 3, "resume": None, "init_from": None, "optimizer": {"lr": 0.05}}
@@ -50,7 +53,7 @@ def module() -> GHGSModule:
     return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
 
-def fit(folder, cut: Cut, resume=None, every=3, **options):
+def fit(folder, cut: Cut, resume=None, every=3, more=(), **options):
     torch.manual_seed(11 if resume else 12)  # what the process drew before must not matter
     best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
     last = Checkpoints(filename="last", every_n_train_steps=every)
@@ -59,7 +62,7 @@ def fit(folder, cut: Cut, resume=None, every=3, **options):
         plugins=[AtomicCheckpointIO()],
         logger=[CsvLog(folder, name="csv", version="", flush_logs_every_n_steps=1),
                 TensorBoardLog(folder, name="tensorboard", version="")],
-        callbacks=[cut, best, last], enable_model_summary=False, enable_progress_bar=False,
+        callbacks=[cut, best, last, *more], enable_model_summary=False, enable_progress_bar=False,
         num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=1,
         **options,
     )  # fmt: skip
@@ -130,6 +133,32 @@ def test_accumulated_steps_are_saved_whole(whole, tmp_path):
     subject = fit(tmp_path / "cut", Cut(), resume=last, accumulate_grad_batches=2)
     for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize(("accumulate", "cut"), [(2, None), (2, 4), (2, 5), (3, 3), (1, 7)])
+def test_every_batch_is_trained_once_and_in_order(tmp_path, monkeypatch, accumulate, cut):
+    """No batch is skipped at the end of an epoch that is no multiple of the batches of a step."""
+    drawn = []
+    real = _Steps.__getitem__
+    monkeypatch.setattr(_Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1])
+    if cut is None:
+        fit(tmp_path, Cut(), accumulate_grad_batches=accumulate)
+    else:
+        with pytest.raises(PowerCut):
+            fit(tmp_path, Cut(cut), every=1, accumulate_grad_batches=accumulate)
+        last = tmp_path / "checkpoints" / "last.ckpt"
+        # The checkpoint of the step before the cut: that step's batches come again.
+        steps = torch.load(last, weights_only=True)["global_step"]
+        in_epoch = -(-5 // accumulate)
+        trained = steps // in_epoch * 5 + steps % in_epoch * accumulate
+        drawn = drawn[:trained]
+        monkeypatch.setattr(
+            _Steps, "__getitem__", lambda self, step: (drawn.append(step), real(self, step))[1]
+        )
+        fit(tmp_path, Cut(), resume=last, accumulate_grad_batches=accumulate)
+    # 16 steps: full epochs of 5 batches, then what is left.
+    epochs, rest = divmod(STEPS, -(-5 // accumulate))
+    assert drawn[: 5 * epochs + rest * accumulate] == list(range(5 * epochs + rest * accumulate))
 
 
 def test_a_run_that_resumes_elsewhere_takes_its_best_along(whole, tmp_path):
@@ -218,6 +247,49 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
     torch.save(content, path)
     with pytest.raises(InputError, match=r"a\.ckpt.*optimizer_states.*init_from"):
         check_resume(path, Other(), CONFIG)
+
+
+def test_an_optimizer_whose_state_was_changed_is_refused(tmp_path):
+    """Broken averages of the gradient would be trained on in silence: the checkpoint has a digest of all."""
+    path = tmp_path / "checkpoints" / "last.ckpt"
+    fit(tmp_path, Cut())
+    step, _ = check_resume(path, Standin(), CONFIG)
+    assert step == 15
+    content = torch.load(path, weights_only=True)
+    state = content["optimizer_states"][0]["state"][0]
+    state["exp_avg"] = torch.randn_like(state["exp_avg"])
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"last\.ckpt: digest: expected .* as written; found"):
+        check_resume(path, Standin(), CONFIG)
+
+
+def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
+    """Seconds and peak memory of a resumed run are those of the whole training, not of its last session."""
+    first, second = TrainingCost(), TrainingCost()
+    with pytest.raises(PowerCut):
+        fit(tmp_path, Cut(13), more=[first])
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    saved = next(v for k, v in torch.load(last, weights_only=True)["callbacks"].items() if "Cost" in k)
+    assert 0 < saved["seconds"] < first.seconds
+    assert saved["peak_bytes"] > 2**20
+    second.on_train_start = lambda *_: setattr(second, "_started", None)  # a session of no time
+    fit(tmp_path, Cut(), resume=last, more=[second])
+    assert second.seconds == saved["seconds"]
+    third = TrainingCost()
+    fit(tmp_path, Cut(), resume=last, more=[third])
+    assert third.seconds > saved["seconds"]
+    assert third.peak_bytes >= saved["peak_bytes"]
+
+
+def test_the_pictures_of_the_checkpoints_own_step_stay(tmp_path):
+    """TensorBoard drops what is logged again after a restart, and no picture of an earlier validation."""
+    with pytest.raises(PowerCut):
+        fit(tmp_path, Cut(10), every=4, more=[Pictures(1)])
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == 8
+    fit(tmp_path, Cut(), resume=last, every=4, more=[Pictures(1)])
+    found = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
+    assert [e.step for e in found.Images("sheet/p0")] == [3, 7, 11, 15]
 
 
 def test_a_longer_budget_is_no_difference():

@@ -2,7 +2,9 @@
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from ghgs_lit.cli.inputs import with_trained_data
 from ghgs_lit.errors import InputError
 from ghgs_lit.training.start import initialize, report
 from tests.helpers.training import Standin
@@ -67,6 +69,26 @@ def test_weights_that_do_not_fit_at_all_are_refused(tmp_path):
         initialize(Standin(), path)
     with pytest.raises(FileNotFoundError):
         initialize(Standin(), tmp_path / "nothing.ckpt")
+
+
+def test_what_does_not_learn_needs_weights(tmp_path):
+    """A checkpoint of another encoder would leave the frozen one random, with a line that nobody reads."""
+    path = checkpoint(tmp_path / "a.ckpt", Other())
+    model = Standin()
+    model.shift.requires_grad_(False)
+    with pytest.raises(InputError, match=r"a\.ckpt: shift: expected weights .* found 'none that fit'"):
+        initialize(model, path)
+    assert model.depth.item() == 2.5
+    initialize(model, path, random_frozen=True)
+    assert model.depth.item() == 7
+
+
+def test_a_checkpoint_does_not_say_where_this_machine_writes(tmp_path):
+    """A checkpoint of somebody else must not make folders here; the command line may."""
+    data = {"name": "synthetic", "cache_dir": str(tmp_path / "theirs"), "size": 56}
+    path = checkpoint(tmp_path / "a.ckpt", Other(), config={"data": data})
+    found = with_trained_data(OmegaConf.create({"checkpoint": str(path)}))
+    assert found.data == {**data, "cache_dir": None}
 
 
 def test_a_long_report_ends(tmp_path):

@@ -1,0 +1,115 @@
+"""What is refused before anything starts: random frozen encoders, useless caches, directories with a run."""
+
+import pytest
+
+from ghgs_lit.cli import train as train_verb
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.errors import InputError
+from ghgs_lit.runs.checks import check_config, check_directory
+from tests.cli.test_main import call
+from tests.helpers.jobs import executed, record_execution
+
+
+def config(*overrides: str) -> dict:
+    return resolve(compose("train", overrides))
+
+
+@pytest.fixture
+def verb(monkeypatch, capsys):
+    """``verb("seed=1")`` runs ``ghgs train`` without training."""
+    monkeypatch.setattr(train_verb, "train", record_execution)
+    return lambda *overrides: call(monkeypatch, capsys, "train", *overrides)
+
+
+def test_a_frozen_encoder_without_weights_is_refused(verb, tmp_path):
+    """The paper's sweeps would train for days on the features of a random encoder."""
+    for name in ("sweep=table4", "experiment=zju_mocap", "experiment=thuman2"):
+        where = (f"hydra.sweep.dir={tmp_path / 'sweep'}", f"hydra.run.dir={tmp_path / 'run'}")
+        code, _, err = verb(name, f"data.root={tmp_path}", *where)
+        assert code == 1
+        assert "init_from: expected a checkpoint with the encoder's weights" in err
+        assert "ghgs import" in err
+    assert not executed(tmp_path / "sweep")
+    code, out, _ = verb("sweep=table4", f"hydra.sweep.dir={tmp_path / 'sweep'}", "dry_run=true")
+    assert code == 0
+    assert out.count("would be refused: init_from: expected") == 1
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("encoder.trainable=all",),
+        ("encoder.trainable=none", "init_from=vggt.ckpt"),
+        ("encoder.trainable=last_1", "resume=last.ckpt"),
+        ("encoder.trainable=none", "allow_random_encoder=true"),
+    ],
+)
+def test_encoders_that_learn_or_have_weights_pass(overrides):
+    """Fine-tuning, resumed runs and experiments on purpose must still start."""
+    check_config(config(*overrides))
+
+
+def test_a_partly_frozen_encoder_needs_weights_too():
+    """The blocks below the last one would stay random."""
+    with pytest.raises(InputError, match=r"init_from: .*encoder\.trainable=last_1"):
+        check_config(config("encoder.trainable=last_1"))
+
+
+def test_a_feature_cache_that_cannot_pay_is_refused():
+    """Each order of random views is a file of its own: terabytes, and hardly a hit."""
+    frozen = ("feature_cache.directory=features", "encoder.trainable=none", "allow_random_encoder=true")
+    with pytest.raises(InputError, match=r"feature_cache\.directory: .*views\.training=even.*any"):
+        check_config(config(*frozen, "views.training=any"))
+    check_config(config(*frozen, "views.training=even"))
+    with pytest.raises(InputError, match=r"feature_cache\.directory: expected null where the encoder learns"):
+        check_config(config("feature_cache.directory=features"))
+
+
+@pytest.mark.parametrize("file", ["checkpoints/best.ckpt", "csv/metrics.csv", "metrics.json"])
+def test_a_directory_with_a_run_is_not_used_again(verb, tmp_path, file):
+    """The same ``hydra.run.dir`` a second time deleted the logs and replaced the checkpoint."""
+    run = tmp_path / "run"
+    (run / file).parent.mkdir(parents=True)
+    (run / file).write_text("precious")
+    where = f"hydra.run.dir={run}"
+    code, _, err = verb(where)
+    assert code == 1
+    assert f"expected a directory without a run; found {file}" in err
+    assert "resume=" in err
+    assert "overwrite=true" in err
+    other = tmp_path / "other.ckpt"
+    other.touch()
+    code, _, err = verb(where, f"resume={other}")
+    assert code == 1  # going on with another run here would destroy this one as well
+    assert (run / file).read_text() == "precious"
+    assert not executed(tmp_path)
+    code, _, _ = verb(where, "overwrite=true")
+    assert code == 0
+    assert len(executed(tmp_path)) == 1
+    assert file == "metrics.json" or not (run / file).exists()
+
+
+def test_a_run_goes_on_in_its_own_directory(tmp_path):
+    """``resume`` of the run's own checkpoint is no new run."""
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    last.parent.mkdir()
+    last.touch()
+    check_directory(tmp_path, {"resume": str(last)})
+    assert last.exists()
+
+
+def test_overwriting_never_deletes_what_the_run_starts_from(tmp_path):
+    """``init_from`` may point into the directory that is deleted."""
+    best = tmp_path / "checkpoints" / "best.ckpt"
+    best.parent.mkdir()
+    best.touch()
+    with pytest.raises(InputError, match="init_from: expected a file outside the run"):
+        check_directory(tmp_path, {"resume": None, "overwrite": True, "init_from": str(best)})
+    assert best.exists()
+
+
+def test_a_sweep_overwrites_nothing(verb, tmp_path):
+    """Sweeps go on with their own runs; ``overwrite`` would train all of them again."""
+    code, _, err = verb("-m", f"hydra.sweep.dir={tmp_path}", "seed=1,2", "overwrite=true")
+    assert code == 1
+    assert "overwrite: expected false in a sweep" in err

@@ -1,0 +1,119 @@
+"""Ctrl-C and SIGTERM while training: a checkpoint after the step, exit codes, and the same end."""
+
+import os
+import signal
+import threading
+
+import lightning.pytorch as L
+import pytest
+import torch
+
+from ghgs_lit.runs import signals
+from ghgs_lit.runs.signals import Interrupted, handlers, interruptible
+from ghgs_lit.training.interruption import StopAtStep
+from tests.training.test_resume import Cut, fit, rows
+
+
+class Signal(L.Callback):
+    """Sends a signal to this process in step ``at`` (counted from 1), or in the validation after it."""
+
+    def __init__(self, at: int, number: int, validating: bool = False, times: int = 1):
+        self.at, self.number, self.validating, self.times = at, number, validating, times
+
+    def on_train_batch_start(self, trainer, *_):
+        if trainer.global_step + 1 == self.at and not self.validating:
+            for _ in range(self.times):
+                os.kill(os.getpid(), self.number)
+
+    def on_validation_batch_start(self, trainer, *_):
+        if trainer.global_step == self.at and self.validating:
+            os.kill(os.getpid(), self.number)
+
+
+def stopped(folder, sender: Signal) -> int:
+    """Train until the signal; returns the exit code."""
+    with interruptible(), pytest.raises(Interrupted) as stop:
+        fit(folder, Cut(), more=[sender, StopAtStep()])
+    return stop.value.code
+
+
+@pytest.mark.parametrize(
+    ("number", "at", "validating", "options"),
+    [
+        (signal.SIGINT, 5, False, {}),
+        (signal.SIGTERM, 7, False, {}),
+        (signal.SIGTERM, 8, False, {}),
+        (signal.SIGINT, 8, True, {}),
+        (signal.SIGTERM, 6, False, {"accumulate_grad_batches": 2}),
+    ],
+)
+def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, number, at, validating, options):
+    """The step and a validation that is due are finished and saved: weights, logs and validations agree."""
+    whole = Cut()
+    expected = fit(tmp_path / "whole", whole, **options)
+    before = handlers()
+    first = Cut()
+    with interruptible(), pytest.raises(Interrupted) as stop:
+        fit(tmp_path / "cut", first, more=[Signal(at, number, validating), StopAtStep()], **options)
+    assert stop.value.code == 128 + number
+    assert handlers() == before
+    last = tmp_path / "cut" / "checkpoints" / "last.ckpt"
+    assert torch.load(last, weights_only=True)["global_step"] == at
+    second = Cut()
+    subject = fit(tmp_path / "cut", second, resume=last, **options)
+    for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert first.validations + second.validations == whole.validations
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+
+
+def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
+    """Who does not want to wait for the step is not made to; one signal that arrives twice is one."""
+    assert stopped(tmp_path / "twice", Signal(5, signal.SIGINT, times=2)) == 130
+    assert (tmp_path / "twice" / "checkpoints" / "last.ckpt").exists()
+    monkeypatch.setattr("ghgs_lit.training.interruption._SAME", -1.0)
+    assert stopped(tmp_path / "now", Signal(2, signal.SIGTERM, times=2)) == 143
+    assert not (tmp_path / "now" / "checkpoints" / "last.ckpt").exists()
+
+
+def test_signals_that_a_batch_system_handles_stay_its_own(tmp_path):
+    """submitit ignores SIGTERM and requeues on SIGUSR2: neither must end the run here, nor be replaced."""
+    seen = []
+    own = {n: signal.signal(n, lambda n, _: seen.append(n)) for n in (signal.SIGTERM, signal.SIGUSR2)}
+    try:
+        with interruptible():
+            senders = [Signal(3, signal.SIGTERM), Signal(4, signal.SIGUSR2)]
+            fit(tmp_path, Cut(), more=[*senders, StopAtStep()])
+    finally:
+        for number, handler in own.items():
+            signal.signal(number, handler)
+    assert seen == [signal.SIGTERM, signal.SIGUSR2]
+
+
+def test_forked_workers_do_not_act_for_their_parent():
+    """A worker that inherits the handlers must die of SIGTERM, and leave Ctrl-C to its parent."""
+    with interruptible():
+        child = os.fork()
+        if child == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+    assert os.WTERMSIG(status) == signal.SIGTERM
+
+
+def test_other_threads_change_no_handlers():
+    """Python refuses handlers outside of the main thread, where some launchers run their jobs."""
+    before, errors = handlers(), []
+
+    def work():
+        try:
+            with interruptible():
+                signals.handle(signals.interrupt, before)
+        except ValueError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert (errors, handlers()) == ([], before)
