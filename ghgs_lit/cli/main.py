@@ -4,6 +4,7 @@ import importlib
 import importlib.metadata
 import keyword
 import os
+import re
 import sys
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from ghgs_lit.config.legacy import GONE
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.job import register_resolvers
@@ -33,7 +35,7 @@ VERBS = {
     ),
     "evaluate": (
         "measure a checkpoint or the baselines",
-        "ghgs evaluate checkpoint=runs/train/.../last.ckpt",
+        "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt",
     ),
     "predict": (
         "turn photographs into a splat (PLY) and a turntable",
@@ -114,19 +116,30 @@ def _one_line(error: Exception) -> str:
     words = " ".join(" ".join(texts).split())
     if "Could not find 'hydra/" in words:
         words += " (launchers and sweepers come with the extras cluster, ray and optuna)"
+    for key, now in GONE.items():
+        if f"override '{key}'" in words:
+            words = f"{key}: expected {now} in its place; found a key of an earlier version"
     return words.replace("To append to your config use +", "this verb has no such key; to add it: +")
 
 
-def _renamed(verb: str, argument: str) -> str:
-    """``argument`` with the key ``runs`` for ``table sweep=<directory>``: to Hydra ``sweep`` is a group."""
-    return argument.replace("sweep=", "runs=", 1) if (verb, argument[:6]) == ("table", "sweep=") else argument
+def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
+    """Arguments in Hydra's terms.
+
+    ``table sweep=<directory>`` is the key ``runs``: to Hydra ``sweep`` is a group. Where the data is that of
+    a checkpoint, which Hydra does not know, its keys are forced.
+    """
+    if verb == "table":
+        return [re.sub("^sweep=", "runs=", argument) for argument in arguments]
+    if verb in ("evaluate", "predict") and not any(argument.startswith("data=") for argument in arguments):
+        return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
+    return arguments
 
 
 def _run(verb: str, argv: list[str]) -> int:
     # With this variable Hydra raises errors, which are handled below, instead of printing them.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = [argv[0], *(_renamed(verb, argument) for argument in argv[2:])]
+    sys.argv = [argv[0], *_for_hydra(verb, argv[2:])]
     task = Verb(verb, tuple(argv), wants_trace)
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
