@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 # Lock files that this process holds: closing a second handle of a locked file would free the lock.
 _HELD: set[Path] = set()
@@ -25,8 +25,12 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     Args:
         path: the file to write.
         write: writes the whole content to the path that it is given.
+
+    Raises:
+        InputError: ``path`` is a directory.
     """
     path = Path(path)
+    require(not path.is_dir(), str(path), "a file to write", "a directory")
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(path)
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")

@@ -6,9 +6,9 @@ from typing import Any
 
 from torch import nn
 
-from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below
+from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite
 from ghgs_lit.weights.switches import differences as differing_switches
 
 
@@ -91,6 +91,7 @@ def initialize(model: nn.Module, path: str | Path, strict: bool = False) -> list
             lines.append(f"loaded       {key} {here}")
     if not fitting:
         raise InputError(f"init_from: expected weights that fit the model; found none in {path}")
+    require_finite(fitting, path)
     model.load_state_dict(fitting, strict=False)
     return lines
 
@@ -104,7 +105,7 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
     if path is None:
         return config
     checkpoint = read_checkpoint(path)
-    origin, state = checkpoint["config"].get("encoder", {}).get("weights"), model_state(checkpoint)
+    origin, state = lookup(checkpoint["config"], "encoder.weights"), model_state(checkpoint)
     fits = all(
         name in state and state[name].shape == tensor.shape
         for name, tensor in model.state_dict().items()
