@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 # Lock files that this process holds: closing a second handle of a locked file would free the lock.
 _HELD: set[Path] = set()
@@ -27,9 +27,11 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
         write: writes the whole content to the path that it is given.
 
     Raises:
+        InputError: ``path`` is a directory.
         OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
     """
     path = Path(path)
+    require(not path.is_dir(), str(path), "a file to write", "a directory")
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

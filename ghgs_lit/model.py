@@ -22,7 +22,7 @@ from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
-from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_fit
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, require_fit
 from ghgs_lit.weights.reading import cast
 
 #: Stages with weights whose widths follow the encoder's.
@@ -180,7 +180,7 @@ class GHGS(nn.Module):
     ) -> "GHGS":
         """The model of a checkpoint, in evaluation mode; needs no YAML.
 
-        The weights are mapped from the file and not read before they are used.
+        The weights are mapped from the file, not copied.
 
         Args:
             path: of the checkpoint.
@@ -189,7 +189,8 @@ class GHGS(nn.Module):
 
         Raises:
             FileNotFoundError: there is no such file.
-            InputError: the file is not a checkpoint of this package, or its weights do not fit its config.
+            InputError: the file is not a checkpoint of this package, or its weights are not finite or do not
+                fit its config.
         """
         model = cls.from_config(read_checkpoint(path)["config"], empty=STAGES)
         model.load(path, dtype)
@@ -211,7 +212,9 @@ class GHGS(nn.Module):
                 return dtype or stored
             return torch.promote_types(stored, torch.float32)
 
-        self.load_state_dict(cast(lambda: model_state(read_checkpoint(path)), precision), assign=True)
+        state = cast(lambda: model_state(read_checkpoint(path)), precision)
+        require_finite(state, path)
+        self.load_state_dict(state, assign=True)
 
 
 def check_batch(batch: Batch, patch_size: int) -> None:

@@ -5,40 +5,59 @@ from typing import Any
 import lightning.pytorch as L
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import build_data, check_size, choices, pick_device, with_trained_data
-from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.config import build
+from ghgs_lit.cli.inputs import (
+    MODEL_NODES,
+    build_data,
+    build_renderer,
+    check_size,
+    choices,
+    model_of,
+    pick_device,
+    with_chosen_targets,
+    with_trained_data,
+)
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
+from ghgs_lit.config import resolve
 from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
+from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.model import GHGS
+from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
-    """The methods to measure by name, and facts about them for the results."""
+    """The methods to measure by name, and facts about them for the results.
+
+    Args:
+        config: of the verb; its model is that of the checkpoint where there is one.
+        device: where the methods run.
+    """
     names = config["baselines"]
     names = list(BASELINES) if names == "all" else [names] if isinstance(names, str) else names
-    path, renderer = config["checkpoint"], build(config["renderer"], "renderer")
+    path, renderer = config["checkpoint"], build_renderer(config, device)
     if path is None and not names:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
     methods: dict[str, Method] = {}
     facts: dict[str, Any] = {"checkpoint": path}
-    trained = config
     if path is not None:
-        model = GHGS.from_checkpoint(path)
+        model = GHGS.from_config(config, empty=STAGES)
+        model.load(path)
         model.precision = config["precision"]
         model.feature_cache = open_cache(config["feature_cache"], model.recalibration.tokens)
-        trained = read_checkpoint(path)["config"]
-        facts["checkpoint_config"] = trained
+        checkpoint = read_checkpoint(path)
+        facts["checkpoint_config"] = checkpoint["config"]
+        facts["model_config"] = {node: config[node] for node in MODEL_NODES if node in config}
+        if "global_step" in checkpoint:
+            facts["training"] = {"steps": checkpoint["global_step"]}
         facts["parameters"] = {"total": sum(p.numel() for p in model.parameters())}
         methods["model"] = ModelMethod(model.to(device).eval(), renderer)
     splats = config["splats"]
     for name in names:
         methods[name] = baseline(
-            name, renderer, lambda: GHGS.from_config(trained).to(device), splats["sigma"], splats["opacity"]
+            name, renderer, lambda: GHGS.from_config(config).to(device), splats["sigma"], splats["opacity"]
         )
     return methods, facts
 
@@ -46,7 +65,10 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the results last."""
     directory = output_dir()
-    config = save_config(with_trained_data(cfg), directory)
+    config = with_chosen_targets(resolve(with_trained_data(cfg)))
+    if config["checkpoint"] is not None:
+        config |= model_of(config["checkpoint"], cfg)
+    write_config(config, directory)
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     methods, facts = _methods(config, device)
@@ -55,7 +77,7 @@ def run(cfg: DictConfig) -> None:
     for method in methods.values():
         if isinstance(method, ModelMethod):
             check_size(data, method.model)
-    data.prepare_data()
+    check_evaluation(config, data)
     facts |= {"verb": "evaluate", "choices": choices()}
     path = measure_and_write(methods, data, config, directory, device, **facts)
     if cache is not None:

@@ -7,14 +7,12 @@ import lightning.pytorch as L
 from omegaconf import DictConfig
 from torch import Tensor
 
+from ghgs_lit.cli.inputs import MODEL_NODES
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.importing import import_weights
 from ghgs_lit.weights.switches import differences
-
-#: Nodes of the configuration that describe the model; a checkpoint stores these.
-MODEL_NODES = (*STAGES, "skip", "model", "compat", "ablation")
 
 
 def initial_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:

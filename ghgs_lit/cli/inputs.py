@@ -1,24 +1,62 @@
-"""What the verbs that measure begin with: data, device, and what the user chose."""
+"""What the verbs that measure begin with: the data, the model of a checkpoint, and the device."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config import build
+from ghgs_lit.config.ablation import ablation_of
+from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.model import GHGS
+from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.weights.checkpoint import read_checkpoint
+
+#: Nodes of the configuration that describe the model; a checkpoint stores these.
+MODEL_NODES = (*STAGES, "skip", "model", "compat")
+
+#: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
+FREE = (
+    "bounds",
+    "depth_head.views",
+    "gaussian_head.pixels",
+    "gaussian_head.views",
+    "model.pad",
+    "recalibration.k",
+    "recalibration.neighborhood",
+    "recalibration.neighbors",
+    "recalibration.s_min",
+    "recalibration.similarity",
+    "recalibration.tokens",
+    "skip",
+    "unprojection",
+)
 
 
 def build_data(config: Mapping[str, Any]) -> PhotographsDataModule:
     """The configured data with its view and target protocols."""
-    return build(
-        config["data"], "data", views=config["views"], targets=config["targets"], seed=config["seed"]
-    )
+    # Cameras are targets that every data set could have; a verb without targets reads none.
+    targets = config.get("targets") or CAMERAS
+    return build(config["data"], "data", views=config["views"], targets=targets, seed=config["seed"])
+
+
+def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
+    """The configured renderer.
+
+    Raises:
+        InputError: it does not run on ``device``.
+    """
+    renderer = build(config["renderer"], "renderer")
+    resolve_backend(renderer.backend, device)
+    return renderer
 
 
 def check_size(data: PhotographsDataModule, model: GHGS) -> None:
@@ -33,30 +71,129 @@ def check_size(data: PhotographsDataModule, model: GHGS) -> None:
 
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:
-    """``cfg`` with the data that its checkpoint was trained on, where no ``data`` was chosen.
+    """``cfg`` with the data that its checkpoint was trained on, where no ``data=<option>`` was chosen.
+
+    Keys of it that were said, such as ``data.root=...`` for data that moved, act on it.
 
     A checkpoint of somebody else does not say where this machine writes: ``data.cache_dir`` is the default.
 
     Raises:
         InputError: there is no checkpoint, or it was not trained.
     """
-    if cfg.get("data") is not None:
+    if "_target_" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
-        raise InputError("data: expected data=... where there is no checkpoint; found none")
+        raise InputError("data: expected data=<option> where there is no checkpoint; found none")
     trained = read_checkpoint(cfg.checkpoint)["config"]
     if "data" not in trained:
         raise InputError(
-            f"data: expected data=... for weights that were imported ({cfg.checkpoint}); found none"
+            f"data: expected data=<option> for weights that were imported ({cfg.checkpoint}); found none"
         )
     data = {key: None if key == "cache_dir" else value for key, value in trained["data"].items()}
     return OmegaConf.merge({"data": data}, cfg)
 
 
+def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
+    """The nodes that describe the model of a checkpoint, with what the command line changes in it.
+
+    Only what was said counts: the options that a verb composes by default describe another model.
+
+    Args:
+        checkpoint: the path.
+        cfg: the composed configuration of the verb.
+
+    Raises:
+        InputError: the command line changes what the weights were trained for; names the key.
+    """
+    trained = read_checkpoint(checkpoint)["config"]
+    for stage in STAGES:
+        place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
+        require(isinstance(found, Mapping), place, "a stage of the model", found)
+    before = {node: trained[node] for node in MODEL_NODES if node in trained}
+    after = copy.deepcopy(before)
+    for key in said():
+        if key == "ablation":
+            _require_ablation(before)
+        if not is_below(key, MODEL_NODES):
+            continue
+        value = _plain(cfg, key)
+        if is_below(key, FREE):
+            _put(after, key, value)
+        else:
+            _require_same(before, key, value)
+    return _with_links(before, after, cfg)
+
+
+def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
+    """Refuse another value than the one that the weights were trained with; names the first that differs."""
+    for name, wanted in flatten(value, key).items():
+        own = lookup(trained, name)
+        same = own == wanted or is_below(name, FREE)
+        require(same, name, f"{own!r}, which the checkpoint's weights were trained with", wanted)
+
+
+def _require_ablation(trained: Mapping[str, Any]) -> None:
+    """Refuse another row of the ablation: it is said by its switches where the weights are trained."""
+    own, wanted = ablation_of(trained), HydraConfig.get().runtime.choices["ablation"]
+    expected = (
+        f"{own}, as the checkpoint was trained (recalibration.neighborhood=... and .similarity=... act)"
+    )
+    require(wanted == own, "ablation", expected, wanted)
+
+
+def _with_links(before: dict[str, Any], after: dict[str, Any], cfg: DictConfig) -> dict[str, Any]:
+    """``after`` with the values that follow others, such as ``gaussian_head.views: ${skip.views}``.
+
+    A checkpoint stores values without their links; ``cfg`` has the links. A value follows where what it is
+    linked to differs between ``before`` and ``after``.
+    """
+    nodes = {node: cfg[node] for node in MODEL_NODES if node in cfg}
+    plain = {node: OmegaConf.to_container(value, resolve=False) for node, value in nodes.items()}
+    links = {k: v for k, v in flatten(plain).items() if isinstance(v, str) and v.startswith("${")}
+    old, new = OmegaConf.create(before), OmegaConf.create(after)
+    for key, link in links.items():
+        for tree in (old, new):
+            OmegaConf.update(tree, key, link, force_add=True)
+    for key in links:
+        own, changed = (OmegaConf.select(tree, key, throw_on_resolution_failure=False) for tree in (old, new))
+        if own != changed:
+            _put(after, key, changed)
+    return after
+
+
+def _plain(cfg: DictConfig, key: str) -> Any:
+    value = OmegaConf.select(cfg, key)
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def _put(config: dict[str, Any], key: str, value: Any) -> None:
+    *parents, name = key.split(".")
+    for parent in parents:
+        config = config.setdefault(parent, {})
+    config[name] = value
+
+
+def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
+    """``config`` that measures the protocol of ``targets=<option>`` alone, where that was said.
+
+    ``evaluation.targets`` says so for several protocols, and wins.
+    """
+    keys = said()
+    if "targets" not in keys or is_below("evaluation.targets", keys):
+        return config
+    return {**config, "evaluation": {**config["evaluation"], "targets": [config["targets"]["name"]]}}
+
+
 def pick_device(name: str) -> torch.device:
-    """The device ``cpu`` or ``cuda``; CUDA for ``auto``, and the CPU where there is no CUDA."""
+    """The device ``cpu`` or ``cuda``; ``auto`` is CUDA, and the CPU where there is no CUDA.
+
+    Raises:
+        InputError: another name, or CUDA where there is none.
+    """
     choice("device", name, ("auto", "cpu", "cuda"))
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+    there = torch.cuda.is_available()
+    require(there or name != "cuda", "device", "auto or cpu on a machine without CUDA", name)
+    return torch.device("cuda" if name != "cpu" and there else "cpu")
 
 
 def choices() -> dict[str, str]:
@@ -67,3 +204,8 @@ def choices() -> dict[str, str]:
 def overrides() -> list[str]:
     """What the command line or the sweep changed in this run; empty outside of Hydra."""
     return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+
+
+def said() -> list[str]:
+    """The keys and groups of :func:`overrides`, in their order."""
+    return [part.key_or_group for part in OverridesParser.create().parse_overrides(overrides())]

@@ -4,6 +4,7 @@ import importlib
 import importlib.metadata
 import keyword
 import os
+import re
 import sys
 from dataclasses import dataclass
 
@@ -106,16 +107,24 @@ def _completion_argv(argv: list[str]) -> list[str] | None:
     return [argv[0], words[1], *argv[1:]]
 
 
-def _renamed(verb: str, argument: str) -> str:
-    """``argument`` with the key ``runs`` for ``table sweep=<directory>``: to Hydra ``sweep`` is a group."""
-    return argument.replace("sweep=", "runs=", 1) if (verb, argument[:6]) == ("table", "sweep=") else argument
+def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
+    """Arguments in Hydra's terms.
+
+    ``table sweep=<directory>`` is the key ``runs``: to Hydra ``sweep`` is a group. Where the data is that of
+    a checkpoint, which Hydra does not know, its keys are forced.
+    """
+    if verb == "table":
+        return [re.sub("^sweep=", "runs=", argument) for argument in arguments]
+    if verb in ("evaluate", "predict") and not any(argument.startswith("data=") for argument in arguments):
+        return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
+    return arguments
 
 
 def _run(verb: str, argv: list[str]) -> int:
     # With this variable Hydra raises errors, which are handled below, instead of printing them.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = [argv[0], *(_renamed(verb, argument) for argument in argv[2:])]
+    sys.argv = [argv[0], *_for_hydra(verb, argv[2:])]
     task = Verb(verb, tuple(argv), wants_trace)
     try:
         check_flags(sys.argv[1:])

@@ -13,6 +13,7 @@ from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.terminal import print_uncut
 
 
 def _listed(key: str, value: Any, kind: type) -> tuple | None:
@@ -64,10 +65,7 @@ def run(cfg: DictConfig) -> None:
 
 
 def _print(table: t.Table) -> None:
-    printed = t.to_terminal(table)
-    # A line that wraps is better than a number that is cut.
-    needed = Console(width=1000).measure(printed).maximum
-    console = Console(width=max(Console().width, needed))
+    console = Console()
     console.print(table.caption.replace("`", ""), highlight=False)
-    console.print(printed)
+    print_uncut(t.to_terminal(table))
     console.print("\n".join(table.notes).replace("**", "").replace("`", ""), markup=False, highlight=False)

@@ -18,6 +18,7 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
@@ -151,6 +152,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")
+    check_evaluation(config, data)
     module = GHGSModule(
         model, renderer, build(config["loss"], "loss"), build(config["optimizer"], "optimizer"), config
     )

@@ -43,7 +43,6 @@ NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 #: views, targets and metrics, which tables keep apart by themselves.
 EXPECTED_TO_DIFFER = (
     *WITHOUT_INFLUENCE,
-    "ablation",
     "evaluation",
     "metrics._target_",
     "recalibration.neighborhood",

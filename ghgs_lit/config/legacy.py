@@ -37,6 +37,12 @@ KEYS: dict[str, str] = {
 #: Values that changed their name: (key of today, old value) to the new one.
 VALUES: dict[tuple[str, Any], Any] = {}
 
+#: Keys that are gone from the command line, and what does now what they said.
+GONE = {
+    "ablation.semantic": "recalibration.similarity=none",
+    "ablation.unprojection": "recalibration.neighborhood=image_plane",
+}
+
 #: Options that changed their name: (group, old option) to the new one. Results list the options of their run.
 OPTIONS = {
     ("optimizer", "pilot"): "from_scratch",
@@ -48,7 +54,11 @@ def _bounds_become_a_stage(config: dict[str, Any]) -> None:
     head = config.get("depth_head")
     if not isinstance(head, dict) or "bounds" in config:
         return
-    kind, search = head.pop("bounds", "box"), head.pop("search", None) or {}
+    kind, search = head.get("bounds", "box"), head.get("search") or {}
+    if kind not in ("box", "hull", "none"):
+        return  # no configuration of this package
+    head.pop("bounds", None)
+    head.pop("search", None)
     if kind == "none":
         search = {}
     elif kind == "box":
@@ -71,14 +81,25 @@ def _heads_name_what_they_skip(config: dict[str, Any]) -> None:
         return
     if "views" in skip:
         views = skip.setdefault("depth_views", {"subject": skip["views"], "all": "all"})
-        head.setdefault("views", views[recalibration.get("tokens", "subject")])
+        head.setdefault("views", views.get(recalibration.get("tokens", "subject"), "all"))
     for name in ("pixels", "views"):
         if name in skip and isinstance(config.get("gaussian_head"), dict):
             config["gaussian_head"].setdefault(name, skip[name])
 
 
+def _ablation_is_what_the_model_does(config: dict[str, Any]) -> None:
+    """The node ``ablation`` repeated what ``recalibration`` does, and could say something else."""
+    labels = config.pop("ablation", None)
+    if isinstance(labels, dict) and "recalibration" not in config:
+        config["recalibration"] = {
+            "neighborhood": "xyz" if labels.get("unprojection") else "image_plane",
+            "similarity": "product" if labels.get("semantic") else "none",
+        }
+
+
 #: Changes that no table can express, applied last: each takes the configuration and changes it in place.
 STEPS: list[Callable[[dict[str, Any]], None]] = [
+    _ablation_is_what_the_model_does,
     _bounds_become_a_stage,
     _heads_name_what_they_skip,
     _unprojection_names_its_class,
@@ -103,10 +124,10 @@ def upgrade(config: Mapping[str, Any]) -> dict[str, Any]:
 def upgrade_provenance(provenance: Mapping[str, Any]) -> dict[str, Any]:
     """The provenance of a result with its configurations and chosen options in today's names."""
     result = dict(provenance)
-    for key in ("config", "checkpoint_config"):
+    for key in ("config", "checkpoint_config", "model_config"):
         if isinstance(result.get(key), Mapping):
             result[key] = upgrade(result[key])
-    if "choices" in result:
+    if isinstance(result.get("choices"), Mapping):
         chosen = result["choices"].items()
         result["choices"] = {group: OPTIONS.get((group, option), option) for group, option in chosen}
     return result

@@ -221,9 +221,6 @@ KINDS: dict[str, Kind] = {
     "views.training": TEXT,
     "views.training_counts": list_of(integer(least=2)),
     # the model
-    "ablation.name": TEXT,
-    "ablation.semantic": FLAG,
-    "ablation.unprojection": FLAG,
     "bounds.cells": integer(least=8, most=512),
     "bounds.dilation": number(least=0, below=0.5),
     "bounds.margin": AMOUNT,

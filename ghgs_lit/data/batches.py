@@ -42,7 +42,7 @@ class BatchOptions:
     resampling: str = "area"
     batch_size: int = 1
     steps_per_epoch: int | None = None
-    body_vertices: int | None = 4096
+    body_vertices: int | None = None
     depths: bool = True
     apply_mask: bool = False
     cache_images_mb: float = 512
@@ -78,9 +78,8 @@ class BatchBuilder:
     depths: bool = True
 
     def batch(self, specs: Sequence[SampleSpec]) -> Batch:
-        """Samples with equal numbers of inputs and equal numbers of targets."""
+        """Samples with equal numbers of inputs and equal numbers of targets, which may be 0."""
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths) for s in specs]
-        targets = [_views(self.targets, s.subject, s.targets, False) for s in specs]
         depths = [[view.depth for view in row] for row in inputs]
         known = all(depth is not None for row in depths for depth in row)
         bodies = [self._body(s.subject) for s in specs]
@@ -88,16 +87,20 @@ class BatchBuilder:
             images=self._images(inputs),
             masks=_stack([[view.mask for view in row] for row in inputs]),
             cameras=_cameras(inputs),
-            targets=Targets(
-                images=self._images(targets),
-                masks=_stack([[view.mask for view in row] for row in targets]),
-                cameras=_cameras(targets),
-                names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
-            ),
+            targets=self._targets(specs) if specs[0].targets else None,
             body_vertices=None if any(body is None for body in bodies) else bodies,
             depths=_stack(depths) if known else None,
             subjects=tuple(s.subject for s in specs),
             views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
+        )
+
+    def _targets(self, specs: Sequence[SampleSpec]) -> Targets:
+        views = [_views(self.targets, s.subject, s.targets, False) for s in specs]
+        return Targets(
+            images=self._images(views),
+            masks=_stack([[view.mask for view in row] for row in views]),
+            cameras=_cameras(views),
+            names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
         )
 
     def _images(self, views: list[list[View]]) -> Tensor:

@@ -15,6 +15,7 @@ from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
+    SampleSpec,
     TargetProtocol,
     TrainingSampler,
     ViewProtocol,
@@ -135,16 +136,35 @@ class PhotographsDataModule(LightningDataModule):
             batch_size: samples of a batch (None: this module's).
         """
         protocol = self.targets if targets is None else from_config(TargetProtocol, "targets", targets)
-        builder = self.builder(split)
-        specs = evaluation_samples(
-            builder.inputs.reader.subjects,
-            views or self.views.evaluation_count,
-            self._possible(protocol),
+        specs = self._evaluation_samples(self.subjects(split), protocol, views)
+        batches = EvaluationBatches(self.builder(split), specs, batch_size or self.options.batch_size)
+        return self._loader(batches)
+
+    def evaluation_batch(
+        self, subject: str, split: str = "val", views: int | None = None, targets: Targets | None = None
+    ) -> Batch:
+        """The sample of one subject; nothing of others is read. Arguments as for :meth:`evaluation_loader`.
+
+        Args:
+            subject: its name.
+            split, views: whose inputs.
+            targets: a protocol or its mapping; None: the batch has no targets.
+        """
+        protocol = None if targets is None else from_config(TargetProtocol, "targets", targets)
+        available = {subject: self.subjects(split)[subject]}
+        return self.builder(split).batch(self._evaluation_samples(available, protocol, views))
+
+    def _evaluation_samples(
+        self, subjects: Mapping[str, tuple[int, ...]], targets: TargetProtocol | None, views: int | None
+    ) -> list[SampleSpec]:
+        return evaluation_samples(
+            subjects,
+            self.views.evaluation_count if views is None else views,
+            None if targets is None else self._possible(targets),
             self.dataset.ring,
             self.seed,
             self.options.evaluation_positions,
         )
-        return self._loader(EvaluationBatches(builder, specs, batch_size or self.options.batch_size))
 
     def val_dataloader(self) -> DataLoader:
         return self.evaluation_loader()

@@ -238,7 +238,7 @@ class TrainingSampler:
 def evaluation_samples(
     subjects: Mapping[str, tuple[int, ...]],
     count: int,
-    targets: TargetProtocol,
+    targets: TargetProtocol | None,
     ring: int,
     seed: int,
     positions: Mapping[int, Sequence[int]] | None = None,
@@ -248,16 +248,18 @@ def evaluation_samples(
     Args:
         subjects: available positions by name.
         count: number of inputs.
-        targets: the target protocol.
+        targets: the target protocol; None: samples without targets.
         ring: number of positions on a full ring.
         seed: of random targets.
         positions: input positions by number of inputs; evenly spaced where they are not listed.
 
     Raises:
-        InputError: a subject lacks an input position.
+        InputError: the input positions are not different ones, or a subject lacks one.
     """
     inputs = list((positions or {}).get(count) or even_positions(ring, count))
     require(len(inputs) == count, f"data.evaluation_positions.{count}", f"{count} positions", inputs)
+    expected = f"different positions of a ring of {ring}"
+    require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, inputs)
     specs = []
     for name, available in subjects.items():
         if lacking := sorted(set(inputs) - set(available)):
@@ -265,6 +267,7 @@ def evaluation_samples(
                 f"evaluation with {count} views: expected ring positions {inputs} of subject {name}; "
                 f"found no position {lacking[0]}"
             )
-        chosen = targets.evaluation(available, inputs, ring, subject_rng(seed, name))
+        rng = subject_rng(seed, name)
+        chosen = () if targets is None else targets.evaluation(available, inputs, ring, rng)
         specs.append(SampleSpec(name, ring_photos(inputs), chosen))
     return specs

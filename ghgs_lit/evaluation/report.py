@@ -4,17 +4,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import rich
 import torch
 from lightning.pytorch import LightningDataModule
 from rich.table import Table
 
 from ghgs_lit.config import build
-from ghgs_lit.config.groups import read_option
-from ghgs_lit.errors import require
+from ghgs_lit.config.ablation import ablation_of
 from ghgs_lit.evaluation.measure import Method, measure_all
+from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.runs.results import Row, metric_names, summarize, write_results
+from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_results
+from ghgs_lit.runs.terminal import print_uncut
 
 #: Metrics that are printed, with their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}
@@ -23,22 +23,6 @@ SPLITS = {
     "train": "the subjects that were trained on",
     "val": "unseen in training; validation shares them: it chooses best.ckpt, and never last.ckpt",
 }
-
-
-def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The protocols that ``evaluation.targets`` lists, by name.
-
-    Each has the values of its own file in ``conf/targets``; the one that ``targets=`` selects has the
-    configured values, overrides included.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    configured = config["targets"]
-    return {
-        name: configured if name == configured["name"] else read_option("targets", name, "evaluation.targets")
-        for name in config["evaluation"]["targets"]
-    }
 
 
 def measure_and_write(
@@ -51,10 +35,13 @@ def measure_and_write(
 ) -> Path:
     """Measure methods as configured; print the means and write the results.
 
+    What :func:`ghgs_lit.evaluation.check.check_evaluation` checks is not checked again.
+
     Args:
         methods: what is measured, by name.
         data: gives the photographs.
-        config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used).
+        config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used, and the
+            model's where one is measured).
         directory: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
         device: where the methods run.
         facts: further entries of the provenance.
@@ -63,9 +50,6 @@ def measure_and_write(
         The path of ``metrics.json``.
     """
     evaluation = config["evaluation"]
-    for key in ("views", "targets"):
-        found = evaluation[key]
-        require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
     targets = target_protocols(config)
     metrics = build(config["metrics"], "metrics").to(device)
     for name, reason in metrics.left_out.items():
@@ -81,6 +65,8 @@ def measure_and_write(
         pictures=directory / "pictures",
         picture_count=evaluation["pictures"],
     )
+    if METHOD in methods:
+        facts["ablation"] = ablation_of(config)
     source = provenance(
         config,
         seed=config["seed"],
@@ -108,4 +94,4 @@ def print_summary(rows: list[Row]) -> None:
     for mean in summarize(rows):
         numbers = ("-" if mean[n] is None else f"{mean[n]:.{PRINTED[n]}f}" for n in names)
         table.add_row(mean["method"], str(mean["views"]), mean["targets"], *numbers)
-    rich.print(table)
+    print_uncut(table)

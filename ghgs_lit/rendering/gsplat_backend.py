@@ -5,14 +5,14 @@ import importlib
 import torch
 from torch import Tensor
 
-from ghgs_lit.errors import require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
 
 
-class BackendUnavailable(ValueError):
+class BackendUnavailable(InputError):
     """The chosen renderer cannot run on this machine; the message says what was tried."""
 
 

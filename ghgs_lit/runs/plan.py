@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from ghgs_lit.errors import InputError
@@ -15,6 +14,7 @@ from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import is_multirun
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
+from ghgs_lit.runs.terminal import print_uncut
 
 OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
 
@@ -76,9 +76,7 @@ def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[s
     table = Table("run", "overrides", *columns)
     for item, *cells in zip(planned, *columns.values(), strict=True):
         table.add_row(item.name, " ".join(o for o in item.shown if o not in shared), *cells)
-    # A line that wraps is better than a name that is cut.
-    width = max(Console().width, Console(width=1000).measure(table).maximum)
-    Console(width=width).print(table)
+    print_uncut(table)
 
 
 def _counts(states: Sequence[State]) -> str:

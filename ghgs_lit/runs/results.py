@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.legacy import upgrade_provenance
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
@@ -19,6 +20,15 @@ METHOD = "model"
 """The method of the rows of a trained model; others are baselines."""
 KEYS = ("method", "subject", "views", "targets", "target", "inputs")
 """What a row describes; all other entries of a row are metrics."""
+
+#: Types of JSON, in words for messages.
+_KINDS = {
+    str: "a text",
+    int: "a whole number",
+    float: "a number or null",
+    list: "a list",
+    dict: "a mapping",
+}
 
 Row = dict[str, Any]
 
@@ -99,6 +109,39 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     return path
 
 
+def entry(place: str, content: Any, key: str, kind: type) -> Any:
+    """The value at a dotted key of results that were read.
+
+    Args:
+        place: the file, or the place in it, for messages.
+        content: the results, or a part of them.
+        key: the dotted key.
+        kind: the type of the value; ``float`` is any number or None.
+
+    Raises:
+        InputError: there is no such key, or its value is of another type; names place and key.
+    """
+    value = lookup(content, key)
+    kinds = int | float | None if kind is float else kind
+    fits = isinstance(value, kinds) and not isinstance(value, bool)
+    short = isinstance(value, str | int | float)
+    require(fits, f"{place}: {key}", _KINDS[kind], value if short else type(value).__name__)
+    return value
+
+
+def _check_rows(path: Path, content: Mapping[str, Any]) -> None:
+    """Refuse rows and means that were edited until they are none."""
+    for part, texts in (("rows", ("method", "subject", "targets")), ("summary", ("method", "targets"))):
+        for index, row in enumerate(entry(str(path), content, part, list)):
+            place = f"{path}: {part}[{index}]"
+            for key in texts:
+                entry(place, row, key, str)
+            entry(place, row, "views", int)
+            for key in row:
+                if key not in KEYS:
+                    entry(place, row, key, float)
+
+
 def read_results(path: Path) -> dict[str, Any]:
     """Read a ``metrics.json``; its configurations are returned in today's keys.
 
@@ -113,7 +156,8 @@ def read_results(path: Path) -> dict[str, Any]:
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found not in range(1, FORMAT_VERSION + 1):
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {found}")
-    source = content.get("provenance", {})
+    _check_rows(path, content)
+    source = entry(str(path), content, "provenance", dict)
     # The keys without influence changed since earlier versions, and with them the hashes.
     if found == FORMAT_VERSION and "config" in source:
         fitting, hashed = config_hash(source["config"]), source.get("config_hash")

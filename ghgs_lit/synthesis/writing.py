@@ -11,6 +11,8 @@ from ghgs_lit.data.view import View
 def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
     """Write one view; the JPEG keeps the full resolution of colours.
 
+    The mask has three equal channels: the authors' loader takes channel 0 of an image that has several.
+
     Args:
         phase: folder of the phase.
         folder: name of the subject's position, ``<id>_<position>``.
@@ -22,7 +24,8 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int =
     for path in folders.values():
         path.mkdir(parents=True, exist_ok=True)
     Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
-    Image.fromarray(view.mask.astype(np.uint8) * 255).save(folders["mask"] / f"{number}.png")
+    mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
+    Image.fromarray(mask).save(folders["mask"] / f"{number}.png")
     if view.inverse_depth is not None:
         Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png")
     np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))

@@ -4,11 +4,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from ghgs_lit.config.ablation import ABLATIONS
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.runs.results import mean
 from ghgs_lit.tables.differences import differing, differing_text
 from ghgs_lit.tables.layouts import Cell, Column, Group, Layout, Line, Table, arrow, decimals
-from ghgs_lit.tables.records import ABLATIONS, Planned, Record, Sweep, Variant, person_of
+from ghgs_lit.tables.records import Planned, Record, Sweep, Variant, person_of
 from ghgs_lit.tables.reported import data_title, reported_data, reported_table
 from ghgs_lit.tables.significance import PairedTest, compare, holm, too_few
 from ghgs_lit.tables.text import write_caption, write_notes

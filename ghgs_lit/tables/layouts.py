@@ -6,9 +6,18 @@ from ghgs_lit.errors import choice
 from ghgs_lit.tables.records import Planned, Record, Variant
 from ghgs_lit.tables.significance import Comparison
 
-DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 3, "gaussians": 0}
-LOWER_IS_BETTER = ("lpips", "flip", "depth_error_mm", "seconds")
-TITLES = {"depth_error_mm": "Depth error (mm)", "seconds": "Seconds", "gaussians": "Gaussians"}
+DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
+DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
+LOWER_IS_BETTER = ("lpips", "flip", "depth_error_mm", "prediction_seconds", "seconds", "peak_gb")
+NEITHER_IS_BETTER = ("gaussians", "steps")
+TITLES = {
+    "depth_error_mm": "Depth error (mm)",
+    "gaussians": "Gaussians",
+    "prediction_seconds": "Prediction (s)",
+    "steps": "Training steps",
+    "seconds": "Training (s)",
+    "peak_gb": "Training memory (GB)",
+}
 
 
 @dataclass(frozen=True)
@@ -60,7 +69,7 @@ def decimals(metric: str) -> int:
 def arrow(metric: str) -> str:
     """Whether higher (↑) or lower (↓) is better; empty where neither is."""
     stem = _stem(metric)
-    return "" if stem == "gaussians" else "↓" if stem in LOWER_IS_BETTER else "↑"
+    return "" if stem in NEITHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else "↑"
 
 
 def title(metric: str) -> str:

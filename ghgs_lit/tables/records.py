@@ -13,18 +13,14 @@ from typing import Any
 import yaml
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.config.ablation import ABLATIONS, switches_of
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.results import METHOD, by_protocol, mean, metric_names, read_results
+from ghgs_lit.runs.results import METHOD, by_protocol, entry, mean, metric_names, read_results
 
-ABLATIONS = {
-    (False, False): "neither",
-    (False, True): "no_unprojection",
-    (True, False): "no_semantic",
-    (True, True): "full",
-}
-"""The ablation's name by its switches (3D unprojection, semantic consistency), in the tables' order."""
+#: The time of a prediction in the rows of results: in tables ``seconds`` are those of the training.
+_PREDICTION = {"seconds": "prediction_seconds"}
 
 # Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("patch_size", "width", "heads", "depth", "layers", "vit")
@@ -127,7 +123,8 @@ def _shipped_encoders() -> dict[str, dict]:
 
 def encoder_name(config: Mapping[str, Any]) -> str:
     """The option of conf/encoder that a configuration has; ``unnamed`` where it is another."""
-    encoder = config.get("encoder") or {}
+    encoder = config.get("encoder")
+    encoder = encoder if isinstance(encoder, Mapping) else {}
     for name, shipped in sorted(_shipped_encoders().items()):
         if all(key in encoder and encoder[key] == shipped.get(key) for key in _ENCODER_KEYS):
             return name
@@ -143,19 +140,20 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
         by: keys that tell rows apart beside model, encoder and ablation.
 
     Raises:
-        InputError: the configuration has no ablation.
+        InputError: the configuration has no recalibration, by which the ablation is told.
     """
-    ablation = config.get("ablation")
-    if not isinstance(ablation, Mapping):
-        raise InputError(f"{source}: expected a run with ablation=...; found none in its configuration")
+    recalibration = entry(source, config, "recalibration", dict)
     compat = lookup(config, "compat.name")
-    model = str(lookup(config, "model.name") or "unnamed")
+    model = [str(lookup(config, "model.name") or "unnamed")]
+    model += [f"compat {compat}"] * (compat not in (None, "none"))
+    # No row of the ablation, which has 3D points or the image plane.
+    model += ["neighbours by feature"] * (recalibration.get("neighborhood") == "feature")
     return Variant(
         kind="model",
         name="ours",
-        model=model if compat in (None, "none") else f"{model}, compat {compat}",
+        model=", ".join(model),
         encoder=encoder_name(config),
-        switches=(bool(ablation["unprojection"]), bool(ablation["semantic"])),
+        switches=switches_of(config),
         # Without published weights an encoder has seen the photographs of this data only.
         has_semantics=bool(lookup(config, "encoder.weights")),
         extra=tuple((key, str(lookup(config, key))) for key in by),
@@ -165,13 +163,23 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
 def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
     """The records of a ``metrics.json``."""
     content = read_results(path)
-    source = content["provenance"]
-    # The configuration of `ghgs evaluate` does not describe the model; that of its checkpoint does.
-    trained = source.get("checkpoint_config") or source["config"]
-    measured = {name: source["config"].get(name) for name in ("data", "metrics")}
-    names = metric_names(content["rows"])
+    source, place = content["provenance"], f"{path}: provenance"
+    config = entry(place, source, "config", dict)
+    # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint
+    # does, but for what the command line changed.
+    trained = (
+        config if source.get("checkpoint_config") is None else entry(place, source, "checkpoint_config", dict)
+    )
+    if source.get("model_config") is not None:
+        trained = {**trained, **entry(place, source, "model_config", dict)}
+    seed = entry(place, trained if "seed" in trained else source, "seed", int)
+    measured = {name: config.get(name) for name in ("data", "metrics")}
+    about = {"hash": source.get("config_hash"), "git": _git(place, source)}
+    training = _training(place, source)
+    rows = [{_PREDICTION.get(key, key): value for key, value in row.items()} for row in content["rows"]]
+    names = metric_names(rows)
     records = []
-    for (method, views, targets), subjects in by_protocol(content["rows"]).items():
+    for (method, views, targets), subjects in by_protocol(rows).items():
         values = {
             subject: {n: v for n in names if (v := mean(row.get(n) for row in rows)) is not None}
             for subject, rows in subjects.items()
@@ -182,22 +190,40 @@ def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
             Record(
                 model_variant(trained, str(path), by) if is_model else Variant("baseline", method),
                 Setting(
-                    str(source["data"]["name"]),
-                    str(source["data"]["split"]),
+                    entry(place, source, "data.name", str),
+                    entry(place, source, "data.split", str),
                     targets,
-                    str(source["protocol"]["metrics"]),
+                    entry(place, source, "protocol.metrics", str),
                 ),
                 views,
-                int(trained.get("seed", source["seed"])),
-                means,
+                seed,
+                means | training if is_model else means,
                 str(path),
                 len(subjects),
                 values,
                 {**trained, **measured} if is_model else None,
-                {"hash": source.get("config_hash"), "git": source.get("git")},
+                about,
             )
         )
     return records
+
+
+def _training(place: str, source: Mapping[str, Any]) -> dict[str, float]:
+    """What the training took: ``steps``, ``seconds`` and ``peak_gb``, as far as the results say."""
+    if source.get("training") is None:
+        return {}
+    said = entry(place, source, "training", dict)
+    taken = {key: entry(f"{place}.training", said, key, float) for key in ("steps", "seconds", "peak_bytes")}
+    peak = taken.pop("peak_bytes")
+    taken["peak_gb"] = None if peak is None else peak / 1e9
+    return {key: value for key, value in taken.items() if value is not None}
+
+
+def _git(place: str, source: Mapping[str, Any]) -> dict[str, Any] | None:
+    if source.get("git") is None:
+        return None
+    entry(place, source, "git.commit", str)
+    return source["git"]
 
 
 def _planned(path: Path, by: Sequence[str]) -> Planned | None:
@@ -206,9 +232,11 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
         config = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
         return None
-    if not isinstance(config, Mapping) or not all(k in config for k in ("ablation", "trainer", "data")):
+    if not isinstance(config, Mapping) or not all(k in config for k in ("trainer", "data")):
         return None
     config = upgrade(config)
+    if "recalibration" not in config:
+        return None
     data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
 

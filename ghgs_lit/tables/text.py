@@ -96,6 +96,7 @@ def write_notes(table: Table, test: PairedTest, illustration: bool = False) -> l
         )
     said += _about_others(table)
     said += _about_test(table, test)
+    said += _about_steps(table)
     said += _about_runs(table)
     return said
 
@@ -132,6 +133,19 @@ def _about_test(table: Table, test: PairedTest) -> list[str]:
         return [f"No differences are marked: n = {n} subjects are too few for a {KINDS[test.kind]} ({few})."]
     marks = f"{MARK} differs beyond chance: {about}, two-sided, Holm's correction over the {len(known)}"
     return [f"{marks} comparisons of this table, p < {test.alpha:g}."]
+
+
+def _about_steps(table: Table) -> list[str]:
+    """That rows were not trained equally long, where they were not."""
+    steps: dict[str, set[int]] = {}
+    for record in table.records:
+        if "steps" in record.means:
+            line = next(line for line in table.lines if line.variant == record.variant)
+            steps.setdefault(" ".join(line.stub), set()).add(round(record.means["steps"]))
+    if len(set().union(*steps.values())) < 2:
+        return []
+    rows = (f"{name}: {' to '.join(map(str, sorted({min(n), max(n)})))}" for name, n in steps.items())
+    return [f"Rows were trained for different numbers of steps ({'; '.join(rows)})."]
 
 
 def _run_name(planned: Planned) -> str:

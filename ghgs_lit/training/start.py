@@ -6,10 +6,10 @@ from typing import Any
 
 from torch import nn
 
-from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below
+from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.training.checkpoints import content_digest
-from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite
 from ghgs_lit.weights.switches import differences as differing_switches
 
 
@@ -104,6 +104,7 @@ def initialize(
         expected = "weights of a part that does not learn (allow_random_encoder=true does without)"
         known = name in fitting or parameter.requires_grad or random_frozen
         require(known, f"{path}: {name}", expected, "none that fit")
+    require_finite(fitting, path)
     model.load_state_dict(fitting, strict=False)
     return lines
 
@@ -117,7 +118,7 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
     if path is None:
         return config
     checkpoint = read_checkpoint(path)
-    origin, state = checkpoint["config"].get("encoder", {}).get("weights"), model_state(checkpoint)
+    origin, state = lookup(checkpoint["config"], "encoder.weights"), model_state(checkpoint)
     fits = all(
         name in state and state[name].shape == tensor.shape
         for name, tensor in model.state_dict().items()

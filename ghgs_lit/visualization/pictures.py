@@ -122,7 +122,7 @@ def _depth_rows(
 
 def sheet(
     batch: Batch,
-    image: Tensor,
+    image: Tensor | None,
     element: int = 0,
     depth: Tensor | None = None,
     depth_valid: Tensor | None = None,
@@ -130,8 +130,8 @@ def sheet(
     """Pictures of one subject: inputs, their depths, then target, render and error of each target.
 
     Args:
-        batch: inputs and targets.
-        image: renders [B, T, 3, h, w].
+        batch: inputs, and targets where there are renders of them.
+        image: renders of the targets [B, T, 3, h, w] (None: no rows of targets).
         element: index of the subject in the batch.
         depth: predicted depths [B, V, H, W], metres (None: no row of them).
         depth_valid: where they are defined [B, V, H, W] (None: in the masks).
@@ -139,6 +139,8 @@ def sheet(
     views = batch.views[element] if batch.views else tuple(map(str, range(batch.images.shape[1])))
     rows = [row([to_uint8(i) for i in batch.images[element]], [f"input {name}" for name in views])]
     rows += _depth_rows(batch, element, depth, depth_valid)
+    if image is None:
+        return stack(rows)
     for t, (render, target) in enumerate(zip(image[element], batch.targets.images[element], strict=True)):
         name = batch.targets.names[element][t] if batch.targets.names else str(t)
         tiles = [to_uint8(target), to_uint8(render), error_map(render, target)]

@@ -37,7 +37,7 @@ def turntable(cameras: Cameras, frames: int) -> Cameras:
     radius = flat.norm(dim=-1).mean()
     start = torch.nn.functional.normalize(flat[0], dim=0)
     side = torch.linalg.cross(up, start)
-    angles = torch.arange(frames, dtype=torch.float64, device=center.device) * (2 * math.pi / frames)
+    angles = torch.arange(frames, dtype=torch.float64, device=center.device) * (2 * math.pi / max(frames, 1))
     around = angles.cos()[:, None] * start + angles.sin()[:, None] * side
     positions = center + radius * around + heights.mean() * up
     forward = torch.nn.functional.normalize(center - positions, dim=-1)

@@ -89,9 +89,23 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
         require_shape(f"{source}: {key}", own[key], value)
 
 
+def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
+    """Refuse weights with NaN or infinity, of which every prediction would be empty; names the first tensor.
+
+    Args:
+        state: tensors by name.
+        source: where they come from, for messages.
+    """
+    for key, value in state.items():
+        # A sum is not finite where a term is not, and needs no second tensor. Half precision would overflow.
+        total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))
+        require(bool(total.isfinite()), f"{source}: {key}", "finite numbers", "NaN or infinity")
+
+
 def load_strictly(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Copy all of ``state`` into ``module``; raises as :func:`require_fit` does."""
+    """Copy all of ``state`` into ``module``; raises as :func:`require_fit` and :func:`require_finite` do."""
     require_fit(module, state, source)
+    require_finite(state, source)
     module.load_state_dict(state)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -11,6 +12,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
+from ghgs_lit.weights.switches import differences
 
 
 def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
@@ -22,31 +24,35 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
         release: the PyTorch file for everything else; None to leave it out.
 
     Raises:
-        InputError: both files are None, or a tensor has no published name.
+        InputError: both files are None, or a tensor has no published name; then nothing is written.
     """
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
-    state = model_state(read_checkpoint(checkpoint))
+    content = read_checkpoint(checkpoint)
+    state = model_state(content)
     encoder = {name: tensor for name, tensor in state.items() if name.startswith("encoder.")}
     heads = {name: tensor for name, tensor in state.items() if name not in encoder}
-    report = []
+    files = []
     for path, own, table, entry in (
         (vggt, encoder, names.VGGT, None),
         (release, heads, names.RELEASE, names.RELEASE_ENTRY),
     ):
         if path is not None:
-            tensors = {_published(checkpoint, name, table): tensor for name, tensor in own.items()}
-            write_tensors(path, tensors, entry)
-            report.append(f"{path}: {len(tensors)} tensors")
-    return report
+            named = {names.to_published(name, table): name for name in own}
+            if None in named:
+                raise _unpublished(checkpoint, named[None], content["config"])
+            files.append((path, {published: own[name] for published, name in named.items()}, entry))
+    for file in files:
+        write_tensors(*file)
+    return [f"{path}: {len(tensors)} tensors" for path, tensors, _ in files]
 
 
-def _published(checkpoint: str | Path, name: str, table: Mapping[str, str]) -> str:
-    published = names.to_published(name, table)
-    if published is None:
-        raise InputError(
-            f"{checkpoint}: {name}: expected a tensor that the release has; found one of our own"
-        )
-    return published
+def _unpublished(checkpoint: str | Path, name: str, config: Mapping[str, Any]) -> InputError:
+    """Why a model has no published form: a tensor, and the settings that differ from the release's."""
+    differing = ", ".join(differences(config))
+    return InputError(
+        f"{checkpoint}: expected a model of the release's form for release=<file>; found one without a"
+        f" published form, with {name} (it differs in {differing})"
+    )
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:

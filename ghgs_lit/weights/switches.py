@@ -7,6 +7,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.config.keys import lookup
 
 
 @cache
@@ -34,8 +35,8 @@ def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = Non
     """
     found = []
     for (group, key), value in release_switches().items():
-        expected = value if other is None else (other.get(group) or {}).get(key)
-        own = (config.get(group) or {}).get(key)
+        expected = value if other is None else lookup(other, f"{group}.{key}")
+        own = lookup(config, f"{group}.{key}")
         if own != expected:
             found.append(f"{group}.{key}={own} for {expected}")
     return found

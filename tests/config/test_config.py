@@ -9,6 +9,7 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.cli.main import VERBS
 from ghgs_lit.config import build, compose, conf_dir
+from ghgs_lit.config.ablation import ablation_of, switches_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 
@@ -88,10 +89,10 @@ def test_every_object_outside_the_model_is_built(group, name, tmp_path):
     list(itertools.product(["v3", "v4", "v5"], ["full", "no_unprojection", "no_semantic", "neither"])),
 )
 def test_the_papers_grid_composes(views, ablation):
-    """The switches that tables read must agree with the name of the ablation."""
+    """The rows that tables read from the model must be those of the option's name."""
     cfg = composed("train", f"views={views}", f"ablation={ablation}", "model=paper")
-    assert cfg.ablation.unprojection == (ablation in ("full", "no_semantic"))
-    assert cfg.ablation.semantic == (ablation in ("full", "no_unprojection"))
+    assert switches_of(cfg) == (ablation in ("full", "no_semantic"), ablation in ("full", "no_unprojection"))
+    assert ablation_of(cfg) == ablation
 
 
 def test_a_command_line_choice_wins_over_the_models():

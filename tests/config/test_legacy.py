@@ -95,7 +95,7 @@ def test_an_old_configuration_builds_the_same_model(name):
 def test_an_upgraded_configuration_is_todays(name):
     """A run of today that resumes an old one must find no difference but those that were made."""
     old, today = upgrade(OLD[name]), config(*TODAY[name])
-    nodes = (*STAGES, "skip", "model", "compat", "ablation")
+    nodes = (*STAGES, "skip", "model", "compat")
     changed = {
         key: (flatten(old).get(key), value)
         for node in nodes
@@ -173,3 +173,12 @@ def test_heads_get_what_skipping_said(tokens, views):
     upgraded = upgrade(old | {"recalibration": {"tokens": tokens}})
     assert upgraded["depth_head"]["views"] == views
     assert upgraded["gaussian_head"] == {"views": "subject", "pixels": "all"}
+
+
+def test_an_ablation_is_what_the_model_does():
+    """The node that repeated it is dropped; where it is all that a result says, it is kept as switches."""
+    labels = {"name": "no_semantic", "unprojection": True, "semantic": False}
+    switches = {"neighborhood": "image_plane", "similarity": "product"}
+    assert upgrade({"ablation": labels, "recalibration": switches}) == {"recalibration": switches}
+    alone = upgrade({"ablation": labels})
+    assert alone == {"recalibration": {"neighborhood": "xyz", "similarity": "none"}}

@@ -73,6 +73,9 @@ def test_round_trip(tmp_path):
         view = layout.view("box", position, 0)
         assert np.abs(view.image / 255 - shots.images[0]).max() < 0.06
         np.testing.assert_array_equal(view.mask, shots.masks[0])
+        # The authors' loader takes channel 0 of three.
+        stored = np.asarray(Image.open(tmp_path / f"train/mask/box_{position:03d}/0.png"))
+        np.testing.assert_array_equal(stored, np.stack([shots.masks[0] * np.uint8(255)] * 3, -1))
         np.testing.assert_allclose(view.depth, shots.depths[0], atol=1.5e-4)
         np.testing.assert_allclose(view.intrinsics, cameras.intrinsics[0], rtol=1e-6)
         np.testing.assert_allclose(view.extrinsics, cameras.extrinsics[0], atol=1e-6)

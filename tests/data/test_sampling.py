@@ -321,3 +321,31 @@ def test_fewer_views_than_asked(root, tmp_path):
         module(root).evaluation_loader(4, {"name": "midway", "per_subject": 5})
     listed = module(tmp_path, evaluation_positions={3: [0, 4, 9]}, batch_size=1)
     assert next(iter(listed.evaluation_loader(3))).views == (("000/0", "004/0", "009/0"),)
+
+
+def test_a_subject_alone_is_read_without_targets(root):
+    """Four cameras that are all inputs leave no target: a splat needs none."""
+    data = module(
+        root, targets={"name": "cameras", "view": 0, "training_views": [0], "positions": [0, 4, 8, 12]}
+    )
+    with pytest.raises(InputError, match=r"targets\.positions: expected a camera that is not an input"):
+        data.evaluation_loader()
+    batch = data.evaluation_batch("s4")
+    assert batch.targets is None
+    assert batch.subjects == ("s4",)
+    assert batch.views == (("000/0", "004/0", "008/0", "012/0"),)
+    beside = data.evaluation_batch("s4", targets=RELEASE)
+    assert torch.equal(beside.images, batch.images)
+    assert beside.targets.names == (("000/3",),)
+
+
+@pytest.mark.parametrize("count", [0, 17])
+def test_a_number_of_views_that_a_ring_does_not_have_is_refused(root, count):
+    """0 views were measured as 4, and 17 of 16 took one position twice."""
+    with pytest.raises(InputError, match=f"evaluation with {count} views: expected different positions"):
+        module(root).evaluation_loader(views=count)
+
+
+def test_every_vertex_of_a_body_is_matched_by_default(root):
+    """The Chamfer term of the paper has all vertices of the body."""
+    assert module(root).options.body_vertices is None

@@ -295,7 +295,7 @@ def test_batches_have_the_protocols_cameras(root):
     batch = data.training_batch(0)
     assert batch.images.shape == (1, 3, 3, 64, 64)
     assert batch.targets.images.shape == (1, 1, 3, 64, 64)
-    assert batch.body_vertices[0].shape == (4096, 3)
+    assert batch.body_vertices[0].shape == (6890, 3)
     assert [data.dataset.reader(phase).people for phase in ("train", "val")] == [1, 1]
     samples = list(data.evaluation_loader(views=3))
     assert samples[0].views == (("000/0", "007/0", "015/0"),)

@@ -7,32 +7,22 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from PIL import Image
 
 from ghgs_lit.cli.main import main
 from ghgs_lit.config import conf_dir
+from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure
-from ghgs_lit.evaluation.report import target_protocols
+from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.export.ply import read_ply
 from ghgs_lit.metrics import ImageMetrics, psnr
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.provenance import config_hash
-from tests.helpers.people import render_boxes
 from tests.helpers.training import Standin, example_batch, flat_renderer
 
 OFF = ImageMetrics(lpips="off")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Images this small gain nothing from threads, and lose much where the cores are shared."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
@@ -66,13 +56,6 @@ def test_the_hash_of_a_configuration_ignores_the_order_of_keys():
     """Runs of a sweep are found again by the hash of their configuration."""
     assert config_hash({"a": 1, "b": {"c": [1, 2]}}) == config_hash({"b": {"c": [1, 2]}, "a": 1})
     assert config_hash({"a": 1}) != config_hash({"a": 2})
-
-
-@pytest.fixture(scope="module")
-def boxes(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("boxes")
-    render_boxes(folder / "rendered", folder / "scans", train=3, val=2)
-    return folder / "rendered"
 
 
 def ghgs(*arguments: str) -> int:
@@ -146,6 +129,43 @@ def test_a_checkpoint_measures_the_same_again_beside_the_baselines(trained, boxe
     assert value["true_depth", "s3", "midway"]["psnr"] > value["black", "s3", "midway"]["psnr"] + 3
 
 
+def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_path):
+    """`metrics.json` describes the model that ran, on data and targets as they were said."""
+    path = trained / "checkpoints" / "last.ckpt"
+    code = ghgs(
+        "evaluate", f"checkpoint={path}", "data.cache_images_mb=1", "targets=midway", "evaluation.views=[3]",
+        "recalibration.similarity=none", "recalibration.k=1", "skip=none", "evaluation.pictures=0",
+        f"hydra.run.dir={tmp_path / 'run'}",
+    )  # fmt: skip
+    assert code == 0
+    content = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    before = json.loads((trained / "metrics.json").read_text())
+    value = {(r["subject"], r["views"], r["targets"]): r["psnr"] for r in before["rows"]}
+    for row in content["rows"]:
+        assert row["targets"] == "midway"
+        assert row["psnr"] != value[row["subject"], row["views"], "midway"]
+    source = content["provenance"]
+    assert (before["provenance"]["ablation"], source["ablation"]) == ("full", "no_semantic")
+    ran = source["model_config"]
+    assert (ran["recalibration"]["k"], ran["recalibration"]["similarity"]) == (1, "none")
+    assert (ran["skip"]["name"], ran["gaussian_head"]["pixels"]) == ("none", "all")
+    assert source["config"]["recalibration"] == ran["recalibration"]
+    assert source["training"] == {"steps": 3}
+    assert source["checkpoint_config"]["recalibration"]["similarity"] == "product"
+    assert (
+        ghgs("evaluate", f"checkpoint={path}", "encoder=vggt_small", f"hydra.run.dir={tmp_path / 'r'}") == 1
+    )
+    assert not (tmp_path / "r" / "metrics.json").exists()
+
+
+def test_an_evaluation_that_cannot_be_is_refused_before_training(boxes, tmp_path, capsys):
+    """Settings of the end must not fail after days of training."""
+    where = f"hydra.run.dir={tmp_path / 'run'}"
+    assert ghgs("train", *data_of(boxes), "evaluation.targets=[foo]", where) == 1
+    assert "evaluation.targets: expected one of cameras" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
 def test_each_target_protocol_has_the_values_of_its_own_file():
     """Only the selected protocol has overrides; the others are read from conf/targets."""
     release = {"name": "release", "kind": "release", "per_subject": "all"}
@@ -201,6 +221,27 @@ def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp
     assert len(list((tmp_path / "r" / "turntable").glob("*.png"))) == 3
     assert np.asarray(Image.open(tmp_path / "r" / "turntable" / "000.png")).max() > 50
     assert ghgs("predict", *arguments, "subject=nobody") == 1
+
+
+def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeypatch):
+    """A data set of thousands must not be read up to the subject; targets are read where they are asked."""
+    read = []
+    view = Photographs.view
+
+    def recorded(self, name, position, number=0, depth=True):
+        read.append((name, position, number))
+        return view(self, name, position, number, depth)
+
+    monkeypatch.setattr(Photographs, "view", recorded)
+    path = trained / "checkpoints" / "last.ckpt"
+    arguments = [f"checkpoint={path}", "subject=s4", "turntable.frames=0", f"hydra.run.dir={tmp_path / 'r'}"]
+    assert ghgs("predict", *arguments) == 0
+    inputs = [("s4", position, 0) for position in (0, 4, 8, 12)]
+    assert read == inputs
+    assert (tmp_path / "r" / "s4.png").exists()
+    read.clear()
+    assert ghgs("predict", *arguments, "targets=release") == 0
+    assert read == [*inputs, ("s4", 0, 3)]
 
 
 def test_a_sweep_becomes_a_table(boxes, tmp_path):

@@ -23,7 +23,7 @@ def config(*overrides):
 @functools.cache  # composing costs more than the tiny models
 def _composed(overrides):
     composed = compose("train", [*TINY, *overrides])
-    nodes = [*STAGES, "skip", "ablation", "model", "compat"]
+    nodes = [*STAGES, "skip", "model", "compat"]
     return OmegaConf.to_container(OmegaConf.masked_copy(composed, nodes), resolve=True)
 
 

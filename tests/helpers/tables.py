@@ -19,7 +19,10 @@ SHIFTS = {"a": -1.0, "b": 1.0}
 def config_of(ablation, seed=1, data="synthetic", weights=None, **changes) -> dict:
     unprojection, semantic = SWITCHES[ablation]
     return {
-        "ablation": {"name": ablation, "unprojection": unprojection, "semantic": semantic},
+        "recalibration": {
+            "neighborhood": "xyz" if unprojection else "image_plane",
+            "similarity": "product" if semantic else "none",
+        },
         "model": {"name": "paper"},
         "encoder": {"weights": weights},
         "data": {"name": data},
@@ -31,7 +34,8 @@ def config_of(ablation, seed=1, data="synthetic", weights=None, **changes) -> di
 
 def write_run(
     folder: Path, ablation, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None,
-    shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train", **changes,
+    shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train",
+    training=None, **changes,
 ):  # fmt: skip
     """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift."""
     config = config_of(ablation, seed, data, weights, **changes)
@@ -51,6 +55,7 @@ def write_run(
         "data": {"name": data, "split": "val"},
         "protocol": {"metrics": protocol},
         "git": git,
+        "training": training,
     }
     if verb == "evaluate":
         source["checkpoint_config"] = config

@@ -80,6 +80,10 @@ class Foreign:
         ({"format_version": FORMAT_VERSION + 1}, "of a newer version"),
         ({"format_version": 0}, "format_version 1 to"),
         ({"config": {"encoder": {}}}, "bounds"),
+        (
+            {"config": {**config(), "encoder": "vggt_nano"}},
+            r"encoder: expected a mapping .*; found 'vggt_nano'",
+        ),
     ],
 )
 def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
@@ -88,7 +92,7 @@ def test_a_foreign_file_is_refused_by_its_path(tmp_path, changes, message):
     checkpoint(path, **changes)
     with pytest.raises(InputError, match=message) as error:
         GHGS.from_checkpoint(path)
-    assert "b.ckpt" in str(error.value) or "bounds" in message
+    assert "b.ckpt" in str(error.value) or "bounds" in message or "encoder" in message
 
 
 def a_checkpoint(folder):
@@ -147,6 +151,14 @@ BAD_FILES = {
     "missing key": (changed_state(lambda s: s.pop(TOKEN)), "camera_token: expected a .*; found 'nothing'"),
     "extra key": (changed_state(lambda s: s.update({"model.x": torch.ones(3)})), "x: expected no such key"),
     "no tensor": (changed_state(lambda s: s.update({TOKEN: 3})), "camera_token: .* found 'int'"),
+    "not finite": (
+        changed_state(lambda s: s.update({TOKEN: torch.full((1, 2, 1, 32), float("nan"))})),
+        "camera_token: expected finite numbers; found 'NaN or infinity'",
+    ),
+    "infinite": (
+        changed_state(lambda s: s[TOKEN].view(-1)[3].fill_(float("inf"))),
+        "camera_token: expected finite numbers; found 'NaN or infinity'",
+    ),
     "whole numbers": (
         changed_state(lambda s: s.update({TOKEN: torch.ones(1, 2, 1, 32).int()})),
         "expected floating point numbers; found torch.int32",

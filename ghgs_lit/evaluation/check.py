@@ -1,0 +1,57 @@
+"""Checks, before any work, all that measuring at the end of a run needs."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ghgs_lit.config import build
+from ghgs_lit.config.settings import from_config
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.reader import PHASES
+from ghgs_lit.data.sampling import TargetProtocol
+from ghgs_lit.errors import choice, require
+from ghgs_lit.evaluation.protocols import target_protocols
+
+
+def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
+    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read.
+
+    Args:
+        config: the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used).
+        data: the photographs.
+
+    Raises:
+        InputError: a value is impossible, a metric cannot be computed, the split has no subjects, or a
+            subject lacks an input or a target.
+    """
+    evaluation = config["evaluation"]
+    for key in ("views", "targets"):
+        found = evaluation[key]
+        require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
+    views, pictures = evaluation["views"], evaluation["pictures"]
+    whole = all(isinstance(count, int) and not isinstance(count, bool) and count >= 2 for count in views)
+    require(whole and len(set(views)) == len(views), "evaluation.views", "different numbers from 2 on", views)
+    require(isinstance(pictures, int) and pictures >= 0, "evaluation.pictures", "0 or more", pictures)
+    protocols = {
+        name: from_config(TargetProtocol, "targets", values)
+        for name, values in target_protocols(config).items()
+    }
+    build(config["metrics"], "metrics")
+    split = evaluation["split"]
+    choice("evaluation.split", split, PHASES)
+    data.prepare_data()
+    require(len(data.subjects(split)) > 0, f"evaluation.split={split}", "a subject or more", "none")
+    for count in views:
+        for protocol in protocols.values():
+            _check_targets(data, split, count, protocol)
+
+
+def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol: TargetProtocol) -> None:
+    """Refuse a protocol that asks for photographs that a subject does not have."""
+    reader = data.builder(split).targets.reader
+    for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.specs:
+        for spec in batch:
+            for position, view in spec.targets:
+                known = position in reader.subjects[spec.subject]
+                there = reader.views_at(spec.subject, position) if known else []
+                expected = f"view {view} of subject {spec.subject} at position {position}"
+                require(view in there, f"evaluation.targets={protocol.name}", expected, there)

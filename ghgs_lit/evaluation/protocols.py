@@ -1,0 +1,22 @@
+"""The target protocols that an evaluation measures."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ghgs_lit.config.groups import read_option
+
+
+def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The protocols that ``evaluation.targets`` lists, by name.
+
+    Each has the values of its own file in ``conf/targets``; the one that ``targets=`` selects has the
+    configured values, overrides included.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    configured = config["targets"]
+    return {
+        name: configured if name == configured["name"] else read_option("targets", name, "evaluation.targets")
+        for name in config["evaluation"]["targets"]
+    }

@@ -1,0 +1,132 @@
+"""The model of a checkpoint after the command line, its data, and the device."""
+
+import copy
+
+import pytest
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import open_dict
+
+from ghgs_lit.cli import inputs
+from ghgs_lit.cli.main import _for_hydra
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.config.keys import lookup
+from ghgs_lit.errors import InputError
+from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.models import config
+
+TRAINED = ("model=hull", "skip=balanced")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "a.ckpt"
+    write_checkpoint(path, {}, {**config(*TRAINED), "data": {"_target_": "x", "root": "old", "size": 42}})
+    return str(path)
+
+
+@pytest.fixture
+def composed(monkeypatch):
+    """Composes a verb as the command line does, after which its overrides are known."""
+
+    def composed(verb, *overrides):
+        cfg = compose(verb, _for_hydra(verb, list(overrides)), with_hydra=True)
+        monkeypatch.setattr(HydraConfig.instance(), "cfg", copy.deepcopy(cfg))
+        with open_dict(cfg):
+            del cfg["hydra"]
+        return cfg
+
+    return composed
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "predict"])
+def test_a_checkpoint_is_not_changed_by_what_a_verb_composes(composed, checkpoint, verb):
+    """The defaults of a verb describe another model: only what was said counts."""
+    cfg = composed(verb, f"checkpoint={checkpoint}")
+    assert inputs.model_of(checkpoint, cfg) == config(*TRAINED)
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "predict"])
+def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, verb):
+    """Options that need no other weights change the model that is measured, with all that follows them."""
+    said = [
+        "skip=none",
+        "recalibration.k=2",
+        "recalibration.similarity=log",
+        "bounds=box",
+        "model.pad=multiple",
+    ]
+    model = inputs.model_of(checkpoint, composed(verb, f"checkpoint={checkpoint}", *said))
+    assert model == config(*TRAINED, *said)
+    assert model["gaussian_head"]["pixels"] == model["depth_head"]["views"] == "all"
+    model = inputs.model_of(
+        checkpoint, composed(verb, f"checkpoint={checkpoint}", "recalibration.tokens=all")
+    )
+    assert model == config(*TRAINED, "recalibration.tokens=all")
+
+
+@pytest.mark.parametrize(
+    ("said", "refused"),
+    [
+        ("encoder=vggt_small", "encoder.width: expected 32, which the checkpoint's weights"),
+        ("recalibration.num_heads=1", "recalibration.num_heads: expected 2,"),
+        ("gaussian_head.color_limit=0.25", "gaussian_head.color_limit: expected 0.5,"),
+        ("depth_head.parameterization=log", "depth_head.parameterization: expected 'linear',"),
+        ("compat=release", "compat.name: expected 'none',"),
+        ("model=paper", "model.name: expected 'hull',"),
+        ("ablation=neither", "ablation: expected full, .*recalibration.neighborhood=.* act"),
+    ],
+)
+def test_what_the_weights_were_trained_for_is_refused(composed, checkpoint, said, refused):
+    """An option that cannot act must not be recorded as if it had."""
+    cfg = composed("evaluate", f"checkpoint={checkpoint}", said)
+    with pytest.raises(InputError, match=refused):
+        inputs.model_of(checkpoint, cfg)
+
+
+def test_what_agrees_with_the_checkpoint_is_accepted(composed, checkpoint):
+    """Saying again what was trained changes nothing."""
+    cfg = composed("evaluate", f"checkpoint={checkpoint}", "model=hull", "compat=none", "ablation=full")
+    assert inputs.model_of(checkpoint, cfg) == config(*TRAINED)
+
+
+def test_a_stage_that_is_no_mapping_is_named(composed, tmp_path):
+    """A checkpoint of another program must not end in a traceback."""
+    path = str(tmp_path / "b.ckpt")
+    write_checkpoint(path, {}, {**config(), "encoder": "vggt_nano"})
+    with pytest.raises(InputError, match=r"b\.ckpt: config\.encoder: expected a stage .*; found 'vggt_nano'"):
+        inputs.model_of(path, composed("evaluate", f"checkpoint={path}", "encoder.width=3"))
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "predict"])
+def test_data_that_moved_are_one_override(composed, checkpoint, verb):
+    """``data.root=`` alone acts on the data that a checkpoint was trained on."""
+    cfg = composed(verb, f"checkpoint={checkpoint}", "data.root=new")
+    found = resolve(inputs.with_trained_data(cfg))["data"]
+    assert found == {"_target_": "x", "root": "new", "size": 42}
+    chosen = resolve(inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}", "data=scans")))
+    assert chosen["data"]["name"] == "scans"
+    with pytest.raises(InputError, match="data: expected data=<option> where there is no checkpoint"):
+        inputs.with_trained_data(composed("evaluate", "data.root=new"))
+
+
+def test_targets_on_the_command_line_are_measured_alone(composed):
+    """``targets=midway`` is the switch that its name says; evaluation.targets is for several protocols."""
+    found = inputs.with_chosen_targets(resolve(composed("evaluate", "targets=midway")))
+    assert lookup(found, "evaluation.targets") == ["midway"]
+    for said in ([], ["targets.per_subject=2"], ["targets=ghg", "evaluation.targets=[release,midway]"]):
+        found = inputs.with_chosen_targets(resolve(composed("evaluate", *said)))
+        assert lookup(found, "evaluation.targets") == ["release", "midway"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_device_or_renderer_that_is_not_there_is_refused():
+    """A run on the CPU must not pass for one on a GPU, and gsplat's absence is one line."""
+    with pytest.raises(
+        InputError, match="device: expected auto or cpu on a machine without CUDA; found 'cuda'"
+    ):
+        inputs.pick_device("cuda")
+    assert inputs.pick_device("auto").type == "cpu"
+    renderer = resolve(compose("evaluate", ["renderer=gsplat"]))
+    with pytest.raises(InputError, match="needs a CUDA device"):
+        inputs.build_renderer(renderer, torch.device("cpu"))
