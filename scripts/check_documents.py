@@ -86,7 +86,10 @@ SMALL = [
 _SCANS = "ghgs prepare task=miniature data=thuman2 data.source={} miniature.size=64 miniature.people.train=2"
 _RENDER = "ghgs prepare task=render data=scans data.source={} data.root=rendered data.render.size=60"
 _RUN = f"ghgs train experiment=demo {TINY} {SHORT}"
-_SWEEP = f"{_RUN} -m ablation=full,neither logger=none callbacks=none hydra.sweep.dir=runs/train/paper"
+_SWEEP = (
+    f"ghgs train -m experiment=demo {TINY} {SHORT} ablation=full,neither 'evaluation.views=[4]' "
+    "evaluation.pictures=0 logger=none callbacks=none hydra.sweep.dir=runs/train/paper"
+)
 _CHECKPOINTS = (
     f"{_RUN} hydra.run.dir=runs/mine",
     *(f"cp runs/mine/checkpoints/last.ckpt {n}.ckpt" for n in "ab"),
