@@ -67,6 +67,7 @@ SMALL = [
     (r"<run>", "runs/before", "a small run"),
     (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
     (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
+    (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "beside the miniature"),
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1", "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
