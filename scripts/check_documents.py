@@ -67,6 +67,7 @@ SMALL = [
     (r"<run>", "runs/before", "a small run"),
     (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
     (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
+    (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "beside the miniature"),
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1", "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
@@ -86,7 +87,10 @@ SMALL = [
 _SCANS = "ghgs prepare task=miniature data=thuman2 data.source={} miniature.size=64 miniature.people.train=2"
 _RENDER = "ghgs prepare task=render data=scans data.source={} data.root=rendered data.render.size=60"
 _RUN = f"ghgs train experiment=demo {TINY} {SHORT}"
-_SWEEP = f"{_RUN} -m ablation=full,neither logger=none callbacks=none hydra.sweep.dir=runs/train/paper"
+_SWEEP = (
+    f"ghgs train -m experiment=demo {TINY} {SHORT} ablation=full,neither 'evaluation.views=[4]' "
+    "evaluation.pictures=0 logger=none callbacks=none hydra.sweep.dir=runs/train/paper"
+)
 _CHECKPOINTS = (
     f"{_RUN} hydra.run.dir=runs/mine",
     *(f"cp runs/mine/checkpoints/last.ckpt {n}.ckpt" for n in "ab"),

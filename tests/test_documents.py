@@ -4,6 +4,7 @@ import importlib.util
 import pydoc
 import re
 import sys
+import tomllib
 from functools import lru_cache
 from pathlib import Path
 
@@ -127,6 +128,20 @@ def test_options_and_keys_exist(document):
         if dotted and not is_file and dotted[1] in keys() and not is_key(span):
             wrong.append(span)
     assert not wrong
+
+
+def test_promised_pythons_agree():
+    """README, package, linter and the script that tests them must promise the same versions of Python."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+    oldest, last = re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["project"]["requires-python"]).groups()
+    versions = [f"3.{minor}" for minor in range(int(oldest), int(last))]
+    classifiers = " ".join(project["project"]["classifiers"])
+    assert re.findall(r"Python :: (3\.\d+)", classifiers) == versions
+    assert project["tool"]["ruff"]["target-version"] == f"py{versions[0].replace('.', '')}"
+    assert f"Python {versions[0]} to {versions[-1]} on" in (REPOSITORY / "README.md").read_text()
+    assert f"{versions[0]} {versions[-1]}" in (REPOSITORY / "scripts" / "test_pythons.sh").read_text()
+    markers = re.findall(r"python_version . \W3\.(\d+)", (REPOSITORY / "constraints.txt").read_text())
+    assert all(int(oldest) < int(minor) for minor in markers)  # no pins of versions that are not promised
 
 
 def test_commands_are_read_whole(tmp_path, monkeypatch):

@@ -207,6 +207,9 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
     if workers < 2:
         yield from map(render_subject, jobs)
         return
+    if multiprocessing.get_start_method() not in multiprocessing.get_all_start_methods():
+        # A worker of joblib: its start method is inherited by name, and a fresh process does not know it.
+        multiprocessing.set_start_method("spawn", force=True)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
         try:

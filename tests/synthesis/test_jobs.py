@@ -202,6 +202,14 @@ def test_several_workers_make_the_same_files(scans, reference, tmp_path):
     assert contents(tmp_path / "out") == reference
 
 
+def test_people_are_rendered_inside_a_worker_of_joblib(scans, reference, tmp_path):
+    """A sweep with ``hydra/launcher=joblib`` makes its people in joblib's worker, in further processes."""
+    joblib = pytest.importorskip("joblib")
+    job = joblib.delayed(render_boxes)(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
+    joblib.Parallel(n_jobs=2, backend="loky")([job])
+    assert contents(tmp_path / "out") == reference
+
+
 def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp_path):
     """An error loses no finished work and leaves no half subject."""
     root = tmp_path / "out"
