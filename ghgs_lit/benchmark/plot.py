@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from ghgs_lit.benchmark.report import totals
 from ghgs_lit.files import write_atomically
@@ -121,7 +122,7 @@ def draw_scaling(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]], machine
     figure, hints = Figure(figsize=(4.2 * len(names), 4), layout="constrained"), {}
     found = {(f["axis"], f["preset"], f["stage"]): f["exponent"] for f in fits}
     colors = matplotlib.colormaps["tab10"]
-    for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
+    for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names), sharey=True)), names, strict=True):
         for number, preset in enumerate(presets):
             own = [row for row in whole if (row["axis"], row["preset"]) == (name, preset)]
             exponent = found.get((name, preset, "total"))
@@ -136,7 +137,7 @@ def draw_scaling(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]], machine
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xticks(values, [f"{value:g}" for value in values])
-        axes.minorticks_off()
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlabel(name)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)

@@ -96,8 +96,6 @@ def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str,
     Raises:
         InputError: there is no such file.
     """
-    is_list = isinstance(names, Sequence) and not isinstance(names, str)
-    require(is_list and bool(names), "presets", "a list with a name", names)
     return {
         name: dict(configured) if name == configured["name"] else read_option("skip", name, "presets")
         for name in names

@@ -60,6 +60,8 @@ def _check(config: dict[str, Any]) -> None:
     for key, least in (("warmup", 0), ("repeats", 1)):
         value = timing[key]
         require(isinstance(value, int) and value >= least, f"timing.{key}", f"at least {least}", value)
+    names = config["presets"]
+    require(isinstance(names, list) and bool(names), "presets", "a list with a name", names)
     count = config["subjects"]
     require(isinstance(count, int) and count >= 1, "subjects", "at least 1", count)
     count = config["threads"]
@@ -80,7 +82,7 @@ _APPLIED = ("skip", "renderer", "precision")
 def _cases(config: dict[str, Any], readers: dict[str, str], device: torch.device) -> list[Case]:
     """Every source in every preset; for errors the yardstick is always among them."""
     names = config["presets"]
-    if config["task"] == "presets" and isinstance(names, list):
+    if config["task"] == "presets":
         names = list(dict.fromkeys([YARDSTICK, *names]))
     presets = presets_of(names, config["skip"])
     if config["checkpoint"] is None:
@@ -89,7 +91,7 @@ def _cases(config: dict[str, Any], readers: dict[str, str], device: torch.device
         given = {"model": config["checkpoint"], "vs": config["vs"]}
         sources = [Source.of_checkpoint(name, path) for name, path in given.items() if path is not None]
     shared = {name: config[name] for name in ("renderer", "precision")}
-    options = (presets, readers, config["knobs"], shared, device, config["seed"])
+    options = (presets, readers, config["knobs"] or {}, shared, device, config["seed"])
     return [case for source in sources for case in cases_of(source, *options)]
 
 
