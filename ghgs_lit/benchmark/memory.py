@@ -1,6 +1,7 @@
 """Peak memory of stages: of the process on a CPU (Linux's own counters), of all tensors on CUDA."""
 
 import ctypes
+import os
 from pathlib import Path
 
 import torch
@@ -20,8 +21,10 @@ def reset_peak() -> None:
 
 
 def return_free_memory() -> None:
-    """Give free memory that the C library keeps back to the system: it must not count."""
-    ctypes.CDLL(None).malloc_trim(0)
+    """Give free memory that the C library keeps back to the system, where it can: it must not count."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 class PeakProbe:
@@ -55,7 +58,7 @@ class PeakProbe:
 
     @property
     def _available(self) -> bool:
-        return self.device.type == "cuda" or _CLEAR.exists()
+        return self.device.type == "cuda" or os.access(_CLEAR, os.W_OK)
 
     def _note(self) -> None:
         """The peak since the last reset counts for all stages that are open."""

@@ -1,8 +1,7 @@
 """Options of config groups by name, beside those that the composed configuration has."""
 
 import difflib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -16,7 +15,7 @@ from ghgs_lit.errors import InputError
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
     """The values of ``<group>/<name>.yaml``, its own defaults included, as plain data.
 
-    Inside a Hydra application its search path comes first: it has the user's ``--config-dir``.
+    Inside a Hydra application its search path counts, which has the user's ``--config-dir`` too.
 
     Args:
         group: config group, such as ``targets``.
@@ -26,28 +25,14 @@ def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]
     Raises:
         InputError: the group has no such option.
     """
-    known: list[str] = []
-    if GlobalHydra.instance().is_initialized() and name in (known := _options(group)):
-        return _read(group, name)
-    with _shipped_configuration():
-        if name in (shipped := _options(group)):
+    inside = GlobalHydra.instance().is_initialized()
+    with nullcontext() if inside else initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        known = sorted(_options(group))
+        if name in known:
             return _read(group, name)
-    known = sorted({*known, *shipped})
     close = difflib.get_close_matches(str(name), known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     raise InputError(f"{key or group}: expected one of {', '.join(known)}; found {name!r}{hint}")
-
-
-@contextmanager
-def _shipped_configuration() -> Iterator[None]:
-    """Hydra with the shipped ``conf`` alone; the application that runs, if any, is put aside."""
-    running = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            yield
-    finally:
-        GlobalHydra.instance().hydra = running
 
 
 def _options(group: str) -> list[str]:

@@ -11,6 +11,7 @@ import torch
 import yaml
 from PIL import Image
 
+from ghgs_lit.cli.main import main
 from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure
@@ -21,7 +22,6 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.runs.provenance import config_hash
 from tests.helpers.people import render_boxes
 from tests.helpers.training import Standin, example_batch, flat_renderer
-from tests.helpers.verbs import ghgs
 
 OFF = ImageMetrics(lpips="off")
 
@@ -73,6 +73,20 @@ def boxes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("boxes")
     render_boxes(folder / "rendered", folder / "scans", train=3, val=2)
     return folder / "rendered"
+
+
+def ghgs(*arguments: str) -> int:
+    """The console script in this process."""
+    before = sys.argv
+    sys.argv = ["ghgs", *arguments]
+    # The script sets it for Hydra; where a user has set it, errors are raised.
+    os.environ.pop("HYDRA_FULL_ERROR", None)
+    try:
+        return main()
+    except SystemExit as exit:
+        return exit.code
+    finally:
+        sys.argv = before
 
 
 @pytest.fixture(scope="module")
