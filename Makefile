@@ -40,7 +40,8 @@ format: setup ## Correct style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: setup ## Measure the rasterizer against its peers (minutes)
+bench: setup ## Measure the presets of skip on built-in people, and the rasterizer (minutes)
+	$(BIN)/ghgs benchmark data=synthetic data.people.train=1 data.people.val=4
 	$(BIN)/python benchmarks/rasterizer.py --quick
 
 clean: ## Remove the virtual environment and caches, keep runs

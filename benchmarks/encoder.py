@@ -17,13 +17,13 @@ from pathlib import Path
 
 import torch
 from omegaconf import OmegaConf
-from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 
 from ghgs_lit import encoder, recalibration
+from ghgs_lit.benchmark.weights import random_model
 from ghgs_lit.config import compose
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS, STAGES
@@ -39,25 +39,6 @@ def configuration(size: str, options: list[str]) -> dict:
     overrides = [f"encoder={size}", "model=paper", "skip=none", "recalibration.tokens=all", *options]
     config = compose("train", overrides)
     return OmegaConf.to_container(OmegaConf.masked_copy(config, [*STAGES, "skip"]), resolve=True)
-
-
-@torch.no_grad()
-def random_model(config: dict) -> GHGS:
-    """A model with random weights, without the time of the usual initialisation."""
-    with torch.device("meta"):
-        model = GHGS.from_config(config)
-    generator = torch.Generator().manual_seed(0)
-    for module in model.modules():
-        for name, parameter in module._parameters.items():
-            if parameter is None:
-                continue
-            value = torch.empty(parameter.shape)
-            if parameter.dim() > 1:
-                value.normal_(std=parameter[0].numel() ** -0.5, generator=generator)
-            else:
-                value.fill_(float(name in ("weight", "gamma")))
-            module._parameters[name] = nn.Parameter(value, requires_grad=False)
-    return model.eval()
 
 
 def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:

@@ -1,13 +1,11 @@
 """Time and peak memory of the stages of a computation, from Linux's own counters."""
 
-import ctypes
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
-STATUS = Path("/proc/self/status")
+from ghgs_lit.benchmark.memory import memory_bytes, reset_peak, return_free_memory
 
 
 @dataclass
@@ -29,26 +27,20 @@ def merged(name: str, stages: list[Stage]) -> Stage:
 
 def memory_gb(field: str) -> float:
     """``VmRSS`` (memory now) or ``VmHWM`` (peak since the last reset) of this process."""
-    line = next(line for line in STATUS.read_text().splitlines() if line.startswith(field + ":"))
-    return int(line.split()[1]) * 1024 / 1e9
-
-
-def reset_peak() -> None:
-    """Reset ``VmHWM`` to the memory that is held now."""
-    Path("/proc/self/clear_refs").write_text("5")
+    return memory_bytes(field) / 1e9
 
 
 class Recorder:
     """Times stages and reads their peak memory; ``base`` is what the process holds at construction."""
 
     def __init__(self) -> None:
-        ctypes.CDLL(None).malloc_trim(0)
+        return_free_memory()
         self.base = memory_gb("VmRSS")
         self.stages: list[Stage] = []
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        ctypes.CDLL(None).malloc_trim(0)  # free memory that the C library keeps must not count
+        return_free_memory()
         before = memory_gb("VmRSS") - self.base
         reset_peak()
         start = time.perf_counter()

@@ -45,6 +45,10 @@ VERBS = {
         "a checkpoint to the published names",
         "ghgs export checkpoint=checkpoints/last.ckpt vggt=vggt.safetensors release=release.pth",
     ),
+    "benchmark": (
+        "run time against error of the presets of skip, by stage",
+        "ghgs benchmark checkpoint=last.ckpt presets=[none,exact,balanced]",
+    ),
     "table": ("collect a sweep into the paper's table", "ghgs table runs=runs/train/sweep_..."),
 }
 

@@ -69,14 +69,14 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     ]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """``value`` for JSON, in which infinite numbers and nan become null."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return value
 
 
@@ -96,7 +96,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     table = io.StringIO()
     writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in _plain(rows))
+    writer.writerows({**row, "inputs": " ".join(row["inputs"]), **origin} for row in plain(rows))
     write_text_atomically(directory / "metrics.csv", table.getvalue())
     content = {
         "format_version": FORMAT_VERSION,
@@ -105,7 +105,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
         "rows": rows,
     }
     path = directory / "metrics.json"
-    write_text_atomically(path, json.dumps(_plain(content), indent=1, allow_nan=False))
+    write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False))
     return path
 
 

@@ -22,6 +22,24 @@ PARTS = (
 )
 
 
+#: A moment: seconds on the CPU, an event on CUDA.
+Mark = float | torch.cuda.Event
+
+
+def time_mark(device: torch.device) -> Mark:
+    """This moment on ``device``: on CUDA, when the work that was given to it so far is done."""
+    if device.type != "cuda":
+        return time.perf_counter()
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
+
+
+def seconds_between(begin: Mark, end: Mark) -> float:
+    """Seconds from one mark to a later one of the same device, which must have been reached."""
+    return end - begin if isinstance(begin, float) else begin.elapsed_time(end) / 1e3
+
+
 class StepClock:
     """Measures the parts of a step: the time between two marks belongs to the part of the second.
 
@@ -43,8 +61,8 @@ class StepClock:
         self.running = False
         self._totals: dict[str, float] = {}
         self._steps = 0
-        self._marks: list[tuple[str | None, object]] = []
-        self._pending: list[tuple[str | None, object]] = []
+        self._marks: list[tuple[str | None, Mark]] = []
+        self._pending: list[tuple[str | None, Mark]] = []
 
     def restart(self) -> None:
         """Begin a step again here; marks since the last :meth:`end_step` are forgotten."""
@@ -72,15 +90,10 @@ class StepClock:
         self._totals, self._steps = {}, 0
         return found
 
-    def _add(self, marks: Sequence[tuple[str | None, object]]) -> None:
+    def _add(self, marks: Sequence[tuple[str | None, Mark]]) -> None:
         self._steps += bool(marks)
         for (_, begin), (part, stop) in pairwise(marks):
-            seconds = begin.elapsed_time(stop) / 1e3 if self.device.type == "cuda" else stop - begin
-            self._totals[part] = self._totals.get(part, 0.0) + seconds
+            self._totals[part] = self._totals.get(part, 0.0) + seconds_between(begin, stop)
 
-    def _now(self) -> object:
-        if self.device.type != "cuda":
-            return time.perf_counter()
-        event = torch.cuda.Event(enable_timing=True)
-        event.record()
-        return event
+    def _now(self) -> Mark:
+        return time_mark(self.device)

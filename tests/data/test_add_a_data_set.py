@@ -1,7 +1,6 @@
 """A data set of one's own: the documentation's template, found by the command line, trained and measured."""
 
 import json
-import os
 import shutil
 import sys
 from pathlib import Path
@@ -12,10 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
-from ghgs_lit.cli.main import main
 from ghgs_lit.config import build, plugins
 from ghgs_lit.errors import InputError
 from tests.helpers.training import ring
+from tests.helpers.verbs import ghgs
 
 TEMPLATE = Path(__file__).parents[2] / "docs" / "template"
 CAMERAS, SIZE = 8, 60
@@ -63,19 +62,6 @@ def clean(monkeypatch):
 def node(project: Path, **changes) -> dict:
     about = {"_target_": "my_people.MyDataModule", "name": "m", "root": str(project / "photographs")}
     return {**about, "size": 56, "ring": CAMERAS, **KEYS, **changes}
-
-
-def ghgs(*arguments: str) -> int:
-    """The console script in this process."""
-    before = sys.argv
-    sys.argv = ["ghgs", *arguments]
-    os.environ.pop("HYDRA_FULL_ERROR", None)
-    try:
-        return main()
-    except SystemExit as exit:
-        return exit.code
-    finally:
-        sys.argv = before
 
 
 def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, capsys):

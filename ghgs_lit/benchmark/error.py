@@ -1,0 +1,77 @@
+"""How far the result of a preset is from the yardstick's."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from ghgs_lit.metrics.functional import decibels, squared_error
+from ghgs_lit.types import Gaussians, Prediction, Rendering
+
+ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
+
+
+def relative_difference(found: Tensor, expected: Tensor) -> float:
+    """``max|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected``
+    is 0 and ``found`` is not; 0 where there are no values."""
+    if found.numel() == 0:
+        return 0.0
+    difference = (found - expected).abs().max().item()
+    if not math.isfinite(difference):
+        return math.inf
+    largest = expected.abs().max().item()
+    return difference / largest if largest > 0 else (0.0 if difference == 0 else math.inf)
+
+
+def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """Indices of the Gaussians that belong to the same input pixel in both.
+
+    A preset may drop or merge Gaussians: those without a partner are left out.
+    """
+    if found.image is None or expected.image is None:
+        n = min(len(found), len(expected))
+        return torch.arange(n), torch.arange(n)
+    width = 1 + max((int(g.pixel.max()) for g in (found, expected) if len(g)), default=0)
+    keys, order = (expected.image * width + expected.pixel).sort(stable=True)
+    wanted = found.image * width + found.pixel
+    place = torch.searchsorted(keys, wanted).clamp(max=max(len(keys) - 1, 0))
+    known: Bool[Tensor, " n"] = (
+        keys[place] == wanted if len(keys) else torch.zeros_like(wanted, dtype=torch.bool)
+    )
+    return known.nonzero()[:, 0], order[place[known]]
+
+
+def differences(
+    found: tuple[Prediction, Rendering], expected: tuple[Prediction, Rendering], masks: Bool[Tensor, "..."]
+) -> dict[str, float]:
+    """What a preset changes.
+
+    Args:
+        found: of the preset.
+        expected: of the yardstick.
+        masks: of the inputs [B, V, H, W].
+
+    Returns:
+        :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` and of the
+        ``depth`` of the subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the
+        renders; and ``unmatched``, the part of the yardstick's Gaussians that have no partner, or more than
+        the preset's own that have none.
+    """
+    (prediction, rendering), (yardstick, reference) = found, expected
+    ours, theirs = prediction.gaussians, yardstick.gaussians
+    a, b = partners(ours, theirs)
+    result = {
+        name: relative_difference(getattr(ours, name)[a], getattr(theirs, name)[b]) for name in ATTRIBUTES
+    }
+    result["render"] = relative_difference(rendering.image, reference.image)
+    valid = prediction.depth_valid & yardstick.depth_valid & masks
+    result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid])
+    error = squared_error(rendering.image.flatten(0, 1), reference.image.flatten(0, 1)).mean()
+    missing = max(len(theirs), len(ours)) - len(a)
+    return {
+        **result,
+        "max_rel_diff": max(result.values()),
+        "psnr_to_none": decibels(error[None]).item(),
+        "unmatched": missing / max(len(theirs), 1),
+    }

@@ -1,0 +1,36 @@
+"""The machine that times were measured on."""
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+def processor_name() -> str:
+    """The processor's model name; what Python knows of it on other systems than Linux."""
+    path = Path("/proc/cpuinfo")
+    lines = path.read_text().splitlines() if path.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def machine_facts(device: torch.device) -> dict[str, Any]:
+    """Processor, vector width, cores, threads, device and PyTorch's version, as plain data."""
+    return {
+        "processor": processor_name(),
+        "vectors": torch.backends.cpu.get_cpu_capability(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
+        "platform": platform.platform(),
+        "torch": torch.__version__,
+    }
+
+
+def in_words(machine: dict[str, Any]) -> str:
+    """The facts on one line, for titles."""
+    device = "" if machine["device"] == "cpu" else f"{machine['device']}, "
+    cores = f"{machine['threads']} of {machine['cores']} cores"
+    return f"{device}{machine['processor']} ({machine['vectors']}, {cores}), torch {machine['torch']}"

@@ -1,0 +1,169 @@
+"""``ghgs benchmark``: run time against error of every preset, and how cost grows."""
+
+import itertools
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from omegaconf import DictConfig
+from rich.progress import Progress
+
+from ghgs_lit.benchmark import report, scaling
+from ghgs_lit.benchmark.board import write_board
+from ghgs_lit.benchmark.machine import in_words, machine_facts
+from ghgs_lit.benchmark.measure import record_cases, threads
+from ghgs_lit.benchmark.page import to_page
+from ghgs_lit.benchmark.plot import draw_presets, draw_scaling, save_png
+from ghgs_lit.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of, presets_of, readers_of_skip
+from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
+from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.config import build
+from ghgs_lit.config.keys import is_below
+from ghgs_lit.config.settings import from_config
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.provenance import provenance
+from ghgs_lit.training.loggers import hyperparameters
+from ghgs_lit.types import Batch
+
+TASKS = ("presets", "scaling")
+
+
+def run(cfg: DictConfig) -> None:
+    """The verb; prints the path of the results last. Exit code 1 where a preset breaks its budget."""
+    directory = output_dir()
+    choice("task", cfg.task, TASKS)
+    cfg = with_trained_data(cfg) if cfg.task == "presets" else cfg
+    config = save_config(cfg, directory)
+    _check(config)
+    L.seed_everything(config["seed"], workers=True, verbose=False)
+    device = pick_device(config["device"])
+    with threads(config["threads"]):
+        cases = _cases(config, readers_of_skip(cfg), device)
+        content = (
+            _presets(cases, config, device) if cfg.task == "presets" else _scaling(cases, config, device)
+        )
+        content = {"task": config["task"], "machine": machine_facts(device), **content}
+    path = _write(directory, content, config)
+    announce(path)
+    if content["broken"]:
+        for said in content["broken"]:
+            print(f"ghgs benchmark: {said}", file=sys.stderr)
+        raise SystemExit(1)
+
+
+def _check(config: dict[str, Any]) -> None:
+    timing = config["timing"]
+    for key, least in (("warmup", 0), ("repeats", 1)):
+        value = timing[key]
+        require(isinstance(value, int) and value >= least, f"timing.{key}", f"at least {least}", value)
+    names = config["presets"]
+    require(isinstance(names, list) and bool(names), "presets", "a list with a name", names)
+    count = config["subjects"]
+    require(isinstance(count, int) and count >= 1, "subjects", "at least 1", count)
+    count = config["threads"]
+    require(count is None or (isinstance(count, int) and count >= 1), "threads", "at least 1, or null", count)
+    if config["checkpoint"] is None:
+        require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
+        return
+    # A checkpoint brings its own model: what is asked for beside it must not be ignored in silence.
+    for key in (text.split("=", 1)[0].lstrip("+~") for text in overrides()):
+        if is_below(key, [name for name in (*KNOBS, "ablation", "compat") if name not in _APPLIED]):
+            raise InputError(f"{key}: expected no option of the model beside a checkpoint (knobs={{...}})")
+
+
+#: Nodes of :data:`KNOBS` that the command line sets for checkpoints, too.
+_APPLIED = ("skip", "renderer", "precision")
+
+
+def _cases(config: dict[str, Any], readers: dict[str, str], device: torch.device) -> list[Case]:
+    """Every source in every preset; for errors the yardstick is always among them."""
+    names = config["presets"]
+    if config["task"] == "presets":
+        names = list(dict.fromkeys([YARDSTICK, *names]))
+    presets = presets_of(names, config["skip"])
+    if config["checkpoint"] is None:
+        sources = [Source("model", config, None)]
+    else:
+        given = {"model": config["checkpoint"], "vs": config["vs"]}
+        sources = [Source.of_checkpoint(name, path) for name, path in given.items() if path is not None]
+    shared = {name: config[name] for name in ("renderer", "precision")}
+    options = (presets, readers, config["knobs"] or {}, shared, device, config["seed"])
+    return [case for source in sources for case in cases_of(source, *options)]
+
+
+def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
+    """Measure presets on data."""
+    data = build_data(config)
+    data.prepare_data()
+    loader = data.evaluation_loader(split=config["split"])
+    number = math.ceil(config["subjects"] / data.options.batch_size)
+    batches: list[Batch] = [batch.to(device) for batch in itertools.islice(loader, number)]
+    if batches[0].targets is None:
+        raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")
+    metrics = build(config["metrics"], "metrics").to(device)
+    timing = config["timing"]
+    total = len(cases) * (len(batches) + timing["warmup"] + timing["repeats"])
+    with Progress() as bar:
+        task = bar.add_task("presets", total=total)
+        records = record_cases(
+            cases, batches, metrics, config["targets"]["name"], device,
+            **timing, progress=lambda label: bar.update(task, advance=1, description=label),
+        )  # fmt: skip
+    rows = report.rows_of(records)
+    _, views, _, height, width = batches[0].images.shape
+    subjects = sum(len(batch.images) for batch in batches)
+    about = f"{_weights(config, cases)}; {subjects} subjects of {config['data']['name']}"
+    return {
+        "about": f"{about}, {views} views of {height} x {width}",
+        "random_weights": config["checkpoint"] is None,
+        "rows": rows,
+        "broken": report.broken_budgets(rows),
+        "subjects": [row for record in records for row in record.metrics],
+    }
+
+
+def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
+    """Measure how cost grows, on analytic scenes."""
+    axes = from_config(scaling.Axes, "scaling", config["scaling"])
+    timing = config["timing"]
+    total = scaling.passes(len(cases), axes, timing["warmup"] + timing["repeats"])
+    with Progress() as bar:
+        task = bar.add_task("scaling", total=total)
+        rows, fits = scaling.study(
+            cases, axes, device, **timing,
+            progress=lambda label: bar.update(task, advance=1, description=label),
+        )  # fmt: skip
+    base = ", ".join(f"{name} {value:g}" for name, value in axes.base.items())
+    about = f"{_weights(config, cases)}; an ellipsoid, elsewhere {base}"
+    random_weights = config["checkpoint"] is None
+    return {"about": about, "random_weights": random_weights, "rows": rows, "fits": fits, "broken": []}
+
+
+def _weights(config: dict[str, Any], cases: list[Case]) -> str:
+    """The models in words."""
+    number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
+    own = config["checkpoint"] or f"{choices().get('encoder', 'encoder')}, random weights"
+    against = f" vs: {config['vs']}" if config["vs"] else ""
+    return f"{own} ({number:.1f} M parameters, precision {config['precision']}){against}"
+
+
+def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
+    """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
+    rows, words = content["rows"], (in_words(content["machine"]), content["about"])
+    if content["task"] == "presets":
+        tables, drawing = report.tables_of(rows), draw_presets(rows, *words)
+    else:
+        fits = content["fits"]
+        tables, drawing = scaling.tables_of(rows, fits), draw_scaling(rows, fits, *words)
+    report.print_tables(tables)
+    png = drawing.png()
+    save_png(png, directory / "benchmark.png")
+    notes = report.notes_of(content)
+    write_text_atomically(directory / "benchmark.html", to_page(drawing, tables, notes))
+    write_board(directory, rows, png, hyperparameters(config, choices(), overrides()))
+    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
+    return report.write_numbers(directory, {**content, "provenance": source}, tables)

@@ -1,0 +1,191 @@
+"""``ghgs benchmark`` from end to end with tiny models: files, budgets, presets without code, scaling."""
+
+import csv
+import json
+import re
+
+import pytest
+
+from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.models import TINY, config, make_model
+from tests.helpers.people import render_boxes
+from tests.helpers.verbs import ghgs
+
+KEYS = {
+    "preset", "stage", "seconds", "peak_bytes", "flops", "max_rel_diff", "psnr", "psnr_loss_db", "budget_db",
+}  # fmt: skip
+QUICK = ["timing.warmup=0", "timing.repeats=1", "threads=1", "metrics.lpips=off", "views=v3"]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("boxes")
+    render_boxes(folder / "rendered", folder / "scans", train=1, val=2)
+    return ["data=scans", f"data.root={folder / 'rendered'}", "data.size=42"]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights") / "tiny.ckpt"
+    write_checkpoint(path, make_model().state_dict(), config())
+    return path
+
+
+def totals(content):
+    return {row["preset"]: row for row in content["rows"] if row["stage"] == "total"}
+
+
+@pytest.fixture(scope="module")
+def measured(data, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("benchmark") / "run"
+    code = ghgs(
+        "benchmark", *data, *TINY, *QUICK, "presets=[exact,balanced]", "subjects=2",
+        f"hydra.run.dir={directory}",
+    )  # fmt: skip
+    assert code == 0
+    return directory
+
+
+def test_the_json_has_one_row_for_each_preset_and_stage(measured):
+    """Scripts read these keys; ``none`` is measured because the others are compared with it."""
+    content = json.loads((measured / "benchmark.json").read_text())
+    assert {"processor", "vectors", "cores", "threads", "torch"} <= set(content["machine"])
+    assert all(set(row) >= KEYS for row in content["rows"])
+    stages = [row["stage"] for row in content["rows"] if row["preset"] == "exact"]
+    assert stages == [
+        "bounds", "encoder.patch_tokens", "encoder", "depth_head", "unprojection", "recalibration",
+        "gaussian_head", "render", "other", "total",
+    ]  # fmt: skip
+    whole = totals(content)
+    assert list(whole) == ["none", "exact", "balanced"]
+    assert whole["none"]["max_rel_diff"] == whole["none"]["psnr_loss_db"] == 0
+    assert whole["exact"]["budget_db"] is not None
+    assert whole["balanced"]["tokens"] < whole["exact"]["tokens"] == 27
+    assert whole["exact"]["gaussians"] == whole["exact"]["points"] > 0
+    assert whole["balanced"]["flops"] < whole["exact"]["flops"] < whole["none"]["flops"]
+    assert content["random_weights"]
+    assert content["broken"] == []
+    assert len(content["subjects"]) == 3 * 2
+    assert content["provenance"]["verb"] == "benchmark"
+
+
+def test_exact_is_exact(measured):
+    """The promise of ``exact`` holds for a model of which every output depends on the photographs."""
+    row = totals(json.loads((measured / "benchmark.json").read_text()))["exact"]
+    assert row["max_rel_diff"] <= 1e-5
+    assert row["differences"]["unmatched"] == 0
+
+
+def test_the_stages_add_up_to_the_total(measured):
+    """With one round the seconds of the stages without a dot are those of the whole pass."""
+    rows = json.loads((measured / "benchmark.json").read_text())["rows"]
+    for preset in ("none", "exact", "balanced"):
+        own = {row["stage"]: row["seconds"] for row in rows if row["preset"] == preset}
+        total = own.pop("total")
+        assert sum(v for stage, v in own.items() if "." not in stage) == pytest.approx(total)
+
+
+def test_all_files_of_a_benchmark_are_written(measured):
+    """The page needs no other file and has a hint for each preset; TensorBoard has a run for each."""
+    with open(measured / "benchmark.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 3 * 10
+    text = (measured / "benchmark.md").read_text()
+    assert "| balanced |" in text
+    assert "Machine: " in text
+    page = (measured / "benchmark.html").read_text()
+    assert not re.search(r'(src|href)="http', page)
+    for preset in ("none", "exact", "balanced"):
+        assert re.search(rf"<title>{preset}: [\d.]+ s", page)
+        assert list((measured / "tensorboard" / preset).glob("events*"))
+    assert list((measured / "tensorboard" / "figure").glob("events*"))
+    assert (measured / "benchmark.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_preset_of_the_user_that_breaks_its_budget_ends_with_code_1(data, tmp_path, capsys):
+    """A new file of ``conf/skip`` is a preset without any code, and its promise is checked."""
+    mine = tmp_path / "conf" / "skip" / "mine.yaml"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("defaults: [balanced, _self_]\nname: mine\nmax_rel_diff: 1.0e-9\nbudget_db: -100\n")
+    run = ["benchmark", f"--config-dir={tmp_path / 'conf'}", *data, *TINY, *QUICK, "subjects=1"]
+    assert ghgs(*run, "presets=[mine]", f"hydra.run.dir={tmp_path / 'a'}") == 1
+    out, err = capsys.readouterr()
+    assert out.strip().splitlines()[-1] == f"wrote {tmp_path / 'a' / 'benchmark.json'}"
+    # Nobody trained these weights: a loss of PSNR is no broken promise.
+    assert "mine: expected max_rel_diff up to 1e-09; found" in err
+    assert "dB" not in err
+    assert ghgs(*run, "presets=[mien]", f"hydra.run.dir={tmp_path / 'b'}") == 1
+    assert "did you mean mine?" in capsys.readouterr().err
+
+
+def test_a_checkpoint_in_every_preset_against_another_one(data, checkpoint, tmp_path, capsys):
+    """Presets act on the weights of a checkpoint, whose configuration has those of its training."""
+    run = ["benchmark", *data, *QUICK, f"checkpoint={checkpoint}", "subjects=1"]
+    code = ghgs(
+        *run, f"vs={checkpoint}", "presets=[balanced]", "knobs={recalibration.k:[2],precision:[float32]}",
+        f"hydra.run.dir={tmp_path / 'a'}",
+    )  # fmt: skip
+    content = json.loads((tmp_path / "a" / "benchmark.json").read_text())
+    whole = totals(content)
+    changed = "balanced recalibration.k=2 precision=float32"
+    assert set(whole) == {
+        "none", "none recalibration.k=2 precision=float32", changed,
+        "vs: none", "vs: none recalibration.k=2 precision=float32", f"vs: {changed}",
+    }  # fmt: skip
+    assert not content["random_weights"]
+    assert whole["none"]["trained"]
+    assert whole[changed]["budget_db"] is None
+    assert whole[changed]["max_rel_diff"] > 0
+    assert whole[changed]["tokens"] < whole["none"]["tokens"]
+    for name in ("psnr", "max_rel_diff", "gaussians"):
+        assert whole[changed][name] == pytest.approx(whole[f"vs: {changed}"][name])
+    assert code == 0
+    # What the checkpoint decides is not ignored in silence.
+    assert ghgs(*run, "recalibration.k=2", f"hydra.run.dir={tmp_path / 'b'}") == 1
+    assert "recalibration.k: expected no option of the model" in capsys.readouterr().err
+
+
+def test_a_trained_model_keeps_its_budget_of_psnr(data, checkpoint, tmp_path, capsys):
+    """With a checkpoint the loss of PSNR is checked, for the values that the command line gives."""
+    run = ["benchmark", *data, *QUICK, f"checkpoint={checkpoint}", "subjects=1", "presets=[exact]"]
+    assert ghgs(*run, f"hydra.run.dir={tmp_path / 'a'}") == 0
+    capsys.readouterr()
+    assert ghgs(*run, "skip.budget_db=-1", f"hydra.run.dir={tmp_path / 'b'}") == 1
+    assert "exact: expected a loss up to -1 dB of PSNR; found" in capsys.readouterr().err
+
+
+def test_the_scaling_study_writes_rows_and_exponents(tmp_path):
+    """Every axis has rows with its values and a fitted exponent beside the one of the FLOPs."""
+    code = ghgs(
+        "benchmark", "task=scaling", *TINY, *QUICK, "presets=[balanced]", "scaling.share=[0.1,0.4]",
+        "scaling.views=[2,4]", "scaling.size=[28,56]", "scaling.batch=[1]", "scaling.threads=[]",
+        "scaling.base.size=28", f"hydra.run.dir={tmp_path}",
+    )  # fmt: skip
+    assert code == 0
+    content = json.loads((tmp_path / "benchmark.json").read_text())
+    whole = [row for row in content["rows"] if row["stage"] == "total"]
+    found = [(row["axis"], row["value"]) for row in whole]
+    assert found == [
+        ("share", 0.1), ("share", 0.4), ("views", 2), ("views", 4), ("size", 28), ("size", 56), ("batch", 1),
+    ]  # fmt: skip
+    assert {row["preset"] for row in whole} == {"balanced"}
+    fits = {fit["axis"]: fit for fit in content["fits"] if fit["stage"] == "total"}
+    assert fits["views"]["expected"] == pytest.approx(1, abs=0.3)
+    assert fits["size"]["exponent"] is not None
+    assert fits["batch"]["exponent"] is None
+    assert "## Exponents" in (tmp_path / "benchmark.md").read_text()
+
+
+def test_impossible_settings_are_named(data, tmp_path, capsys):
+    """Mistakes cost a line, not the time of a benchmark."""
+    for wrong, said in {
+        "timing.repeats=0": "timing.repeats",
+        "presets=[]": "presets",
+        "presets=exact": "presets",
+        "vs=other.ckpt": "vs",
+        "task=speed": "task",
+        "subjects=0": "subjects",
+        "knobs={recalibration.colour:[1]}": "knobs.recalibration.colour",
+    }.items():
+        code = ghgs("benchmark", *data, *TINY, *QUICK, wrong, f"hydra.run.dir={tmp_path / 'run'}")
+        assert code == 1
+        assert f"ghgs benchmark: {said}: expected" in capsys.readouterr().err

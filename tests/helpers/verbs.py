@@ -1,0 +1,20 @@
+"""The command line in the process of the tests."""
+
+import os
+import sys
+
+from ghgs_lit.cli.main import main
+
+
+def ghgs(*arguments: str) -> int:
+    """The exit code of ``ghgs <arguments>``."""
+    before = sys.argv
+    sys.argv = ["ghgs", *arguments]
+    # The script sets it for Hydra; where a user has set it, errors are raised.
+    os.environ.pop("HYDRA_FULL_ERROR", None)
+    try:
+        return main()
+    except SystemExit as exit:
+        return exit.code
+    finally:
+        sys.argv = before
