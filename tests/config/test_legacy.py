@@ -173,3 +173,14 @@ def test_heads_get_what_skipping_said(tokens, views):
     upgraded = upgrade(old | {"recalibration": {"tokens": tokens}})
     assert upgraded["depth_head"]["views"] == views
     assert upgraded["gaussian_head"] == {"views": "subject", "pixels": "all"}
+
+
+def test_encoders_kept_all_tokens():
+    """A checkpoint without a choice of tokens goes on working on all of them."""
+    kept = {"tokens": "all", "margin": 1}
+    assert upgrade({"encoder": {"width": 8}, "skip": {"name": "balanced"}}) == {
+        "encoder": {"width": 8} | kept,
+        "skip": {"name": "balanced"} | kept,
+    }
+    fast = {"encoder": {"tokens": "subject", "margin": 0}}
+    assert upgrade(fast) == fast
