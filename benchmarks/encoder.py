@@ -1,6 +1,7 @@
 """Time, peak memory and FLOPs of a forward pass by stage: ``python benchmarks/encoder.py [--size vggt_1b]``.
 
-Random weights, an ellipsoid in front of a ring of cameras, ``skip=none``: every token and every pixel.
+Random weights, an ellipsoid in front of a ring of cameras, ``skip=none``: every token and every pixel. With
+``skip=fast`` the encoder's numbers are those of the kept tokens; ``--zoom`` changes the subject's size.
 Rates are compared with those of matrix products, measured before and after in the same run. With
 ``--literal`` the recalibration is compared with a literal version (gathers, each layer by itself).
 """
@@ -25,6 +26,7 @@ from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 from ghgs_lit import encoder, recalibration
 from ghgs_lit.benchmark.weights import random_model
 from ghgs_lit.config import compose
+from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, DepthBounds, Points, Tokens
@@ -50,9 +52,9 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
         found = []
         kept = embed.forward
 
-        def timed(images):
+        def timed(images, patches):
             with record("patch tokens (ViT)"):
-                found.append(kept(images))
+                found.append(kept(images, patches))
             reset_peak()
             return found[0]
 
@@ -100,11 +102,12 @@ def count_gflop(config: dict, model: GHGS, batch: Batch) -> dict[str, float]:
     """
     with torch.device("meta"):
         aggregator = GHGS.from_config(config).encoder.aggregator
+        kept = KeptPatches(model.encoder.keeps(batch.masks), torch.device("meta"))
     b, v, _, height, width = batch.images.shape
     channels = next(p for p in aggregator.patch_embed.parameters() if p.dim() == 4).shape[1]
     images = torch.empty(b, v, channels, height, width, device="meta")
-    patch = gflop_of(lambda: aggregator.patch_embed(images.flatten(0, 1)))
-    found = {"patch tokens (ViT)": patch, "aggregator": gflop_of(lambda: aggregator(images)) - patch}
+    patch = gflop_of(lambda: aggregator.patch_embed(images.flatten(0, 1), kept))
+    found = {"patch tokens (ViT)": patch, "aggregator": gflop_of(lambda: aggregator(images, kept)) - patch}
     size, c, s = model.encoder.patch_size, model.encoder.dim_latent, model.encoder.dim_semantic
     grid = (1, 1, height // size, width // size)
     one = math.prod(grid)
@@ -219,6 +222,7 @@ def main() -> None:
     parser.add_argument("--size", default="vggt_1b", help="a member of the config group encoder")
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--side", type=int, default=518, help="of the square photographs, in pixels")
+    parser.add_argument("--zoom", type=float, default=0.8, help="focal length in sides: the subject's size")
     parser.add_argument(
         "--dtype", choices=list(DTYPES), default="float32", help="bfloat16 runs under autocast"
     )
@@ -231,7 +235,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     dtype = DTYPES[options.dtype]
     config = configuration(options.size, options.options)
-    batch = make_batch(1, options.views, options.side, options.side)
+    batch = make_batch(1, options.views, options.side, options.side, zoom=options.zoom)
     if options.train:
         print("| encoder, forward and backward | s | peak GB above weights and gradients |\n|---|---|---|")
         for stage in training_stages(config, batch):
@@ -257,6 +261,8 @@ def main() -> None:
     parameters = sum(p.numel() for p in model.parameters())
     print(f"{options.size}, {parameters / 1e6:.0f} M parameters, {options.views} views of {options.side}²,")
     print(f"{options.dtype}, {options.threads} threads, {capability}, torch {torch.__version__}")
+    kept = int(model.encoder.keeps(batch.masks).sum())
+    print(f"the subject fills {batch.masks.float().mean():.1%} of the frames, {kept} patches are kept")
     print(f"first use of the compiled kernels: {loading:.1f} s\n")
     report(record.stages, rates, record.base)
     if options.json:

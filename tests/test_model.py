@@ -45,6 +45,12 @@ class GivenTokens(nn.Module):
         return self.tokens
 
 
+def element(batch, b):
+    """One element of a batch."""
+    one = slice(b, b + 1)
+    return Batch(batch.images[one], batch.masks[one], batch.cameras[one], depths=batch.depths[one])
+
+
 def release_model(inputs, dtype):
     dpt = {"features": 16, "out_channels": [16, 20, 24, 32]}
     model = GHGS(
@@ -138,7 +144,8 @@ def test_extreme_masks_give_one_finite_gaussian_for_each_pixel(name, skip):
 
 
 @pytest.mark.parametrize(
-    "overrides", [["model=paper"], ["model=hull"], ["compat=release"], ["model=hull", "skip=none"]]
+    "overrides",
+    [["model=paper"], ["model=hull"], ["compat=release"], ["model=hull", "skip=none"], ["skip=fast"]],
 )
 def test_every_parameter_gets_a_finite_gradient(overrides):
     """A parameter without a gradient would never be trained."""
@@ -184,6 +191,35 @@ def test_skip_exact_gives_the_gaussians_of_skip_none():
     with torch.no_grad():
         exact, none = (make_model(f"skip={skip}")(batch).gaussians for skip in ("exact", "none"))
     close(exact, none)
+
+
+def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background():
+    """The preset changes what the encoder sees, and nothing else."""
+    batch = make_batch(2, 3)
+    batch = dataclasses.replace(batch, masks=torch.ones_like(batch.masks))
+    with torch.no_grad():
+        fast, exact = (make_model(f"skip={skip}")(batch).gaussians for skip in ("fast", "exact"))
+    close(fast, exact)
+
+
+@pytest.mark.parametrize("margin", [0, 1])
+@torch.no_grad()
+def test_skip_fast_with_few_pixels_and_with_mates(margin):
+    """An empty view, a single pixel, two people and a batch mate: the same pixels, each element as alone."""
+    batch = make_batch(2, 4, zoom=0.4)
+    batch.masks[0, 0] = False
+    batch.masks[0, 1] = False
+    batch.masks[0, 1, 20, 33] = True
+    batch.masks[1, 2, :4, :4] = batch.masks[1, 2, -3:, -3:] = True
+    model = make_model("skip=fast", f"skip.margin={margin}").eval()
+    together = model(batch)
+    assert torch.equal(together.depth_valid, batch.masks)
+    assert len(together.gaussians) == batch.masks.sum()
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        assert getattr(together.gaussians, name).isfinite().all()
+    assert len(together.points.tokens) < 2 * 4 * 4 * 4
+    for b in range(2):
+        close(together.gaussians[b], model(element(batch, b)).gaussians)
 
 
 def test_views_without_the_subject_are_not_decoded():
@@ -422,7 +458,7 @@ def test_windows_give_gaussians_of_the_same_pixels(size):
 PADS = ["model.pad=multiple"]
 
 
-@pytest.mark.parametrize("skip", ["none", "exact", "balanced"])
+@pytest.mark.parametrize("skip", ["none", "exact", "balanced", "fast"])
 @pytest.mark.parametrize(("size", "name"), [((50, 64), "hull"), ((45, 71), "paper")])
 def test_photographs_of_any_size_are_padded_and_come_back(size, name, skip):
     """What the stages see is a batch with a black border; what comes back is in the photograph's pixels."""

@@ -97,10 +97,19 @@ def _ablation_is_what_the_model_does(config: dict[str, Any]) -> None:
         }
 
 
+def _encoders_keep_all_tokens(config: dict[str, Any]) -> None:
+    """Encoders had no choice of tokens: they kept all."""
+    for name in ("skip", "encoder"):
+        if isinstance(config.get(name), dict):
+            config[name].setdefault("tokens", "all")
+            config[name].setdefault("margin", 1)
+
+
 #: Changes that no table can express, applied last: each takes the configuration and changes it in place.
 STEPS: list[Callable[[dict[str, Any]], None]] = [
     _ablation_is_what_the_model_does,
     _bounds_become_a_stage,
+    _encoders_keep_all_tokens,
     _heads_name_what_they_skip,
     _unprojection_names_its_class,
 ]

@@ -7,24 +7,25 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.block import Block, run_block
-from ghgs_lit.encoder.rope import rotary_tables, token_positions
+from ghgs_lit.encoder.packing import KeptPatches
+from ghgs_lit.encoder.rope import rotary_tables
 from ghgs_lit.errors import require
 
 NORM_EPS = 1e-5
 
 #: Tokens after a frame block and after the global block that follows it.
-Pair = tuple[Float[Tensor, "n t c"], Float[Tensor, "n t c"]]
+Pair = tuple[Float[Tensor, "t c"], Float[Tensor, "t c"]]
 
 
 class Aggregator(nn.Module):
     """``depth`` pairs of a frame block and a global block on the patch tokens of ``patch_embed``.
 
-    Each view's sequence is [camera, registers, patches]. The first view has its own camera and register
+    Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and register
     tokens, so it defines the frame of reference: another first view changes the result; any other
     permutation of the views only permutes it.
 
     Args:
-        patch_embed: [n, i, H, W] images to [n, p, width] patch tokens.
+        patch_embed: [n, i, H, W] images and :class:`KeptPatches` to [N, width] tokens of the kept patches.
         patch_size: side of a patch in pixels.
         width: channels of a token.
         heads: attention heads of each block.
@@ -83,34 +84,32 @@ class Aggregator(nn.Module):
         tokens = torch.cat((self.camera_token, self.register_token), dim=2)[0]
         return torch.cat((tokens[:1], tokens[1:].expand(views - 1, -1, -1)))
 
-    def forward(self, images: Float[Tensor, "b v i H W"]) -> tuple[list[Pair], Float[Tensor, "bv p c"]]:
+    def forward(
+        self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
+    ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
         """Tokens of the layers that are read out.
 
         Args:
             images: normalised images, [B, V, channels, H, W].
+            kept: the patches that take part; all others are as if they did not exist.
 
         Returns:
-            For each layer in ``layers`` the tokens after its frame block and after its global block, special
-            tokens included ([B * V, special + P, C] each); and the patch tokens that entered.
+            For each layer in ``layers`` the packed tokens after its frame block and after its global block,
+            special tokens included; and the patch tokens that entered.
         """
-        b, v, _, height, width = images.shape
-        patches = self.patch_embed(images.flatten(0, 1))
+        b, v = images.shape[:2]
+        patches = self.patch_embed(images.flatten(0, 1), kept)
         special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)
-        x = torch.cat((special, patches), dim=1)
-
-        positions = token_positions(
-            height // self.patch_size, width // self.patch_size, self.special, images.device
-        )
-        inside = rotary_tables(positions, self.head_width, x)
-        across = inside.repeat(v)
+        x = kept.join(special, patches)
+        rotary = rotary_tables(kept.positions(self.special), self.head_width, x)
+        inside, across = kept.lengths(self.special), kept.element_lengths(self.special)
 
         pairs = []
         for i, (frame_block, global_block) in enumerate(
             zip(self.frame_blocks, self.global_blocks, strict=True)
         ):
-            frame = run_block(frame_block, x, self.checkpointing, inside)
-            sequence = frame.unflatten(0, (b, v)).flatten(1, 2)
-            x = run_block(global_block, sequence, self.checkpointing, across).view_as(frame)
+            frame = run_block(frame_block, x, inside, self.checkpointing, rotary)
+            x = run_block(global_block, frame, across, self.checkpointing, rotary)
             if i in self.layers:
                 pairs.append((frame, x))
         return pairs, patches

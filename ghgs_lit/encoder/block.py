@@ -1,5 +1,7 @@
 """Pre-norm transformer block with LayerScale, used by the ViT and the aggregator."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -39,7 +41,7 @@ class Mlp(nn.Module):
 
 
 class Block(nn.Module):
-    """``x + gamma1 Attention(LN(x))``, then ``x + gamma2 MLP(LN(x))``."""
+    """``x + gamma1 Attention(LN(x))``, then ``x + gamma2 MLP(LN(x))``, on packed sequences."""
 
     def __init__(self, width: int, heads: int, qk_norm: bool, norm_eps: float, layer_scale: float):
         super().__init__()
@@ -50,30 +52,36 @@ class Block(nn.Module):
         self.mlp = Mlp(width)
         self.ls2 = LayerScale(width, layer_scale)
 
-    def forward(self, x: Float[Tensor, "n t c"], rotary: Rotary | None = None) -> Float[Tensor, "n t c"]:
-        x = self.ls1(x, self.attn(self.norm1(x), rotary))
+    def forward(
+        self, x: Float[Tensor, "t c"], lengths: Sequence[int], rotary: Rotary | None = None
+    ) -> Float[Tensor, "t c"]:
+        x = self.ls1(x, self.attn(self.norm1(x), lengths, rotary))
         if torch.is_grad_enabled():
             return self.ls2(x, self.mlp(self.norm2(x)))
         # x is the fresh result of ls1, so it can be changed in place, a part of the tokens at a time.
-        tokens = x.flatten(0, 1)
-        for rows in even_parts(len(tokens), _HIDDEN // (4 * x.shape[-1])):
-            tokens[rows].addcmul_(self.mlp(self.norm2(tokens[rows])), self.ls2.gamma)
+        for rows in even_parts(len(x), _HIDDEN // (4 * x.shape[-1])):
+            x[rows].addcmul_(self.mlp(self.norm2(x[rows])), self.ls2.gamma)
         return x
 
 
 def run_block(
-    block: Block, x: Float[Tensor, "n t c"], checkpointing: bool, rotary: Rotary | None = None
-) -> Float[Tensor, "n t c"]:
+    block: Block,
+    x: Float[Tensor, "t c"],
+    lengths: Sequence[int],
+    checkpointing: bool,
+    rotary: Rotary | None = None,
+) -> Float[Tensor, "t c"]:
     """``block(x)``; no gradient is recorded where neither ``x`` nor the block needs one.
 
     Args:
         block: the block to run.
-        x: tokens.
+        x: tokens of all sequences, one after another.
+        lengths: tokens of each sequence; attention stays inside it.
         checkpointing: recompute the block's activations in the backward pass instead of keeping them.
         rotary: tables that rotate queries and keys; None for no rotation.
     """
     needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
     with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):
         if checkpointing and torch.is_grad_enabled():
-            return checkpoint(block, x, rotary, use_reentrant=False)
-        return block(x, rotary)
+            return checkpoint(block, x, lengths, rotary, use_reentrant=False)
+        return block(x, lengths, rotary)

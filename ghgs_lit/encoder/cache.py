@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -22,6 +21,7 @@ from torch import Tensor
 from ghgs_lit.encoder.encoder import VGGTEncoder
 from ghgs_lit.errors import choice, require
 from ghgs_lit.files import write_atomically
+from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Version of the files; raise it when older files must not be read any more.
@@ -154,7 +154,7 @@ class FeatureCache:
         kept = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
         digest = hashlib.sha256(json.dumps([LAYOUT, self._fingerprint(encoder), kept, device, half]).encode())
         _add(digest, images)
-        if encoder.mask_input or encoder.bounds_input or self.tokens == "subject":
+        if encoder.reads_masks or self.tokens == "subject":
             _add(digest, masks)
         if encoder.bounds_input and bounds is not None:
             _add(digest, bounds.near)
@@ -210,8 +210,7 @@ def _add(digest, tensor: Tensor) -> None:
 
 def _around_subject(tokens: Tokens, masks: Tensor, margin: int) -> Tokens:
     """Tokens of patches with a pixel of the subject and of ``margin`` patches around them."""
-    patches = F.max_pool2d(masks.flatten(0, 1)[:, None].float(), tokens.patch_size)
-    kept = F.max_pool2d(patches, 2 * margin + 1, 1, margin)[:, 0].bool()
+    kept = patches_around_subject(masks, tokens.patch_size, margin).flatten(0, 1)
     return tokens.select(kept[tokens.image, tokens.row, tokens.column])
 
 

@@ -7,9 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
+from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.types import DepthBounds, Tokens
@@ -36,6 +38,9 @@ class VGGTEncoder(nn.Module):
         image_size: side of the square image whose patch positions a DINOv2 ViT stores, in pixels.
         mask_input: add the mask to the input channels.
         bounds_input: add two maps of the depth bounds (:func:`relative_bounds`) to the input channels.
+        tokens: ``all``, or ``subject``: patches of the background leave before the first block. The others
+            keep their place in the photograph; a view with an empty mask keeps its special tokens only.
+        margin: patches around the subject that stay, with ``tokens=subject``.
         layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
         trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
         checkpointing: recompute activations in the backward pass instead of keeping them.
@@ -55,12 +60,16 @@ class VGGTEncoder(nn.Module):
         image_size: int = 518,
         mask_input: bool = False,
         bounds_input: bool = False,
+        tokens: str = "all",
+        margin: int = 1,
         layer_scale: float = 0.01,
         trainable: str = "all",
         checkpointing: bool = False,
         weights: str | None = None,
     ):
         super().__init__()
+        choice("encoder.tokens", tokens, ("all", "subject"))
+        require(margin >= 0, "encoder.margin", "0 or more patches", margin)
         #: All that the tokens depend on, the weights apart.
         self.options = {
             "width": width,
@@ -72,7 +81,10 @@ class VGGTEncoder(nn.Module):
             "registers": registers,
             "mask_input": mask_input,
             "bounds_input": bounds_input,
+            "tokens": tokens,
+            "margin": margin if tokens == "subject" else 0,
         }
+        self.tokens, self.margin = tokens, margin
         self.weights = weights
         self.patch_size, self.mask_input, self.bounds_input = patch_size, mask_input, bounds_input
         self.dim_latent, self.dim_semantic = 2 * width, width
@@ -107,11 +119,11 @@ class VGGTEncoder(nn.Module):
         bounds: DepthBounds | None = None,
         cache: Callable[..., Tokens] | None = None,
     ) -> Tokens:
-        """Tokens of all views: of all patches, or of those that ``cache`` keeps.
+        """Tokens of all views: of all patches, or of those that ``tokens`` and ``cache`` keep.
 
         Args:
             images: [B, V, 3, H, W], RGB in [0, 1], sides divisible by the patch size.
-            masks: [B, V, H, W]; read with ``mask_input`` or ``bounds_input``.
+            masks: [B, V, H, W]; read where :attr:`reads_masks`.
             bounds: read with ``bounds_input``.
             cache: a :class:`ghgs_lit.encoder.FeatureCache` to look the tokens up in; None: compute them.
         """
@@ -121,22 +133,31 @@ class VGGTEncoder(nn.Module):
     def encode(
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."], bounds: DepthBounds | None
     ) -> Tokens:
-        """Compute the tokens of all patches of all views; arguments as in :meth:`forward`."""
-        b, v, _, height, width = images.shape
-        grid = (b, v, height // self.patch_size, width // self.patch_size)
-        pairs, patches = self.aggregator(self._normalized(images, masks, bounds))
-        first = self.aggregator.special
-        axes = (torch.arange(n, device=images.device) for n in (b * v, *grid[2:]))
-        image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+        """Compute the tokens of the kept patches of all views; arguments as in :meth:`forward`."""
+        kept = KeptPatches(self.keeps(masks), images.device)
+        pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
         return Tokens(
-            latent=tuple(_joined(pairs, first)),
-            semantic=patches.detach().flatten(0, 1),
-            image=image,
-            row=row,
-            column=column,
-            grid=grid,
+            latent=tuple(_joined(pairs, kept, self.aggregator.special)),
+            semantic=patches.detach(),
+            image=kept.image,
+            row=kept.row,
+            column=kept.column,
+            grid=kept.grid,
             patch_size=self.patch_size,
         )
+
+    @property
+    def reads_masks(self) -> bool:
+        """Whether the tokens depend on the masks."""
+        return self.mask_input or self.bounds_input or self.tokens == "subject"
+
+    def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
+        """Which patches take part; on the CPU where the masks are not read."""
+        if self.tokens == "subject":
+            return patches_around_subject(masks, self.patch_size, self.margin)
+        b, v, height, width = masks.shape
+        grid = (b, v, height // self.patch_size, width // self.patch_size)
+        return torch.ones(grid, dtype=torch.bool, device="cpu")
 
     def _check(self, images: Tensor, masks: Tensor) -> None:
         b, v, channels, height, width = images.shape
@@ -158,10 +179,10 @@ class VGGTEncoder(nn.Module):
         return x.to(self.aggregator.camera_token.dtype)
 
 
-def _joined(pairs: list[Pair], first: int) -> Iterator[Float[Tensor, "N C"]]:
-    """Tokens from ``first`` on of frame and global block, concatenated; empties ``pairs`` to free memory."""
+def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Float[Tensor, "N C"]]:
+    """Patch tokens of frame and global block, concatenated; empties ``pairs`` to free memory."""
     while pairs:
-        yield torch.cat([tokens[:, first:] for tokens in pairs.pop(0)], dim=-1).flatten(0, 1)
+        yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 
 
 def _patch_embedding(

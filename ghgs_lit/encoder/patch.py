@@ -5,6 +5,8 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ghgs_lit.encoder.packing import KeptPatches
+
 
 class PatchEmbed(nn.Module):
     """One convolution whose kernel and stride are the patch size (a linear projection of each patch)."""
@@ -13,8 +15,12 @@ class PatchEmbed(nn.Module):
         super().__init__()
         self.proj = nn.Conv2d(in_channels, width, kernel_size=patch_size, stride=patch_size)
 
-    def forward(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n p c"]:
+    def dense(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n p c"]:
+        """Tokens of all patches, row by row."""
         return rearrange(self.proj(images), "n c h w -> n (h w) c")
+
+    def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
+        return kept.select(self.dense(images))
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -52,7 +58,7 @@ class ConvStem(nn.Module):
         self.mix = nn.Conv2d(width, width, 3, padding=1)
         self.norm = nn.LayerNorm(width)
 
-    def forward(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n p c"]:
+    def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
         x = self.reduce(images)
         x = x + self.mix(F.gelu(self.mix_norm(x)))
-        return self.norm(rearrange(x, "n c h w -> n (h w) c"))
+        return self.norm(kept.select(rearrange(x, "n c h w -> n (h w) c")))

@@ -21,17 +21,6 @@ class Rotary(NamedTuple):
     cosine: Float[Tensor, "t d"]
     sine: Float[Tensor, "t d"]
 
-    def repeat(self, views: int) -> "Rotary":
-        """Tables for the concatenated sequences of ``views`` views; all views have the same positions."""
-        return Rotary(self.cosine.repeat(views, 1), self.sine.repeat(views, 1))
-
-
-def token_positions(height: int, width: int, special: int, device=None) -> Int[Tensor, "t 2"]:
-    """``(row, column)`` of each token: ``special`` tokens at (0, 0), then patches from (1, 1), row by row."""
-    rows = torch.arange(1, height + 1, device=device).repeat_interleave(width)
-    columns = torch.arange(1, width + 1, device=device).repeat(height)
-    return torch.nn.functional.pad(torch.stack((rows, columns), dim=-1), (0, 0, special, 0))
-
 
 def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
     """Tables of all tokens.

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.block import Block, run_block
+from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import PatchEmbed
 from ghgs_lit.errors import require
 
@@ -15,7 +16,7 @@ NORM_EPS = 1e-6
 
 
 class VisionTransformer(nn.Module):
-    """DINOv2 ViT; tokens are in the order class, registers, patches.
+    """DINOv2 ViT; tokens of an image are in the order class, registers, kept patches.
 
     Args:
         in_channels: channels of the image.
@@ -43,7 +44,7 @@ class VisionTransformer(nn.Module):
         super().__init__()
         require(image_size % patch_size == 0, "encoder.image_size", f"a multiple of {patch_size}", image_size)
         self.patch_size = patch_size
-        self.registers = registers
+        self.special = 1 + registers
         self.checkpointing = checkpointing
         self.patch_embed = PatchEmbed(in_channels, width, patch_size)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
@@ -76,20 +77,20 @@ class VisionTransformer(nn.Module):
         grid = F.interpolate(grid, (height, width), mode="bicubic", antialias=True, align_corners=False)
         return torch.cat((table[:, :1], grid.flatten(2).mT), dim=1).to(dtype)
 
-    def embed(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n t c"]:
-        """The input sequence of the first block."""
+    def embed(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
+        """The packed input of the first block; position embeddings are those of the whole image."""
         n, _, height, width = images.shape
-        patches = self.patch_embed(images)
+        patches = self.patch_embed.dense(images)
         positions = self.positions(height // self.patch_size, width // self.patch_size, patches.dtype)
         special = torch.cat((self.cls_token + positions[:, :1], self.register_tokens), dim=1)
-        return torch.cat((special.expand(n, -1, -1), patches + positions[:, 1:]), dim=1)
+        return kept.join(special.expand(n, -1, -1), kept.select(patches + positions[:, 1:]))
 
-    def tokens(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n t c"]:
-        """Class, register and patch tokens after the final norm."""
-        x = self.embed(images)
+    def tokens(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "t c"]:
+        """Packed class, register and patch tokens after the final norm."""
+        x, lengths = self.embed(images, kept), kept.lengths(self.special)
         for block in self.blocks:
-            x = run_block(block, x, self.checkpointing)
+            x = run_block(block, x, lengths, self.checkpointing)
         return self.norm(x)
 
-    def forward(self, images: Float[Tensor, "n i H W"]) -> Float[Tensor, "n p c"]:
-        return self.tokens(images)[:, 1 + self.registers :]
+    def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
+        return kept.take(self.tokens(images, kept), self.special)

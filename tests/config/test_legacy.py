@@ -182,3 +182,14 @@ def test_an_ablation_is_what_the_model_does():
     assert upgrade({"ablation": labels, "recalibration": switches}) == {"recalibration": switches}
     alone = upgrade({"ablation": labels})
     assert alone == {"recalibration": {"neighborhood": "xyz", "similarity": "none"}}
+
+
+def test_encoders_kept_all_tokens():
+    """A checkpoint without a choice of tokens goes on working on all of them."""
+    kept = {"tokens": "all", "margin": 1}
+    assert upgrade({"encoder": {"width": 8}, "skip": {"name": "balanced"}}) == {
+        "encoder": {"width": 8} | kept,
+        "skip": {"name": "balanced"} | kept,
+    }
+    fast = {"encoder": {"tokens": "subject", "margin": 0}}
+    assert upgrade(fast) == fast

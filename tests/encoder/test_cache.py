@@ -107,6 +107,22 @@ def test_masks_that_nothing_reads_do_not_miss(tmp_path):
     assert (cache.hits, cache.made) == (1, 1)
 
 
+def test_few_tokens_are_cached_as_they_are(tmp_path):
+    """Tokens without a background depend on the mask and on what is kept, and come back as they were."""
+    images, masks = views()
+    for margin, made in ((0, 1), (1, 2)):
+        encoder, cache = make(tokens="subject", margin=margin), FeatureCache(tmp_path, tokens="all")
+        expected = encoder(images, masks)
+        assert not expected.is_dense
+        same(encoder(images, masks, cache=cache), expected)
+        same(encoder(images, masks, cache=cache), expected)
+        assert (cache.hits, cache.made) == (1, 1)
+        assert len(list(tmp_path.glob("*/*.safetensors"))) == made
+    masks[0, 1] = False
+    assert len(encoder(images, masks, cache=cache).image) == len(expected.image) / 2
+    assert cache.made == 2
+
+
 @pytest.mark.parametrize("left", [0, 7, 2000])
 def test_a_truncated_file_is_written_again(tmp_path, left, capsys):
     """A file that a crash cut off must be replaced, with a message."""

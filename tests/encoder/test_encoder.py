@@ -5,13 +5,14 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-import yaml
+from omegaconf import OmegaConf
 
 from ghgs_lit.encoder import VGGTEncoder
-from ghgs_lit.encoder.rope import rotary_tables, rotate, token_positions
+from ghgs_lit.encoder.packing import KeptPatches
+from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.errors import InputError
 
-CONF = Path(__file__).parents[2] / "conf" / "encoder"
+CONF = Path(__file__).parents[2] / "conf"
 SMALL = {"width": 32, "heads": 2, "depth": 2, "layers": (0, 1), "vit": {"kind": "stem", "channels": 8}}
 
 
@@ -33,7 +34,11 @@ def _views(b: int, v: int, height: int, width: int, seed: int = 1):
 
 
 def _options(name: str) -> dict:
-    options = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    nodes = {
+        node: OmegaConf.load(CONF / node / f"{file}.yaml")
+        for node, file in (("encoder", name), ("skip", "none"))
+    }
+    options = OmegaConf.to_container(OmegaConf.create(nodes), resolve=True)["encoder"]
     assert options.pop("_target_") == "ghgs_lit.encoder.VGGTEncoder"
     return options
 
@@ -52,7 +57,7 @@ def test_small_encoders_fit_their_size(name, most):
 
 def test_every_shipped_size_builds():
     """Every option of conf/encoder must be a valid encoder."""
-    names = sorted(path.stem for path in CONF.glob("*.yaml"))
+    names = sorted(path.stem for path in (CONF / "encoder").glob("*.yaml"))
     assert names == ["vggt_1b", "vggt_nano", "vggt_small"]
     with torch.device("meta"):
         for name in names:
@@ -171,7 +176,8 @@ def test_rotation_depends_on_differences_of_positions():
 
 def test_angles_are_float32_whatever_the_tokens():
     """Angles in half precision would shift positions."""
-    positions = token_positions(37, 37, special=5)
+    kept = KeptPatches(torch.ones(1, 1, 37, 37, dtype=torch.bool), torch.device("cpu"))
+    positions = kept.positions(special=5)
     exact = rotary_tables(positions, 64, torch.zeros(1))
     for dtype in (torch.bfloat16, torch.float16):
         tables = rotary_tables(positions, 64, torch.zeros(1, dtype=dtype))

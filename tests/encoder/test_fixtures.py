@@ -13,6 +13,7 @@ import torch
 from safetensors.torch import load_file
 
 from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.heads.activations import split_activated
@@ -65,7 +66,9 @@ def test_vit(name, dtype):
     vit.to(dtype)
     with torch.no_grad():
         x = _inputs(groups, dtype)["x"]
-        tokens, patches = vit.tokens(x), vit(x)
+        n, _, height, width = x.shape
+        kept = KeptPatches(torch.ones(1, n, height // 14, width // 14, dtype=torch.bool), x.device)
+        tokens, patches = (rows.unflatten(0, (n, -1)) for rows in (vit.tokens(x, kept), vit(x, kept)))
     found = {"cls_token": tokens[:, 0], "register_tokens": tokens[:, 1:5], "patch_tokens": patches}
     _compare(name, groups, dtype, found)
 
@@ -81,13 +84,14 @@ def test_encoder(name, dtype):
     images = _inputs(groups, dtype)["images"]
     b, v, _, height, width = images.shape
     with torch.no_grad():
-        pairs, patches = encoder.aggregator((images - encoder.mean) / encoder.std)
+        kept = KeptPatches(torch.ones(b, v, height // 14, width // 14, dtype=torch.bool), images.device)
+        pairs, patches = encoder.aggregator((images - encoder.mean) / encoder.std, kept)
         tokens = encoder(images, torch.ones(b, v, height, width, dtype=torch.bool))
-    found = {f"layer_{i}": torch.cat(pair, dim=-1) for i, pair in enumerate(pairs)}
-    _compare(name, groups, dtype, found | {"patch_tokens": patches})
+    found = {f"layer_{i}": torch.cat(pair, dim=-1).unflatten(0, (b * v, -1)) for i, pair in enumerate(pairs)}
+    _compare(name, groups, dtype, found | {"patch_tokens": patches.unflatten(0, (b * v, -1))})
 
     assert tokens.grid == (b, v, height // 14, width // 14)
-    assert torch.equal(tokens.semantic, patches.flatten(0, 1))
+    assert torch.equal(tokens.semantic, patches)
     for i, latent in enumerate(tokens.latent):
         assert torch.equal(latent, found[f"layer_{i}"][:, 5:].flatten(0, 1))
 

@@ -9,7 +9,8 @@ import torch.nn.functional as F
 import ghgs_lit.kernels.linear
 from ghgs_lit.encoder import VGGTEncoder, cpu
 from ghgs_lit.encoder.block import Block
-from ghgs_lit.encoder.rope import rotary_tables, token_positions
+from ghgs_lit.encoder.packing import KeptPatches
+from ghgs_lit.encoder.rope import rotary_tables
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.kernels.linear import linear
@@ -102,23 +103,25 @@ def test_a_block_without_gradient_is_the_same_and_keeps_its_input(
     with torch.no_grad():
         for parameter in block.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape))
-    rotary = rotary_tables(token_positions(2, 3, 5), 32, torch.zeros(1)) if qk_norm else None
-    x = torch.randn(3, 11, 64)
-    kept = x.clone()
+    kept = KeptPatches(torch.ones(1, 3, 2, 3, dtype=torch.bool), torch.device("cpu"))
+    rotary = rotary_tables(kept.positions(special=5), 32, torch.zeros(1)) if qk_norm else None
+    x, lengths = torch.randn(3 * 11, 64), [11] * 3
+    before = x.clone()
     with torch.no_grad():
-        found = block(x, rotary)
-    assert torch.equal(x, kept)  # the input is not written to
-    torch.testing.assert_close(found, block(x, rotary).detach(), atol=1e-5, rtol=1e-5)
+        found = block(x, lengths, rotary)
+    assert torch.equal(x, before)  # the input is not written to
+    torch.testing.assert_close(found, block(x, lengths, rotary).detach(), atol=1e-5, rtol=1e-5)
 
 
-def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels):
-    """All fast paths together do not change the encoder's tokens."""
+@pytest.mark.parametrize("tokens", ["all", "subject"])
+def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels, tokens):
+    """All fast paths together do not change the encoder's tokens, with views of any number of tokens."""
     torch.manual_seed(0)
     vit = {"kind": "dinov2", "depth": 2, "heads": 2}
-    encoder = VGGTEncoder(
-        width=64, heads=2, depth=3, layers=(0, 1, 2), vit=vit, image_size=28, layer_scale=0.5
-    )
+    options = {"image_size": 28, "layer_scale": 0.5, "tokens": tokens, "margin": 0}
+    encoder = VGGTEncoder(width=64, heads=2, depth=3, layers=(0, 1, 2), vit=vit, **options)
     images, masks = torch.rand(2, 3, 3, 28, 42), torch.ones(2, 3, 28, 42, dtype=torch.bool)
+    masks[0, 1, :, 14:] = masks[1, 2] = False
     expected = encoder(images, masks)
     with torch.no_grad():
         found = encoder(images, masks)
@@ -133,9 +136,9 @@ def test_frozen_blocks_record_no_gradient(monkeypatch, trainable, recorded):
     seen = []
     forward = Block.forward
 
-    def spy(block, x, rotary=None):
+    def spy(block, x, lengths, rotary=None):
         seen.append(torch.is_grad_enabled())
-        return forward(block, x, rotary)
+        return forward(block, x, lengths, rotary)
 
     monkeypatch.setattr(Block, "forward", spy)
     encoder = VGGTEncoder(

@@ -1,0 +1,76 @@
+"""Sequences of different lengths in one tensor: views keep different numbers of patches.
+
+Everything in a block but the attention works on tokens one by one, so no view is padded.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+class KeptPatches:
+    """The patches of a batch that take part, and their places among packed tokens.
+
+    Packed tokens [T, C] are the sequences of all images, one after another: the special tokens of an image
+    (class, camera or registers), then its kept patches, row by row. An image without a kept patch has its
+    special tokens only.
+
+    Args:
+        kept: which patches take part; it may be on the CPU where the tokens are not.
+        device: of the tokens.
+    """
+
+    def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):
+        _, _, height, width = self.grid = tuple(kept.shape)
+        kept = kept.cpu()  # once: the lengths below are needed as numbers
+        self._counts = kept.flatten(2).sum(-1)
+        self.index = kept.flatten().nonzero()[:, 0].to(device)
+        self.image = self.index // (height * width)
+        self.row = self.index // width % height
+        self.column = self.index % width
+
+    def lengths(self, special: int) -> list[int]:
+        """Tokens of each image, with ``special`` special ones."""
+        return (self._counts + special).flatten().tolist()
+
+    def element_lengths(self, special: int) -> list[int]:
+        """Tokens of all views of each batch element, with ``special`` special ones in each view."""
+        return (self._counts + special).sum(1).tolist()
+
+    def select(self, patches: Float[Tensor, "n p c"]) -> Float[Tensor, "N c"]:
+        """The kept ones among the tokens of all patches."""
+        flat = patches.flatten(0, 1)
+        return flat if len(flat) == len(self.index) else flat[self.index]
+
+    def join(self, special: Tensor, patches: Tensor) -> Tensor:
+        """Packed tokens.
+
+        Args:
+            special: of every image, [B * V, s, C].
+            patches: the kept ones, [N, C].
+
+        Returns:
+            [B * V * s + N, C], in the wider precision of both.
+        """
+        images, count, width = special.shape
+        counts = self._counts.flatten().to(patches.device)
+        before = torch.arange(images, device=patches.device) * count + counts.cumsum(0) - counts
+        places = before[:, None] + torch.arange(count, device=patches.device)
+        dtype = torch.promote_types(special.dtype, patches.dtype)
+        packed = patches.new_empty(images * count + len(patches), width, dtype=dtype)
+        packed.index_copy_(0, places.flatten(), special.flatten(0, 1).to(dtype))
+        return packed.index_copy_(0, self._places(count), patches.to(dtype))
+
+    def take(self, packed: Float[Tensor, "t c"], special: int) -> Float[Tensor, "N c"]:
+        """The kept patches among packed tokens with ``special`` special ones in each image."""
+        return packed[self._places(special)]
+
+    def positions(self, special: int) -> Int[Tensor, "t 2"]:
+        """``(row, column)`` of packed tokens in the whole image: patches from (1, 1), special ones (0, 0)."""
+        at_patches = torch.stack((self.row, self.column), dim=-1) + 1
+        b, v = self.grid[:2]
+        return self.join(at_patches.new_zeros(b * v, special, 2), at_patches)
+
+    def _places(self, special: int) -> Int[Tensor, " N"]:
+        """Of the kept patches among packed tokens."""
+        return torch.arange(len(self.index), device=self.index.device) + (self.image + 1) * special
