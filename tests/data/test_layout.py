@@ -120,7 +120,7 @@ def test_renders_of_others_are_read(root):
     Image.open(img / "0.jpg").save(img / "0.png")
     shutil.copy(img / "0.jpg", img / "2_hr.jpg")
     (img / "0.jpg").unlink()
-    binary = (np.asarray(Image.open(mask / "0.png")) > 0).astype(np.uint8)
+    binary = (np.asarray(Image.open(mask / "0.png"))[..., 0] > 0).astype(np.uint8)
     Image.fromarray(np.stack([binary, 0 * binary, 0 * binary], -1)).save(mask / "0.png")
     shutil.rmtree(depth)
     extrinsic = np.load(parm / "0_extrinsic.npy")
@@ -138,6 +138,14 @@ def test_renders_of_others_are_read(root):
     np.testing.assert_allclose(view.intrinsics[:2, 2], ours.intrinsics[:2, 2] + 0.5, rtol=1e-6)
     half = photographs(root, (28, 28), pixel_centers="integer").view("box", 0, 0)
     np.testing.assert_allclose(half.intrinsics[:2, 2], (ours.intrinsics[:2, 2] + 0.5) / 2, rtol=1e-6)
+
+
+def test_masks_of_one_channel_are_read(root):
+    """Data that was rendered before masks had three channels stays readable."""
+    before = photographs(root).view("box", 0, 0).mask
+    path = root / "train" / "mask" / "box_000" / "0.png"
+    Image.open(path).convert("L").save(path)
+    np.testing.assert_array_equal(photographs(root).view("box", 0, 0).mask, before)
 
 
 def test_cache_keeps_what_fits_and_no_more(root):
