@@ -30,7 +30,7 @@ def run(cfg: DictConfig) -> None:
         for folder in make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed):
             announce(folder)
     else:
-        check(data, output_dir(), cfg.check.min_iou)
+        check(data, output_dir(), **cfg.check)
 
 
 def render(data: PhotographsDataModule) -> None:
@@ -43,18 +43,18 @@ def render(data: PhotographsDataModule) -> None:
         log.info("%s: %d subjects", phase, len(data.subjects(phase)) if data.dataset.has(phase) else 0)
 
 
-def check(data: PhotographsDataModule, folder: Path, min_iou: float) -> None:
+def check(data: PhotographsDataModule, folder: Path, min_iou: float, min_agreement: float) -> None:
     """Read everything once; print tables, write ``check.json`` and a contact sheet.
 
     Args:
         data: the data set with its protocols.
         folder: where the files are written.
-        min_iou: as for :func:`inspect`.
+        min_iou, min_agreement: as for :func:`inspect`.
 
     Raises:
         InputError: training cannot start.
     """
-    report = inspect(data, min_iou)
+    report = inspect(data, min_iou, min_agreement)
     show(report)
     announce(write(report, folder))
     if report.problems:

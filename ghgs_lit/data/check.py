@@ -1,9 +1,10 @@
 """Reads all of a data set once and reports what is there, what is missing and what is broken."""
 
+import hashlib
 import json
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,14 @@ from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
 from ghgs_lit.data.contact import Tile, draw_tile, save_sheet
+from ghgs_lit.data.cross_checks import agreeing, shared
 from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.findings import Phase, Photograph, Report, Seen
 from ghgs_lit.data.overlap import overlap
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
+from ghgs_lit.data.silhouettes import implausible, silhouette
+from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError
 
 _LINE = re.compile(r"(?P<place>.*?): expected (?P<expected>.*); found (?P<found>.*)", re.DOTALL)
@@ -26,59 +31,10 @@ _SHOWN = 30
 # MiB of decoded files kept: a body is read once for all photographs of its subject.
 _CACHE_MB = 4
 _PICTURED_SUBJECTS, _PICTURED_VIEWS = 6, 8
-
-Photograph = tuple[str, int, int]
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What reading one photograph gave.
-
-    Attributes:
-        name, position, view: the photograph.
-        iou, inside: how the body fits the mask (:class:`Overlap`), where there is a body.
-        problem: the line of the error, if there is one.
-        tile: picture for the contact sheet.
-    """
-
-    name: str
-    position: int
-    view: int
-    iou: float | None = None
-    inside: float | None = None
-    problem: str | None = None
-    tile: Tile | None = field(default=None, repr=False)
-
-
-@dataclass
-class Phase:
-    """What was found in a phase."""
-
-    people: int
-    subjects: int
-    bodies: int
-    seen: list[Seen]
-
-    def overlaps(self, key: str) -> list[float]:
-        """All known values of ``iou`` or ``inside``."""
-        return [value for seen in self.seen if (value := getattr(seen, key)) is not None]
-
-
-@dataclass
-class Report:
-    """The result of a check.
-
-    Attributes:
-        phases: what was found in ``train`` and ``val``.
-        problems: lines ``<place>: expected ...; found ...`` of what keeps training from starting.
-        notes: the same of what does not.
-        inspections: number of files that were checked beside the photographs.
-    """
-
-    phases: dict[str, Phase] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    inspections: int = 0
+# A subject of which no channel is brighter than this, of 255, is not lit at all.
+_BLACK = 8
+# Units: nobody is taller than this in metres.
+_TALLEST = 10.0
 
 
 @dataclass(frozen=True)
@@ -101,16 +57,33 @@ class _Readings(Dataset):
             body = self.photographs.body(photograph[0])
         except InputError as error:
             return Seen(*photograph, problem=str(error), tile=draw_tile(None, None) if wanted else None)
-        tile = draw_tile(view, body) if wanted else None
+        seen = Seen(
+            *photograph,
+            body=body is not None,
+            tall=None if body is None else float(np.ptp(body, axis=0).max()),
+            digest=hashlib.blake2b(view.image.tobytes(), digest_size=16).hexdigest(),
+            tile=draw_tile(view, body) if wanted else None,
+        )
         fit = None if body is None else overlap(body, view)
-        if fit is None:
-            return Seen(*photograph, tile=tile)
-        problem = None
-        if fit.iou < self.min_iou:
-            place = self.photographs.reader.place(*photograph)
-            expected = f"the body in its mask (IoU of {self.min_iou:.2f} or more)"
-            problem = f"{place}: expected {expected}; found IoU {fit.iou:.2f}"
-        return Seen(*photograph, fit.iou, fit.inside, problem, tile)
+        if fit is not None:
+            seen = replace(seen, iou=fit.iou, inside=fit.inside)
+        problem = self._problem(view, seen)
+        if problem is not None:
+            return replace(seen, problem=f"{self.photographs.reader.place(*photograph)}: {problem}")
+        return seen if fit is not None else replace(seen, silhouette=silhouette(view))
+
+    def _problem(self, view: View, seen: Seen) -> str | None:
+        """What is wrong with one photograph, if anything is."""
+        if seen.iou is not None and seen.iou < self.min_iou:
+            return (
+                f"expected the body in its mask (IoU of {self.min_iou:.2f} or more); found IoU {seen.iou:.2f}"
+            )
+        if seen.iou is None and (problem := implausible(view.mask)) is not None:
+            return problem
+        brightest = int(view.image[view.mask].max())
+        if brightest < _BLACK:
+            return f"expected a photograph in the mask; found black (no channel above {brightest} of 255)"
+        return None
 
 
 @dataclass(frozen=True)
@@ -135,13 +108,15 @@ def _read_all(items: Dataset, workers: int, label: str) -> list:
     return list(track(loader, label, total=len(items), console=Console(stderr=True)))
 
 
-def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:
+def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
 
     Args:
         data: the data set with its protocols.
         min_iou: least IoU of a body's silhouette and a mask; below it a camera counts as wrong. Clothed
             people reach 0.75 to 0.95, a wrong camera 0 to 0.4.
+        min_agreement: the same for people without a body: least share of a mask that the other masks allow.
+            Right cameras reach 0.98 to 1.
     """
     report = Report()
     dataset, workers = data.dataset, data.options.workers
@@ -154,6 +129,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:
         report.problems += [line for line in found if line is not None]
     if dataset.root is None and inspections:
         return report
+    readers: dict[str, Reader] = {}
     for phase in PHASES:
         try:
             if phase == "train" and not dataset.has(phase):
@@ -168,9 +144,12 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5) -> Report:
         report.problems += reader.problems
         cache_mb = min(data.options.cache_images_mb, _CACHE_MB)
         found = _inspect_phase(phase, Photographs(reader, None, cache_mb), targets, min_iou, workers)
+        found.seen = agreeing(found.seen, reader, min_agreement)
         report.phases[phase] = found
+        readers[phase] = reader
         report.problems += [seen.problem for seen in found.seen if seen.problem]
         report.notes += _notes(dataset.published.get(phase), phase, reader, found)
+    report.problems += shared(str(dataset.root), report.phases, readers)
     if not report.problems:
         report.problems += _cannot_sample(data, targets, "train" in report.phases)
     report.problems = list(dict.fromkeys(report.problems))
@@ -191,8 +170,7 @@ def _inspect_phase(
     ]
     items = _Readings(photographs, listed, _pictured(reader), min_iou)
     seen = _read_all(items, workers, f"checking {phase}") if listed else []
-    unread = {s.name for s in seen if s.problem is not None and s.iou is None}
-    bodies = sum(name not in unread and photographs.body(name) is not None for name in reader.subjects)
+    bodies = len({s.name for s in seen if s.body})
     return Phase(reader.people, len(reader.subjects), bodies, seen)
 
 
@@ -214,8 +192,10 @@ def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> li
     if read.bodies < read.subjects:
         notes.append(
             f"{phase}: expected a body for each of {read.subjects} subjects; found {read.bodies} "
-            "(no Chamfer term, and cameras without a body are not checked)"
+            "(no Chamfer term; cameras are checked by their masks alone)"
         )
+    if read.tall is not None and read.tall > _TALLEST:
+        notes.append(f"{phase}: expected metres; found subjects {read.tall:.0f} units tall (millimetres?)")
     most = max(map(len, reader.subjects.values()), default=0)
     fewer = [name for name, positions in reader.subjects.items() if len(positions) < most]
     if fewer:
@@ -244,11 +224,13 @@ def split_line(line: str) -> tuple[str, str, str]:
 
 def show(report: Report) -> None:
     """Print the tables."""
-    columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "inside")
+    columns = ("people", "subjects", "photos", "broken", "bodies", "mean IoU", "min IoU", "inside", "agree")
     table = Table("phase", *columns)
     for name, phase in report.phases.items():
         iou, inside = phase.overlaps("iou"), phase.overlaps("inside")
         numbers = [f"{np.mean(iou):.3f}", f"{min(iou):.3f}", f"{min(inside):.3f}"] if iou else ["-"] * 3
+        agreement = phase.overlaps("agreement")
+        numbers.append(f"{min(agreement):.3f}" if agreement else "-")
         broken = sum(seen.problem is not None for seen in phase.seen)
         counts = (phase.people, phase.subjects, len(phase.seen), broken, phase.bodies)
         table.add_row(name, *map(str, counts), *numbers)
@@ -277,7 +259,7 @@ def write(report: Report, folder: Path) -> Path:
     }
     for phase in content["phases"].values():
         for seen in phase["seen"]:
-            del seen["tile"]
+            del seen["tile"], seen["silhouette"]
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "check.json").write_text(json.dumps(content, indent=1))
     rows: dict[str, list[Tile]] = {}

@@ -127,6 +127,10 @@ class Layout(Reader):
             raise InputError(
                 f"{images}: expected a folder <id>_<position> for every camera; found no such folder"
             )
+        if names is None:
+            other = _positions(self.root / next(p for p in PHASES if p != phase) / "img")
+            for name in sorted(found[phase].keys() & other.keys()):
+                self.problem(f"{self.root}: expected each subject in train or in val; found {name!r} in both")
         planned = self._complete.plan.get(phase, [])
         wanted = (sorted({*found[phase], *planned}) if names is None else list(names))[:limit]
         homes = {name: next((p for p in phases if name in found[p]), phase) for name in wanted}

@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 
 from ghgs_lit.config import build, plugins
+from ghgs_lit.data.check import inspect
 from ghgs_lit.errors import InputError
 from tests.helpers.training import ring
 from tests.helpers.verbs import ghgs
@@ -96,6 +97,15 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
     assert ghgs(*arguments) == 0
     again = json.loads(Path("measured/metrics.json").read_text())
     assert {row["target"]: row["psnr"] for row in again["rows"]} == pytest.approx(before, abs=1e-3)
+
+
+def test_the_template_passes_the_check(project, monkeypatch):
+    """task=check asks for the static cameras alone, whatever the protocol's views, and counts the bodies."""
+    monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
+    release = {"name": "release", "training_views": [2, 3, 4]}
+    report = inspect(build(node(project, targets=release), "data"))
+    assert report.problems == report.notes == []
+    assert [phase.bodies for phase in report.phases.values()] == [2, 1]
 
 
 def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):

@@ -1,0 +1,154 @@
+"""What task=check finds without a body's help: masks, cameras, units, leakage."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ghgs_lit.data.check import inspect
+from ghgs_lit.data.datamodules import RenderedDataModule
+from ghgs_lit.errors import InputError
+from tests.helpers.people import TINY, V4, render_boxes
+
+PLACE = "train/mask/s0_008/0.png"
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """Boxes, whose bodies of eight vertices check no camera."""
+    folder = tmp_path_factory.mktemp("boxes")
+    settings = replace(TINY, samples=1, positions=(0, 4, 8, 12), views=(0, 3))
+    render_boxes(folder / "root", folder / "scans", train=2, val=1, settings=settings)
+    return folder / "root"
+
+
+@pytest.fixture
+def root(sound, tmp_path):
+    shutil.copytree(sound, tmp_path / "root")
+    return tmp_path / "root"
+
+
+def report(root, **changes):
+    targets = {"name": "release", "training_views": [3]}
+    return inspect(
+        RenderedDataModule(**({"root": str(root), "views": V4, "targets": targets, "size": 42} | changes))
+    )
+
+
+def change(root, kind: str, function, names: str = "s0_*") -> None:
+    """Replace matrices of cameras by ``function`` of them."""
+    for path in sorted(root.glob(f"train/parm/{names}/*_{kind}.npy")):
+        np.save(path, function(np.load(path)))
+
+
+def paint(root, function) -> None:
+    """Replace the mask at :data:`PLACE`."""
+    mask = np.asarray(Image.open(root / PLACE)) > 127
+    Image.fromarray(function(mask).astype(np.uint8) * 255).save(root / PLACE)
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    return np.concatenate((pose[:, :3].T, -pose[:, :3].T @ pose[:, 3:]), 1)
+
+
+def spot(mask: np.ndarray) -> np.ndarray:
+    only = np.zeros_like(mask)
+    only[20, 20] = True
+    return only
+
+
+def same_camera(root) -> None:
+    for kind in ("intrinsic", "extrinsic"):
+        folder = root / "train/parm"
+        shutil.copy(folder / f"s0_000/0_{kind}.npy", folder / f"s0_008/0_{kind}.npy")
+
+
+def black(root) -> None:
+    Image.new("RGB", (42, 42)).save(root / "train/img/s0_008/0.jpg")
+
+
+DISAGREE = "expected a mask that the others of its subject allow"
+DAMAGES = {
+    "full mask": (lambda r: paint(r, lambda m: m | True), f"{PLACE}: .*not of the background; found 100%"),
+    "inverted mask": (lambda r: paint(r, lambda m: ~m), f"{PLACE}: .*not of the background; found"),
+    "one pixel": (lambda r: paint(r, spot), f"{PLACE}: expected a (subject of|mask that)"),
+    "camera to world": (lambda r: change(r, "extrinsic", inverse), DISAGREE),
+    "axes of OpenGL": (lambda r: change(r, "extrinsic", lambda e: np.diag([1, -1, -1]) @ e), DISAGREE),
+    "one camera in millimetres": (
+        lambda r: change(r, "extrinsic", lambda e: e * [1, 1, 1, 1000], "s0_008"),
+        DISAGREE,
+    ),
+    "intrinsics of another size": (lambda r: change(r, "intrinsic", lambda k: k * [[2], [2], [1]]), DISAGREE),
+    "the same camera twice": (
+        same_camera,
+        f"{PLACE}: expected a camera of its own; found that of position 0",
+    ),
+    "black photograph": (black, f"{PLACE}: expected a photograph in the mask; found black"),
+}
+
+
+def test_sound_data_agrees(root):
+    """Right masks and cameras pass; every subject's body is counted, whether it checks cameras or not."""
+    found = report(root)
+    assert found.problems == []
+    assert found.notes == []
+    assert [phase.bodies for phase in found.phases.values()] == [2, 1]
+    assert all(min(phase.overlaps("agreement")) > 0.97 for phase in found.phases.values())
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_damage_is_found_without_bodies(root, kind):
+    """Each defect that silhouettes show is one problem, although no body says where the subject is."""
+    shutil.rmtree(root / "train/smpl")
+    damage, line = DAMAGES[kind]
+    damage(root)
+    problems = report(root).problems
+    assert len(problems) == 1, problems
+    with pytest.raises(InputError, match=line):
+        raise InputError(problems[0])
+
+
+def test_other_units_are_named(root):
+    """Cameras that all agree in millimetres are a note: nothing says that a subject is no giant."""
+    for phase in ("train", "val"):
+        for path in sorted(root.glob(f"{phase}/parm/*/*_extrinsic.npy")):
+            np.save(path, np.load(path) * [1, 1, 1, 1000])
+        shutil.rmtree(root / phase / "smpl")
+    found = report(root)
+    assert found.problems == []
+    for phase in ("train", "val"):
+        (note,) = [line for line in found.notes if "metres" in line and line.startswith(phase)]
+        assert note.endswith("units tall (millimetres?)")
+
+
+def test_the_same_person_in_both_phases_is_a_problem(root):
+    """Leakage by id stops reading and the check; the same photographs under another id stop the check."""
+    for folder in sorted(root.glob("train/*/s1*")):
+        renamed = folder.name.replace("s1", "other")
+        shutil.copytree(folder, root / "val" / folder.parent.name / renamed)
+    (root / "rendering/done/val/other").touch()
+    (line,) = report(root).problems
+    assert line == (
+        f"{root}/val/mask/other_000/0.png: expected a photograph that train has not; "
+        f"found {root}/train/mask/s1_000/0.png"
+    )
+    for folder in sorted(root.glob("val/*/other*")):
+        folder.rename(folder.with_name(folder.name.replace("other", "s1")))
+    (root / "rendering/done/val/s1").touch()
+    (line,) = report(root).problems
+    assert line == f"{root}: expected each subject in train or in val; found 's1' in both"
+    data = RenderedDataModule(root=str(root), views=V4, targets={"name": "cameras", "view": 0}, size=42)
+    with pytest.raises(InputError, match="found 's1' in both"):
+        data.subjects("val")
+
+
+def test_bodies_are_counted_where_photographs_are_missing(root):
+    """A missing view is a problem of its own; the subject still has its body."""
+    for path in sorted(root.glob("train/img/s0_*/3.jpg")):
+        path.unlink()
+    found = report(root)
+    assert len(found.problems) == 4
+    assert found.phases["train"].bodies == 2
+    assert not any("a body for each" in note for note in found.notes)
