@@ -55,7 +55,7 @@ class FeatureCache:
         tokens: str = "subject",
         margin: int = 1,
         dtype: str = "float32",
-        max_gb: float | None = None,
+        max_gb: float | int | None = None,
     ):
         choice("feature_cache.tokens", tokens, ("subject", "all"))
         choice("feature_cache.dtype", dtype, tuple(DTYPES))

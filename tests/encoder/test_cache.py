@@ -218,7 +218,7 @@ def test_the_oldest_files_make_room(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}, {"max_gb": 0}, {"max_gb": "many"}]
+    "option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}, {"max_gb": 0}, {"max_gb": -1.5}]
 )
 def test_impossible_options_are_refused(tmp_path, option):
     """A bad value is found when the configuration is read, by its key."""
