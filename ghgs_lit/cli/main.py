@@ -83,8 +83,8 @@ class Verb:
         sys.argv = list(self.argv)
         try:
             # Before the verb's module is imported, which takes seconds.
-            check_groups(self.name, cfg)
             resolve(cfg)
+            check_groups(self.name, cfg)
             return importlib.import_module(module_of(self.name)).run(cfg)
         except BAD_INPUT as error:
             # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.

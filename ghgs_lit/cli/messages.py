@@ -72,8 +72,9 @@ def _composition(error: HydraException) -> str:
     if key in GONE:
         return f"{key}: expected {GONE[key]} in its place; found a key of an earlier version"
     # A key without its group counts as close, too: lr for optimizer.lr.
-    whole = {known.rpartition(".")[2]: known for known in KINDS}.get(key)
-    hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*KINDS, *_groups()))
+    keys = [known for known in KINDS if "*" not in known]
+    whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
+    hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*keys, *_groups()))
     hint = "" if key in KINDS else hint  # a key of another verb
     return f"{key}: expected a key or group of this verb; found none of that name{hint}; +{key}=... adds it"
 
