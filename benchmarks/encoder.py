@@ -1,7 +1,7 @@
 """Time, peak memory and FLOPs of a forward pass by stage: ``python benchmarks/encoder.py [--size vggt_1b]``.
 
 Random weights, an ellipsoid in front of a ring of cameras, ``skip=none``: every token and every pixel. With
-``skip=fast`` the encoder's numbers are those of the kept tokens; ``--zoom`` changes the subject's size.
+``skip=fast`` the numbers are those of the kept tokens; ``--zoom`` changes the subject's size.
 Rates are compared with those of matrix products, measured before and after in the same run. With
 ``--literal`` the recalibration is compared with a literal version (gathers, each layer by itself).
 """
@@ -119,10 +119,10 @@ def count_gflop(config: dict, model: GHGS, batch: Batch) -> dict[str, float]:
     pixel = sum(2e-9 * p.numel() for header in headers for p in header.parameters() if p.dim() == 2)
     found["depth head"] = b * v * gflop_of(lambda: model.depth_head.dpt(tokens))
     found["Gaussian head"] = b * v * (gflop_of(lambda: head.decoder(tokens)) + height * width * pixel)
-    k = min(model.recalibration.k, v * one)
+    k = min(model.recalibration.k, len(kept.index) // b)
     linears = (block.q_proj, block.k_proj, block.v_proj, block.o_proj, block.mlp[0], block.mlp[2])
     each = sum(2 * linear.weight.numel() for linear in linears) + 4 * k * block.q_proj.out_features
-    return found | {"recalibration": 1e-9 * b * v * one * (4 * each + 2 * k * s)}
+    return found | {"recalibration": 1e-9 * len(kept.index) * (4 * each + 2 * k * s)}
 
 
 def best_seconds(function: Callable, repeats: int = 3) -> float:
