@@ -97,7 +97,11 @@ MISSING = [
     ),
     ("train data=scans data.root={tmp}/none", 1, "{tmp}/none: expected the folder of the data set"),
     ("train data=thuman2 data.root={empty}", 1, "{empty}"),
-    ("train data=humman data.root={empty} targets=cameras evaluation.targets=[cameras]", 1, "{empty}"),
+    (
+        "train data=humman data.root={empty} targets=cameras evaluation.targets=[cameras]",
+        1,
+        "data.smpl_model: expected",
+    ),
     ("train data=zju_mocap data.root={empty} targets=cameras evaluation.targets=[cameras]", 1, "{empty}"),
     ("evaluate", 1, "data: expected data=..."),
     ("evaluate data=synthetic", 1, "checkpoint: expected a checkpoint or baselines=[...]; found neither"),
