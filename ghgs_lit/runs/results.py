@@ -159,7 +159,7 @@ def read_results(path: Path) -> dict[str, Any]:
     _check_rows(path, content)
     source = entry(str(path), content, "provenance", dict)
     # The keys without influence changed since earlier versions, and with them the hashes.
-    if found == FORMAT_VERSION and "config" in source:
+    if found == FORMAT_VERSION and isinstance(source.get("config"), dict):
         fitting, hashed = config_hash(source["config"]), source.get("config_hash")
         expected = f"a configuration that fits its config_hash {hashed}"
         require(fitting == hashed, f"{path}: provenance.config", expected, f"one of {fitting}")

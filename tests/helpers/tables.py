@@ -5,6 +5,7 @@ from pathlib import Path
 import yaml
 
 from ghgs_lit import tables as t
+from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import write_results
 
 SWITCHES = {
@@ -50,7 +51,6 @@ def write_run(
     ]  # fmt: skip
     source = {
         "config": config,
-        "config_hash": f"{ablation}{seed}",
         "seed": seed,
         "data": {"name": data, "split": "val"},
         "protocol": {"metrics": protocol},
@@ -60,6 +60,7 @@ def write_run(
     if verb == "evaluate":
         source["checkpoint_config"] = config
         source["config"] = {**config_of("neither", 99), "data": {"name": data}}
+    source["config_hash"] = config_hash(source["config"])
     path = write_results(folder, rows, source)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     return path
