@@ -47,7 +47,7 @@ VERBS = {
     ),
     "benchmark": (
         "run time against error of the presets of skip, by stage",
-        "ghgs benchmark checkpoint=last.ckpt presets=[none,exact,balanced]",
+        "ghgs benchmark checkpoint=runs/train/.../checkpoints/last.ckpt presets=[none,exact,balanced]",
     ),
     "table": ("collect a sweep into the paper's table", "ghgs table runs=runs/train/sweep_..."),
 }

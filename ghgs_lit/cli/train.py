@@ -152,13 +152,14 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")
-    check_evaluation(config, data)
     module = GHGSModule(
         model, renderer, build(config["loss"], "loss"), build(config["optimizer"], "optimizer"), config
     )
     _quiet()
     cost = TrainingCost()
     trainer = build_trainer(config, directory, cost, StopAtStep())
+    # Last of all checks: it makes the photographs that are missing.
+    check_evaluation(config, data)
     try:
         fit(trainer, module, data, config, step, stats)
         checkpoint = directory / "checkpoints" / "last.ckpt"

@@ -170,7 +170,7 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     """A bad value must be found before hours of training, not at its turn."""
     code, _, err = sweep("seed=1,-2")
     assert code == 1
-    assert "seed: expected an integer from 0" in err
+    assert "seed: expected an integer >= 0" in err
     code, _, err = sweep("seed=1,2", "trainer=ddp_cpu", "dry_run=true")
     assert code == 1
     assert "trainer.devices: expected 1 in a sweep whose jobs share a process; found 2" in err
