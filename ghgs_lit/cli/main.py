@@ -5,6 +5,7 @@ import importlib.metadata
 import keyword
 import os
 import re
+import signal
 import sys
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.messages import BAD_INPUT, BadUsage, check_flags, did_you_mean, one_line, raised_by_hydra
 from ghgs_lit.config import check_groups, conf_dir, resolve
 from ghgs_lit.runs.job import register_resolvers
+from ghgs_lit.runs.signals import Interrupted, interruptible
 
 register_resolvers()  # on import, so that the processes of a launcher have them too
 
@@ -132,7 +134,8 @@ def _run(verb: str, argv: list[str]) -> int:
     task = Verb(verb, tuple(argv), wants_trace)
     try:
         check_flags(sys.argv[1:])
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
+        with interruptible():
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
     except BadUsage as error:
         print(f"ghgs {verb}: {error}", file=sys.stderr)
         return 2
@@ -141,6 +144,10 @@ def _run(verb: str, argv: list[str]) -> int:
             raise
         print(f"ghgs {verb}: {one_line(error)}", file=sys.stderr)
         return 1
+    except Interrupted as stop:
+        if not stop.explained:
+            print(f"ghgs {verb}: interrupted ({signal.Signals(stop.number).name})", file=sys.stderr)
+        return stop.code
     except KeyboardInterrupt:
         print(f"ghgs {verb}: interrupted", file=sys.stderr)
         return 130
@@ -148,7 +155,7 @@ def _run(verb: str, argv: list[str]) -> int:
 
 
 def main() -> int:
-    """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 when interrupted."""
+    """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 and 143 when interrupted."""
     argv = list(sys.argv)
     # OpenMP threads that spin while they wait slow down other processes on the same cores tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
