@@ -1,6 +1,8 @@
 """Checks annotated shapes (jaxtyping with beartype), and limits the threads of each test process."""
 
 import os
+import signal
+import threading
 from pathlib import Path
 
 from jaxtyping import install_import_hook
@@ -16,3 +18,7 @@ import torch  # noqa: E402
 
 # Test processes share the cores; more threads than cores slow each other down.
 torch.set_num_threads(max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
+
+# Shells start background jobs with Ctrl-C ignored, which child processes inherit: tests that send it would fail.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
