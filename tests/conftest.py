@@ -19,6 +19,6 @@ import torch  # noqa: E402
 # Test processes share the cores; more threads than cores slow each other down.
 torch.set_num_threads(max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
 
-# Shells start background jobs with Ctrl-C ignored, which child processes inherit: tests that send it would fail.
+# Shells start background jobs with Ctrl-C ignored, and child processes inherit that.
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
