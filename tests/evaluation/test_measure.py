@@ -10,7 +10,6 @@ import pytest
 import yaml
 from PIL import Image
 
-from ghgs_lit.cli.main import main
 from ghgs_lit.config import conf_dir
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
@@ -21,6 +20,7 @@ from ghgs_lit.metrics import ImageMetrics, psnr
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.provenance import config_hash
 from tests.helpers.training import Standin, example_batch, flat_renderer
+from tests.helpers.verbs import ghgs
 
 OFF = ImageMetrics(lpips="off")
 
@@ -56,20 +56,6 @@ def test_the_hash_of_a_configuration_ignores_the_order_of_keys():
     """Runs of a sweep are found again by the hash of their configuration."""
     assert config_hash({"a": 1, "b": {"c": [1, 2]}}) == config_hash({"b": {"c": [1, 2]}, "a": 1})
     assert config_hash({"a": 1}) != config_hash({"a": 2})
-
-
-def ghgs(*arguments: str) -> int:
-    """The console script in this process."""
-    before = sys.argv
-    sys.argv = ["ghgs", *arguments]
-    # The script sets it for Hydra; where a user has set it, errors are raised.
-    os.environ.pop("HYDRA_FULL_ERROR", None)
-    try:
-        return main()
-    except SystemExit as exit:
-        return exit.code
-    finally:
-        sys.argv = before
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,8 @@ import warnings
 
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
 from safetensors.torch import load_file, save_file
 
-from ghgs_lit.cli import main as cli
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.training import start
@@ -18,6 +16,7 @@ from ghgs_lit.weights.exporting import export_weights
 from ghgs_lit.weights.importing import Source, match_files
 from ghgs_lit.weights.reading import cast
 from ghgs_lit.weights.switches import differences
+from tests.cli.test_main import call
 from tests.helpers.models import close
 from tests.helpers.scenes import make_batch
 from tests.helpers.weights import (
@@ -259,34 +258,23 @@ def test_our_own_variants_have_no_published_names(tmp_path, files):
         export_weights(out, None, tmp_path / "back.safetensors")
 
 
-def command(monkeypatch, capsys, *argv):
-    monkeypatch.setattr("sys.argv", ["ghgs", *argv])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-    GlobalHydra.instance().clear()
-    try:
-        code = cli.main()
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    return code, *capsys.readouterr()
-
-
 def test_the_verbs(monkeypatch, capsys, tmp_path, files):
     """The command line must pass its keys on, print paths last, and answer errors in one line."""
     monkeypatch.chdir(tmp_path)
-    code, out, _ = command(
+    code, out, _ = call(
         monkeypatch, capsys, "import", "vggt=vggt.safetensors", "release=release.pth", "out=a/out.ckpt", *TINY
     )
     assert code == 0
     assert "differs from the release" not in out
     assert out.splitlines()[-1] == "wrote a/out.ckpt"
-    code, out, _ = command(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
+    code, out, _ = call(monkeypatch, capsys, "export", "checkpoint=a/out.ckpt", "release=back.pth")
     assert code == 0
     assert out.splitlines()[-2:] == [f"back.pth: {len(files[3])} tensors", "wrote back.pth"]
     for argv, message in (
         (["vggt=vggt.safetensors", "out=b.ckpt"], "compat: expected none where there is no release"),
         (["vggt=none.pt", "compat=none", "out=b.ckpt"], "none.pt: expected a file of weights; found none"),
     ):
-        code, _, err = command(monkeypatch, capsys, "import", *argv, *TINY)
+        code, _, err = call(monkeypatch, capsys, "import", *argv, *TINY)
         assert code == 1
         assert err.strip().startswith(f"ghgs import: {message}")
         assert len(err.strip().splitlines()) == 1
