@@ -61,6 +61,11 @@ TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a comma
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
     (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
+    (r"^(ghgs benchmark (?!.*(?:-help|task=)).*)", r"\1 timing.repeats=1 subjects=1", "one subject, one round"),
+    (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
+    (r"^(ghgs benchmark task=scaling .*)",
+     r"\1 encoder=vggt_nano 'scaling={share: [0.1, 0.2], views: [2, 3], size: [56, 70], batch: [1]}'",
+     "small photographs"),
     (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
     (r" init_from=start\.ckpt", "", PUBLISHED),
     (r"runs/train/<time>", "runs/train/$(ls runs/train | grep ^20 | tail -n 1)", "the last run"),
@@ -119,6 +124,7 @@ END"""
 # A document, and the commands that make what its reader has.
 BEFORE = {
     "docs/add_a_data_set.md": (_SCANS.format("scans"), _RENDER.format("scans"), _PHOTOGRAPHS),
+    "docs/benchmark.md": _CHECKPOINTS,
     "docs/data.md": (
         f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
         _SCANS.format("THuman2.0_Release"),
