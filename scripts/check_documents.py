@@ -61,7 +61,7 @@ TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a comma
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
     (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
-    (r"^(ghgs benchmark (?!.*(?:-help|task=)).*)", r"\1 timing.repeats=1 subjects=1", "one subject, one round"),
+    (r"^(ghgs benchmark (?!.*(?:-help|task=)).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"^(ghgs benchmark task=scaling .*)",
      r"\1 encoder=vggt_nano 'scaling={share: [0.1, 0.2], views: [2, 3], size: [56, 70], batch: [1]}'",

@@ -14,7 +14,15 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.messages import BAD_INPUT, BadUsage, check_flags, did_you_mean, one_line, raised_by_hydra
+from ghgs_lit.cli.messages import (
+    BAD_INPUT,
+    BadUsage,
+    check_deletions,
+    check_flags,
+    did_you_mean,
+    one_line,
+    raised_by_hydra,
+)
 from ghgs_lit.config import check_groups, conf_dir, resolve
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
@@ -134,6 +142,7 @@ def _run(verb: str, argv: list[str]) -> int:
     task = Verb(verb, tuple(argv), wants_trace)
     try:
         check_flags(sys.argv[1:])
+        check_deletions(sys.argv[1:])
         with interruptible():
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
     except BadUsage as error:

@@ -16,6 +16,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config import conf_dir
+from ghgs_lit.config.keys import is_below
 from ghgs_lit.config.legacy import GONE
 from ghgs_lit.config.schema import KINDS
 from ghgs_lit.errors import InputError
@@ -128,3 +129,18 @@ def check_flags(arguments: Sequence[str]) -> None:
     parser: argparse.ArgumentParser = get_args_parser()
     parser.error = refuse
     parser.parse_args(list(arguments))
+
+
+#: Nodes of Lightning's classes, whose keys have values of their own where none is given.
+_LIGHTNING = ("trainer", "callbacks", "logger")
+
+
+def check_deletions(arguments: Sequence[str]) -> None:
+    """Refuse to delete single keys (``~data.size``), which the package reads; groups can be deleted.
+
+    Raises:
+        InputError: names the key.
+    """
+    for key in (text[1:].split("=", 1)[0] for text in arguments if text.startswith("~")):
+        if "." in key and not is_below(key, _LIGHTNING):
+            raise InputError(f"{key}: expected a value (or null where it may be empty); found ~{key}")

@@ -47,6 +47,8 @@ USAGE = [
 ]
 
 MISSPELT = [
+    ("train experiment=demo ~evaluation.views", 1, "evaluation.views: expected a value", "~evaluation.views"),
+    ("train ~data.size", 1, "data.size: expected a value", "~data.size"),
     ("train optimizer.lrr=1", 1, "optimizer.lrr: expected a key", "did you mean optimizer.lr?"),
     ("train lr=1e-3", 1, "lr: expected a key", "did you mean optimizer.lr?"),
     ("train max_steps=10", 1, "max_steps: expected a key", "did you mean trainer.max_steps?"),
