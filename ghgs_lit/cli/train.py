@@ -36,6 +36,7 @@ from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 from ghgs_lit.training import GHGSModule, loggers, start
+from ghgs_lit.training.budgets import TokenBudgets
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.interruption import StopAtStep
@@ -152,8 +153,14 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer = build(config["renderer"], "renderer")
+    budgets = config.get("token_budgets")
     module = GHGSModule(
-        model, renderer, build(config["loss"], "loss"), build(config["optimizer"], "optimizer"), config
+        model,
+        renderer,
+        build(config["loss"], "loss"),
+        build(config["optimizer"], "optimizer"),
+        config,
+        None if budgets is None else TokenBudgets(budgets),
     )
     _quiet()
     cost = TrainingCost()

@@ -167,6 +167,7 @@ KINDS: dict[str, Kind] = {
     "test.alpha": number(above=0, below=1),
     "test.kind": TEXT,
     "test.unit": TEXT | NULL,
+    "token_budgets": list_of(one_of("all", "window") | integer(least=0)) | NULL,
     "turntable.frames": integer(least=0),
     "vggt": PATH,
     # data

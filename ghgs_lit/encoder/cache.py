@@ -152,7 +152,8 @@ class FeatureCache:
         device = images.device.type
         half = torch.is_autocast_enabled(device) and str(torch.get_autocast_dtype(device))
         kept = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
-        digest = hashlib.sha256(json.dumps([LAYOUT, self._fingerprint(encoder), kept, device, half]).encode())
+        facts = [LAYOUT, encoder.options, self._fingerprint(encoder), kept, device, half]
+        digest = hashlib.sha256(json.dumps(facts, sort_keys=True, default=list).encode())
         _add(digest, images)
         if encoder.reads_masks or self.tokens == "subject":
             _add(digest, masks)
@@ -162,12 +163,12 @@ class FeatureCache:
         return digest.hexdigest()
 
     def _fingerprint(self, encoder: VGGTEncoder) -> str:
-        """Hash of the encoder's options and weights, computed again when a weight has changed."""
+        """Hash of the encoder's weights, computed again when one has changed."""
         # A change in place raises a tensor's version; another tensor has another address.
         state = encoder.state_dict(keep_vars=True)
         versions = [(t.data_ptr(), t._version, t.dtype) for t in state.values()]
         if versions != self._versions:
-            digest = hashlib.sha256(json.dumps(encoder.options, sort_keys=True, default=list).encode())
+            digest = hashlib.sha256()
             for name, tensor in sorted(state.items()):
                 digest.update(name.encode())
                 _add(digest, tensor)

@@ -1,6 +1,7 @@
 """The encode stage: photographs and masks to tokens."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -70,8 +71,7 @@ class VGGTEncoder(nn.Module):
         super().__init__()
         choice("encoder.tokens", tokens, ("all", "subject"))
         require(margin >= 0, "encoder.margin", "0 or more patches", margin)
-        #: All that the tokens depend on, the weights apart.
-        self.options = {
+        self._options = {
             "width": width,
             "heads": heads,
             "depth": depth,
@@ -81,8 +81,6 @@ class VGGTEncoder(nn.Module):
             "registers": registers,
             "mask_input": mask_input,
             "bounds_input": bounds_input,
-            "tokens": tokens,
-            "margin": margin if tokens == "subject" else 0,
         }
         self.tokens, self.margin = tokens, margin
         self.weights = weights
@@ -145,6 +143,12 @@ class VGGTEncoder(nn.Module):
             grid=kept.grid,
             patch_size=self.patch_size,
         )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """All that the tokens depend on, the weights apart."""
+        margin = self.margin if self.tokens == "subject" else 0
+        return {**self._options, "tokens": self.tokens, "margin": margin}
 
     @property
     def reads_masks(self) -> bool:

@@ -13,6 +13,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import PSNR, depth_error_mm
 from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.training.budgets import TokenBudgets, token_budget
 from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
@@ -32,6 +33,7 @@ class GHGSModule(L.LightningModule):
         losses: the terms that are trained on.
         optimization: optimizer, schedule and gradient clipping.
         config: the run's full configuration as plain data; every checkpoint contains it.
+        token_budgets: drawn from in each training step; None: the model stays as it is configured.
 
     Attributes:
         clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
@@ -45,6 +47,7 @@ class GHGSModule(L.LightningModule):
         losses: Losses,
         optimization: Optimization,
         config: Mapping[str, Any],
+        token_budgets: TokenBudgets | None = None,
     ):
         super().__init__()
         self.model = model
@@ -52,6 +55,7 @@ class GHGSModule(L.LightningModule):
         self.losses = losses
         self.optimization = optimization
         self.config = config
+        self.token_budgets = token_budgets
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
         self.used_budget = 0.0
         self.clock = StepClock()
@@ -74,9 +78,16 @@ class GHGSModule(L.LightningModule):
         numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
         return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
+    def draw_budget(self, batch_idx: int) -> str | int | None:
+        """The token budget of this step: the same in all processes, so that none waits for a larger one."""
+        part = batch_idx % self.trainer.accumulate_grad_batches
+        numbers = [self.config.get("seed", 0), self.global_step, part]
+        return None if self.token_budgets is None else self.token_budgets.draw(numbers)
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         torch.manual_seed(self.step_seed(batch_idx))
-        prediction, rendering = self(batch)
+        with token_budget(self.model, self.draw_budget(batch_idx)):
+            prediction, rendering = self(batch)
         total, values = self.losses(prediction, rendering, batch)
         if not torch.isfinite(total):
             broken = ", ".join(f"{name} = {v.item()}" for name, v in values.items() if not torch.isfinite(v))

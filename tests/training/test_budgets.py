@@ -1,0 +1,118 @@
+"""Random budgets of tokens: each is a preset of skipping, and the draw depends on the step alone."""
+
+from collections import Counter
+from types import SimpleNamespace
+
+import lightning.pytorch as L
+import pytest
+import torch
+
+from ghgs_lit.encoder import FeatureCache
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import Losses
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.budgets import TokenBudgets, token_budget
+from tests.helpers.models import close, make_model
+from tests.helpers.scenes import make_batch
+from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
+
+# The preset that is configured, a budget, and the preset that it is.
+PRESETS = [
+    ("fast", "all", ["skip=exact"]),
+    ("exact", "window", ["skip=balanced"]),
+    ("balanced", 2, ["skip=fast", "skip.margin=2"]),
+]
+
+
+@pytest.mark.parametrize(("configured", "budget", "preset"), PRESETS)
+def test_a_budget_is_a_preset_while_it_lasts(configured, budget, preset):
+    """Training would see something else than the preset that its weights are meant for."""
+    model, batch = make_model(f"skip={configured}"), make_batch(views=2, height=112, width=84)
+    expected = make_model(*preset)
+    expected.load_state_dict(model.state_dict())
+    with torch.no_grad():
+        before = model(batch).gaussians
+        with token_budget(model, budget):
+            close(model(batch).gaussians, expected(batch).gaussians)
+        assert torch.equal(model(batch).gaussians.means, before.means)
+
+
+def test_budgets_need_features_of_their_own(tmp_path):
+    """A frozen encoder's features of one budget must not be found for another."""
+    encoder = make_model("encoder.trainable=none", "encoder.bounds_input=false").encoder
+    batch = make_batch(views=2, height=112, width=84)
+    model = SimpleNamespace(encoder=encoder, crop=False)
+    cache = FeatureCache(tmp_path, tokens="all")
+    for made, budget in enumerate([1, 0, "all"], start=1):
+        with token_budget(model, budget):
+            tokens = encoder(batch.images, batch.masks, None, cache)
+            assert torch.equal(tokens.semantic, encoder(batch.images, batch.masks).semantic)
+        assert cache.made == made
+    encoder(batch.images, batch.masks, None, cache)
+    assert (cache.made, cache.hits) == (3, 1)
+
+
+def test_the_draw_is_even_and_depends_on_all_numbers():
+    """A step, a seed or a part of an accumulated step that does not count would repeat a budget."""
+    budgets = TokenBudgets(["all", "window", 0, 0])
+    drawn = [[budgets.draw([seed, step, part]) for step in range(400)] for seed in (0, 1) for part in (0, 1)]
+    shares = Counter(drawn[0])
+    assert set(shares) == {"all", "window", 0}
+    assert 160 < shares[0] < 240
+    assert len({tuple(row) for row in drawn}) == 4
+    assert drawn[0] == [budgets.draw([0, step, 0]) for step in range(400)]
+
+
+class Watched(Standin):
+    """Keeps the budgets that it sees, in training and in validation."""
+
+    def __init__(self):
+        super().__init__()
+        self.encoder = SimpleNamespace(tokens="subject", margin=7)
+        self.crop, self.trained, self.validated = False, [], []
+
+    def forward(self, batch):
+        seen = self.trained if torch.is_grad_enabled() else self.validated
+        seen.append((self.crop, self.encoder.tokens, self.encoder.margin))
+        return super().forward(batch)
+
+
+def fit(folder, steps, resume=None):
+    model = Watched()
+    options = Optimization(lr=0.05)
+    budgets = TokenBudgets(["all", "window", 0, 1, 2])
+    module = GHGSModule(model, flat_renderer, Losses({"render_l1": 1.0}), options, {"seed": 3}, budgets)
+    trainer = L.Trainer(
+        accelerator="cpu", max_steps=steps, max_epochs=-1, default_root_dir=folder, logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+        num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=6,
+    )  # fmt: skip
+    trainer.fit(module, StepData(), ckpt_path=resume)
+    trainer.save_checkpoint(folder / "end.ckpt")
+    return model
+
+
+def test_a_resumed_run_draws_as_the_whole_one_and_validates_as_configured(tmp_path):
+    """Weights after an interruption would differ; a score would depend on the draw."""
+    (tmp_path / "half").mkdir()
+    whole, half = fit(tmp_path, 18), fit(tmp_path / "half", 12)
+    torch.manual_seed(99)  # what the process drew before must not matter
+    rest = fit(tmp_path / "half", 18, resume=tmp_path / "half" / "end.ckpt")
+    assert whole.trained == half.trained + rest.trained
+    assert len(set(whole.trained)) == 5
+    assert set(whole.validated) == {(False, "subject", 7)}
+
+
+def test_without_budgets_the_model_stays_as_it_is_configured():
+    """The default must not change what training sees."""
+    model = Watched()
+    with token_budget(model, None):
+        model(example_batch())
+    assert model.trained == [(False, "subject", 7)]
+
+
+@pytest.mark.parametrize("choices", [[], ["windows"], [-1], ["all", "1"]])
+def test_budgets_that_do_not_exist_are_refused(choices):
+    """A typing error must not become another training."""
+    with pytest.raises(InputError, match="token_budgets"):
+        TokenBudgets(choices)
