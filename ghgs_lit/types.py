@@ -104,12 +104,28 @@ class Cameras(_TensorStruct):
 
 @dataclass(frozen=True)
 class Targets(_TensorStruct):
-    """Photographs to predict, from cameras other than the input cameras."""
+    """Photographs to predict, from cameras other than the input cameras.
+
+    ``names`` are those of the photographs of each subject, ``protocols`` the target protocol of each of the
+    ``T``, the same for all subjects.
+    """
 
     images: Float[Tensor, "B T 3 h w"]
     masks: Bool[Tensor, "B T h w"]
     cameras: Cameras
     names: tuple[tuple[str, ...], ...] = ()
+    protocols: tuple[str, ...] = ()
+
+    def of_protocol(self, name: str) -> "Targets":
+        """The targets of one protocol."""
+        chosen = [number for number, protocol in enumerate(self.protocols) if protocol == name]
+        return Targets(
+            self.images[:, chosen],
+            self.masks[:, chosen],
+            self.cameras[:, chosen],
+            tuple(tuple(names[number] for number in chosen) for names in self.names),
+            (name,) * len(chosen),
+        )
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,6 @@ def record_cases(
     cases: Sequence[Case],
     batches: Sequence[Batch],
     metrics: ImageMetrics,
-    targets: str,
     device: torch.device,
     warmup: int,
     repeats: int,
@@ -177,7 +176,6 @@ def record_cases(
         cases: of each source the yardstick first.
         batches: on the device, with targets.
         metrics: of the renders.
-        targets: name of the target protocol.
         device: where the models are.
         warmup, repeats: as for :func:`time_jobs`.
         count_flops: whether FLOPs are counted, which takes one more forward pass.
@@ -194,7 +192,7 @@ def record_cases(
             for name, value in differences(found, yardstick, batch.masks).items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
-            record.metrics += _metrics(record.case, batch, *found, metrics, targets, device)
+            record.metrics += _metrics(record.case, batch, *found, metrics, device)
             progress(record.case.label)
     for record, own in zip(records, works, strict=True):
         record.work = Work.of(own)
@@ -210,10 +208,9 @@ def _metrics(
     prediction: Prediction,
     rendering: Rendering,
     metrics: ImageMetrics,
-    targets: str,
     device: torch.device,
 ) -> list[Row]:
     """The error against the truth, by the measurement of ``ghgs evaluate``; its time does not count."""
     estimate = Estimate(rendering.image, prediction.depth, prediction.depth_valid)
-    rows = measure(lambda _: estimate, case.label, [batch], targets, metrics, device)
+    rows = measure(lambda _: estimate, case.label, [batch], metrics, device)
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]

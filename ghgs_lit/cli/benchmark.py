@@ -110,7 +110,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     with Progress() as bar:
         task = bar.add_task("presets", total=total)
         records = record_cases(
-            cases, batches, metrics, config["targets"]["name"], device,
+            cases, batches, metrics, device,
             **timing, progress=lambda label: bar.update(task, advance=1, description=label),
         )  # fmt: skip
     rows = report.rows_of(records)

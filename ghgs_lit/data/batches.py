@@ -78,7 +78,7 @@ class BatchBuilder:
     depths: bool = True
 
     def batch(self, specs: Sequence[SampleSpec]) -> Batch:
-        """Samples with equal numbers of inputs and equal numbers of targets, which may be 0."""
+        """Samples with equal numbers of inputs and equal protocols of targets, which may be none."""
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths) for s in specs]
         depths = [[view.depth for view in row] for row in inputs]
         known = all(depth is not None for row in depths for depth in row)
@@ -101,6 +101,7 @@ class BatchBuilder:
             masks=_stack([[view.mask for view in row] for row in views]),
             cameras=_cameras(views),
             names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
+            protocols=specs[0].protocols,
         )
 
     def _images(self, views: list[list[View]]) -> Tensor:
@@ -155,13 +156,13 @@ class TrainingBatches(Dataset):
 
 
 class EvaluationBatches(Dataset):
-    """Fixed samples; an item has up to ``batch_size`` neighbours with equal numbers of targets."""
+    """Fixed samples; an item has up to ``batch_size`` neighbours with equal protocols of targets."""
 
     def __init__(self, builder: BatchBuilder, specs: Sequence[SampleSpec], batch_size: int) -> None:
         self.builder = builder
         self.specs = [
             alike[i : i + batch_size]
-            for alike in (list(group) for _, group in groupby(specs, lambda s: len(s.targets)))
+            for alike in (list(group) for _, group in groupby(specs, lambda s: s.protocols))
             for i in range(0, len(alike), batch_size)
         ]
 

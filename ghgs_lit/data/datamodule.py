@@ -1,7 +1,7 @@
 """The LightningDataModule of all data sets: a data set, protocols and options turned into loaders."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -123,7 +123,7 @@ class PhotographsDataModule(LightningDataModule):
     def evaluation_loader(
         self,
         views: int | None = None,
-        targets: Targets | None = None,
+        targets: Targets | Sequence[Targets] | None = None,
         split: str = "val",
         batch_size: int | None = None,
     ) -> DataLoader:
@@ -131,12 +131,15 @@ class PhotographsDataModule(LightningDataModule):
 
         Args:
             views: number of inputs (None: the view protocol's).
-            targets: a protocol or its mapping (None: this module's).
+            targets: a protocol or its mapping, or several, whose targets a sample has one after another
+                (None: this module's).
             split: ``train`` or ``val``.
             batch_size: samples of a batch (None: this module's).
         """
-        protocol = self.targets if targets is None else from_config(TargetProtocol, "targets", targets)
-        specs = self._evaluation_samples(self.subjects(split), protocol, views)
+        targets = self.targets if targets is None else targets
+        several = targets if isinstance(targets, Sequence) and not isinstance(targets, str) else (targets,)
+        protocols = [from_config(TargetProtocol, "targets", protocol) for protocol in several]
+        specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.builder(split), specs, batch_size or self.options.batch_size)
         return self._loader(batches)
 
@@ -150,17 +153,17 @@ class PhotographsDataModule(LightningDataModule):
             split, views: whose inputs.
             targets: a protocol or its mapping; None: the batch has no targets.
         """
-        protocol = None if targets is None else from_config(TargetProtocol, "targets", targets)
+        protocols = [] if targets is None else [from_config(TargetProtocol, "targets", targets)]
         available = {subject: self.subjects(split)[subject]}
-        return self.builder(split).batch(self._evaluation_samples(available, protocol, views))
+        return self.builder(split).batch(self._evaluation_samples(available, protocols, views))
 
     def _evaluation_samples(
-        self, subjects: Mapping[str, tuple[int, ...]], targets: TargetProtocol | None, views: int | None
+        self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
     ) -> list[SampleSpec]:
         return evaluation_samples(
             subjects,
             self.views.evaluation_count if views is None else views,
-            None if targets is None else self._possible(targets),
+            [self._possible(protocol) for protocol in protocols],
             self.dataset.ring,
             self.seed,
             self.options.evaluation_positions,

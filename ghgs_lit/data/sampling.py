@@ -32,11 +32,12 @@ def subject_rng(seed: int, name: str) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class SampleSpec:
-    """Which photographs of a subject make one sample."""
+    """Which photographs of a subject make one sample; ``protocols`` has the protocol of each target."""
 
     subject: str
     inputs: tuple[Photo, ...]
     targets: tuple[Photo, ...]
+    protocols: tuple[str, ...]
 
 
 def photo_name(photo: Photo) -> str:
@@ -230,15 +231,14 @@ class TrainingSampler:
         rng = np.random.default_rng([self.seed, _SAMPLE, step, index])
         available = self.subjects[name]
         inputs = self.views.draw(available, count, self.ring, rng)
-        return SampleSpec(
-            name, ring_photos(inputs), self.targets.draw(available, inputs, self.targets.per_step, rng)
-        )
+        targets = self.targets.draw(available, inputs, self.targets.per_step, rng)
+        return SampleSpec(name, ring_photos(inputs), targets, (self.targets.name,) * len(targets))
 
 
 def evaluation_samples(
     subjects: Mapping[str, tuple[int, ...]],
     count: int,
-    targets: TargetProtocol | None,
+    protocols: Sequence[TargetProtocol],
     ring: int,
     seed: int,
     positions: Mapping[int, Sequence[int]] | None = None,
@@ -248,7 +248,7 @@ def evaluation_samples(
     Args:
         subjects: available positions by name.
         count: number of inputs.
-        targets: the target protocol; None: samples without targets.
+        protocols: whose targets a sample has, one after another; none: samples without targets.
         ring: number of positions on a full ring.
         seed: of random targets.
         positions: input positions by number of inputs; evenly spaced where they are not listed.
@@ -267,7 +267,11 @@ def evaluation_samples(
                 f"evaluation with {count} views: expected ring positions {inputs} of subject {name}; "
                 f"found no position {lacking[0]}"
             )
-        rng = subject_rng(seed, name)
-        chosen = () if targets is None else targets.evaluation(available, inputs, ring, rng)
-        specs.append(SampleSpec(name, ring_photos(inputs), chosen))
+        chosen = [
+            (photo, protocol.name)
+            for protocol in protocols
+            for photo in protocol.evaluation(available, inputs, ring, subject_rng(seed, name))
+        ]
+        targets, names = (tuple(pair[part] for pair in chosen) for part in range(2))
+        specs.append(SampleSpec(name, ring_photos(inputs), targets, names))
     return specs

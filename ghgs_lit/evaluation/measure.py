@@ -1,5 +1,6 @@
 """Measures a method (a model or a baseline) on the targets of an evaluation protocol."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -62,20 +63,33 @@ def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None
     return depth_error_mm(estimate.depth[element], batch.depths[element], valid).item()
 
 
-def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[list[Row]]:
-    """The metrics of each element's targets [B][T], without what the rows describe."""
-    b, t = batch.targets.images.shape[:2]
-    flat = metrics(
-        estimate.image.flatten(0, 1), batch.targets.images.flatten(0, 1), batch.targets.masks.flatten(0, 1)
-    )
+def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
+    """The metrics of each element's targets, with what each row is about."""
+    targets, (b, t) = batch.targets, batch.targets.images.shape[:2]
+    flat = metrics(estimate.image.flatten(0, 1), targets.images.flatten(0, 1), targets.masks.flatten(0, 1))
     values = {name: value.reshape(b, t).tolist() for name, value in flat.items()}
     rows = []
     for element in range(b):
+        about = {"subject": batch.subjects[element], "views": batch.images.shape[1]}
+        about["inputs"] = list(batch.views[element]) if batch.views else []
         shared = {"depth_error_mm": _depth_error(batch, estimate, element)}
         if estimate.gaussians is not None:
             shared["gaussians"] = estimate.gaussians[element]
-        rows.append([{**{name: v[element][k] for name, v in values.items()}, **shared} for k in range(t)])
+        names = targets.names[element] if targets.names else [str(k) for k in range(t)]
+        for k in range(t):
+            about |= {"targets": targets.protocols[k], "target": names[k]}
+            rows.append({**about, **{name: value[element][k] for name, value in values.items()}, **shared})
     return rows
+
+
+def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
+    """A picture of one subject for each protocol."""
+    for protocol in dict.fromkeys(batch.targets.protocols):
+        chosen = [p == protocol for p in batch.targets.protocols]
+        part = dataclasses.replace(batch, targets=batch.targets.of_protocol(protocol))
+        picture = sheet(part, estimate.image[:, chosen], element, estimate.depth, estimate.depth_valid)
+        views, subject = batch.images.shape[1], batch.subjects[element]
+        save_png(picture, pictures / f"{name}_v{views}_{protocol}_{subject}.png")
 
 
 @torch.no_grad()
@@ -83,26 +97,24 @@ def measure(
     method: Method,
     name: str,
     loader: Iterable[Batch],
-    targets: str,
     metrics: ImageMetrics,
     device: torch.device | str = "cpu",
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Measure one method on one protocol.
+    """Measure one method; the targets of all protocols come from one prediction.
 
     Args:
         method: what is measured.
         name: its name in the rows.
-        loader: batches with targets.
-        targets: name of the target protocol in the rows.
+        loader: batches with targets and their protocols.
         metrics: what is computed of the renders.
         device: where the method runs.
         pictures: folder for pictures (None: none are written).
         picture_count: the number of subjects, the first ones, that are drawn.
 
     Returns:
-        One row for each subject and target. ``seconds`` is the time of the prediction and the renders of a
+        One row for each subject and target. ``seconds`` is the time of the prediction and all renders of a
         subject, in a batch as the loader gives it.
 
     Raises:
@@ -112,29 +124,17 @@ def measure(
     for batch in loader:
         batch = batch.to(device)
         if batch.targets is None:
-            raise InputError(f"evaluation.targets={targets}: expected target photographs; found none")
+            raise InputError("targets: expected target photographs; found none")
         started = time.perf_counter()
         estimate = method(batch)
         if estimate.image.is_cuda:
             torch.cuda.synchronize()
         seconds = (time.perf_counter() - started) / len(batch.images)
-        views = batch.images.shape[1]
-        for element, numbers in enumerate(_rows(batch, estimate, metrics)):
-            subject = batch.subjects[element]
-            if pictures is not None and picture_count > 0:
-                picture_count -= 1
-                picture = sheet(batch, estimate.image, element, estimate.depth, estimate.depth_valid)
-                save_png(picture, pictures / f"{name}_v{views}_{targets}_{subject}.png")
-            for k, own in enumerate(numbers):
-                about = {
-                    "method": name,
-                    "subject": subject,
-                    "views": views,
-                    "targets": targets,
-                    "target": batch.targets.names[element][k] if batch.targets.names else str(k),
-                    "inputs": list(batch.views[element]) if batch.views else [],
-                }
-                rows.append({**about, **own, "seconds": seconds})
+        if pictures is not None:
+            for element in range(min(picture_count, len(batch.images))):
+                _draw(batch, estimate, element, pictures, name)
+            picture_count = max(picture_count - len(batch.images), 0)
+        rows += [{"method": name, **row, "seconds": seconds} for row in _rows(batch, estimate, metrics)]
     return rows
 
 
@@ -157,16 +157,17 @@ def measure_all(
         views: numbers of input views.
         targets: target protocols by name.
         split: subjects of ``train`` or ``val``.
-        metrics, device, pictures, picture_count: as for :func:`measure`; pictures of each protocol.
+        metrics, device, pictures, picture_count: as for :func:`measure`.
 
     Returns:
         The rows of every number of views, protocol and method, in this order.
     """
     rows: list[Row] = []
     for count in views:
-        for kind, protocol in targets.items():
-            loader = data.evaluation_loader(views=count, targets=protocol, split=split)
-            for name, method in methods.items():
-                batches = track(loader, f"measuring {name}, {count} views, targets {kind}")
-                rows += measure(method, name, batches, kind, metrics, device, pictures, picture_count)
+        loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)
+        found: list[Row] = []
+        for name, method in methods.items():
+            batches = track(loader, f"measuring {name}, {count} views")
+            found += measure(method, name, batches, metrics, device, pictures, picture_count)
+        rows += [row for kind in targets for row in found if row["targets"] == kind]
     return rows

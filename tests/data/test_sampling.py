@@ -91,7 +91,7 @@ def test_middle_wraps_around_the_ring():
 def test_release_beside_every_input_and_listed_positions():
     """per_subject=all measures beside every input; listed inputs replace the even ones."""
     targets = TargetProtocol("release", per_subject="all")
-    samples = evaluation_samples({"a": FULL}, 3, targets, 16, 0, {3: [0, 6, 11]})
+    samples = evaluation_samples({"a": FULL}, 3, [targets], 16, 0, {3: [0, 6, 11]})
     assert samples[0].inputs == ((0, 0), (6, 0), (11, 0))
     assert samples[0].targets == ((0, 3), (6, 3), (11, 3))
 
@@ -100,8 +100,8 @@ def test_random_targets_of_evaluation_are_fixed_and_differ_between_subjects():
     """Evaluation measures the same targets every time."""
     targets = TargetProtocol("random", per_subject=3)
     subjects = {f"s{i}": FULL for i in range(6)}
-    first = evaluation_samples(subjects, 4, targets, 16, 0)
-    assert first == evaluation_samples(subjects, 4, targets, 16, 0)
+    first = evaluation_samples(subjects, 4, [targets], 16, 0)
+    assert first == evaluation_samples(subjects, 4, [targets], 16, 0)
     assert len({d.targets for d in first}) == 6
     for sample in first:
         assert len(set(sample.targets)) == 3

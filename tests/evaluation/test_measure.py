@@ -13,12 +13,14 @@ from PIL import Image
 from ghgs_lit.config import conf_dir
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure
+from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.export.ply import read_ply
 from ghgs_lit.metrics import ImageMetrics, psnr
 from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash
+from ghgs_lit.synthesis.datamodules import ScansDataModule
 from tests.helpers.training import Standin, example_batch, flat_renderer
 from tests.helpers.verbs import ghgs
 
@@ -28,7 +30,7 @@ OFF = ImageMetrics(lpips="off")
 def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
     """Every number is found under its subject, target and inputs, with the value of the metric."""
     batch = example_batch(subjects=2, views=3, targets=2)
-    rows = measure(ModelMethod(Standin(), flat_renderer), "model", [batch], "midway", OFF, "cpu", tmp_path, 1)
+    rows = measure(ModelMethod(Standin(), flat_renderer), "model", [batch], OFF, "cpu", tmp_path, 1)
     assert [(r["subject"], r["target"]) for r in rows] == [
         ("p0", "000/3"), ("p0", "001/3"), ("p1", "000/3"), ("p1", "001/3"),
     ]  # fmt: skip
@@ -46,7 +48,7 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
 def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
     """A perfect render has the capped PSNR, and a method without depth has no depth error."""
     batch = example_batch()
-    rows = measure(lambda b: Estimate(b.targets.images), "perfect", [batch], "release", OFF)
+    rows = measure(lambda b: Estimate(b.targets.images), "perfect", [batch], OFF)
     assert rows[0]["psnr"] == pytest.approx(100)
     assert rows[0]["flip"] == 0
     assert rows[0]["depth_error_mm"] is None
@@ -191,6 +193,44 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
     assert list(protocols) == content["provenance"]["protocol"]["targets"] == ["ghg", "mine", "release"]
     assert (protocols["mine"]["kind"], protocols["mine"]["positions"]) == ("cameras", [1, 4])
     assert protocols["release"]["per_subject"] == 2
+
+
+def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes, tmp_path):
+    """A subject is predicted once for each number of views; rows and pictures are those of each protocol."""
+    data = ScansDataModule(
+        {"name": "v3", "training_counts": [3], "evaluation_count": 3},
+        {"name": "release"},
+        root=str(boxes),
+        size=42,
+    )
+    protocols = {name: {"name": name} for name in ("midway", "release")}
+    protocols["midway"]["per_subject"] = 2
+    predictions = []
+
+    class Counting(Standin):
+        def forward(self, batch):
+            predictions.append(batch.subjects)
+            return super().forward(batch)
+
+    method = {"model": ModelMethod(Counting(), Renderer("cpu"))}
+
+    def rows_of(names, pictures=None):
+        chosen = {name: protocols[name] for name in names}
+        rows = measure_all(method, data, [3], chosen, "val", OFF, "cpu", pictures, 1)
+        return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
+
+    together = rows_of(protocols, tmp_path)
+    assert predictions == [("s3",), ("s4",)]
+    assert [row["targets"] for row in together] == ["midway"] * 4 + ["release"] * 2
+    for row, alone in zip(together, rows_of(["midway"]) + rows_of(["release"]), strict=True):
+        numbers = [name for name in row if isinstance(row[name], float)]
+        assert [row.pop(name) for name in numbers] == pytest.approx([alone.pop(n) for n in numbers], rel=1e-5)
+        assert row == alone
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "model_v3_midway_s3.png", "model_v3_release_s3.png",
+    ]  # fmt: skip
+    heights = [Image.open(tmp_path / f"model_v3_{name}_s3.png").height for name in protocols]
+    assert heights[0] > heights[1]
 
 
 def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp_path):

@@ -49,6 +49,7 @@ def example_batch(
             masks=masks[:, :1].expand(-1, targets, -1, -1),
             cameras=batched(ring(targets, size, start=0.2), subjects),
             names=tuple(tuple(f"00{k}/3" for k in range(targets)) for _ in range(subjects)),
+            protocols=("midway",) * targets,
         ),
         body_vertices=[torch.rand(20, 3, generator=g) * 0.2 for _ in range(subjects)],
         depths=torch.full((subjects, views, size, size), 2.1) * masks,
