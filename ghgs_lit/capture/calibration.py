@@ -1,0 +1,174 @@
+"""Calibrations as files store them, and what they mean in the conventions of :mod:`ghgs_lit.types`.
+
+A file says less than one needs: whether its poses map the world to the camera, and with which axes, is known
+from its format, or it must be said. A :class:`Convention` is such a meaning; the camera doctor tries others.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics
+from ghgs_lit.errors import InputError, choice, require
+
+EXTRINSICS = ("world_to_camera", "camera_to_world")
+AXES = ("opencv", "opengl")
+INTRINSICS = ("pixels", "normalized", "normalized_principal")
+PIXEL_CENTERS = ("half", "integer")
+
+#: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# Sides of a photograph and of its calibration have one ratio up to the rounding of a resize, in pixels.
+_ROUNDING = 1.5
+
+
+@dataclass(frozen=True)
+class Convention:
+    """What the numbers of a calibration mean.
+
+    Attributes:
+        extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
+        axes: of the camera: ``opencv`` (y down, z forward) | ``opengl`` (y up, z backward).
+        intrinsics: ``pixels``, or shares of the width and of the height: ``normalized`` (all of them) |
+            ``normalized_principal`` (the principal point alone).
+        pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0 (``integer``, as OpenCV's).
+        size: (height, width) in pixels of the images that were calibrated; None: what the file says, and that
+            of the photographs where it says nothing.
+        unit: metres of one unit of length.
+    """
+
+    extrinsics: str = "world_to_camera"
+    axes: str = "opencv"
+    intrinsics: str = "pixels"
+    pixel_centers: str = "half"
+    size: tuple[int, int] | None = None
+    unit: float = 1.0
+
+    def __post_init__(self) -> None:
+        choice("calibration.extrinsics", self.extrinsics, EXTRINSICS)
+        choice("calibration.axes", self.axes, AXES)
+        choice("calibration.intrinsics", self.intrinsics, INTRINSICS)
+        choice("calibration.pixel_centers", self.pixel_centers, PIXEL_CENTERS)
+        require(self.unit > 0, "calibration.unit", "above 0", self.unit)
+
+
+@dataclass(frozen=True)
+class StoredCamera:
+    """One camera as a file stores it.
+
+    Attributes:
+        name: by which photographs are found.
+        place: file and key, for messages.
+        intrinsics: [3, 3] float64.
+        pose: [4, 4] float64, a rotation and a translation.
+        size: (height, width) in pixels of the images that were calibrated, where the file says it.
+        distortion: of OpenCV's model, 0 to 14 numbers: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
+            ``fisheye`` k1 to k4 of Kannala and Brandt's.
+        fisheye: which of these models.
+        mask: the photograph's mask, where the file names it.
+    """
+
+    name: str
+    place: str
+    intrinsics: np.ndarray
+    pose: np.ndarray
+    size: tuple[int, int] | None = None
+    distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    fisheye: bool = False
+    mask: Path | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "intrinsics", check_intrinsics(f"{self.place}: intrinsics", self.intrinsics))
+        object.__setattr__(self, "pose", check_extrinsics(f"{self.place}: rotation", self.pose))
+        counts = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
+        expected = f"{', '.join(map(str, counts))} distortion coefficients"
+        require(len(self.distortion) in counts, self.place, expected, len(self.distortion))
+        require(bool(np.isfinite(self.distortion).all()), self.place, "finite distortion", "NaN or infinity")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One camera for photographs of one size, in the conventions of :mod:`ghgs_lit.types`.
+
+    Attributes:
+        intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
+        extrinsics: [4, 4] float64, world to camera, OpenCV axes.
+        distortion, fisheye: as for :class:`StoredCamera`.
+    """
+
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+    distortion: np.ndarray
+    fisheye: bool
+
+
+def calibrated_size(
+    camera: StoredCamera, convention: Convention, photograph: tuple[int, int]
+) -> tuple[int, int]:
+    """The (height, width) that the intrinsics are for: as said, as stored, or that of the photograph."""
+    return convention.size or camera.size or photograph
+
+
+def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
+    """What a stored camera means for a photograph.
+
+    Args:
+        camera: as stored.
+        convention: what its numbers mean.
+        photograph: (height, width) in pixels; intrinsics of another size with the same ratio of the sides are
+            scaled.
+
+    Raises:
+        InputError: the ratio of the sides differs.
+    """
+    size = calibrated_size(camera, convention, photograph)
+    intrinsics = camera.intrinsics.copy()
+    height, width = size
+    if convention.intrinsics != "pixels":
+        columns = slice(None) if convention.intrinsics == "normalized" else slice(2, None)
+        intrinsics[:2, columns] *= np.array([[width], [height]])
+    if convention.pixel_centers == "integer":
+        intrinsics[:2, 2] += 0.5
+    if size != photograph:
+        if not same_ratio(size, photograph):
+            raise InputError(
+                f"{camera.place}: expected a photograph of {height}x{width} (height x width) or scaled "
+                f"from it, as it was calibrated; found {photograph[0]}x{photograph[1]}"
+            )
+        intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
+    extrinsics = extrinsics_of(camera.pose, convention)
+    return Calibration(intrinsics, extrinsics, camera.distortion, camera.fisheye)
+
+
+def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
+    """World to camera [4, 4] with OpenCV axes, of a stored pose."""
+    if convention.extrinsics == "camera_to_world":
+        pose = np.linalg.inv(pose)
+    extrinsics = _FLIP @ pose if convention.axes == "opengl" else pose.copy()
+    extrinsics[:3, 3] *= convention.unit
+    return extrinsics
+
+
+def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size (height, width) is the other one scaled, up to rounding to whole pixels."""
+    return abs(one[0] * other[1] / one[1] - other[0]) <= _ROUNDING
+
+
+def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
+    """The camera of an image that was turned, as ``numpy.rot90`` turns it.
+
+    Args:
+        calibration: of the image before; without distortion, which turns not.
+        turns: quarter turns counterclockwise.
+        size: (height, width) of the image before.
+    """
+    for _ in range(turns % 4):
+        k = calibration.intrinsics
+        # New x is the old y, new y is the width less the old x.
+        height, width = size
+        turned = np.array([[k[1, 1], 0, k[1, 2]], [0, k[0, 0], width - k[0, 2]], [0, 0, 1.0]])
+        rotation = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        calibration = replace(calibration, intrinsics=turned, extrinsics=rotation @ calibration.extrinsics)
+        size = (width, height)
+    return calibration
