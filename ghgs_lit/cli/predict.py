@@ -1,6 +1,7 @@
-"""``ghgs predict``: one subject's photographs to a splat (PLY) and pictures from all around."""
+"""``ghgs predict``: one subject's photographs to a splat, and to what else ``formats`` lists."""
 
 import dataclasses
+import time
 from typing import Any
 
 import torch
@@ -17,12 +18,10 @@ from ghgs_lit.cli.inputs import (
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.errors import InputError, require
-from ghgs_lit.export.ply import write_ply
+from ghgs_lit.errors import InputError
+from ghgs_lit.export import output_options, write_prediction
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch
-from ghgs_lit.visualization.pictures import save_png, sheet, to_uint8
-from ghgs_lit.visualization.turntable import turntable
 
 
 def subject_batch(
@@ -51,12 +50,11 @@ def subject_batch(
 
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the splat last."""
+    """The verb; prints the files, and their directory last."""
     directory = output_dir()
     config = resolve(with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
     write_config(config, directory)
-    frames = config["turntable"]["frames"]
-    require(isinstance(frames, int) and frames >= 0, "turntable.frames", "a number of at least 0", frames)
+    options = output_options(config)
     device = pick_device(config["device"])
     renderer = build_renderer(config, device)
     model = GHGS.from_config(config, empty=STAGES)
@@ -67,15 +65,11 @@ def run(cfg: DictConfig) -> None:
     check_size(data, model)
     data.prepare_data()
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    name, targets = batch.subjects[0], batch.targets
+    begin = time.perf_counter()
     prediction = model(dataclasses.replace(batch, targets=None))
-    image = None if targets is None else renderer(prediction.gaussians, targets.cameras).image
-    save_png(sheet(batch, image, 0, prediction.depth, prediction.depth_valid), directory / f"{name}.png")
-    orbit = turntable(batch.cameras[0], frames)
-    for frame in range(frames):
-        camera = orbit[frame : frame + 1][None]
-        picture = to_uint8(renderer(prediction.gaussians, camera).image[0, 0])
-        save_png(picture, directory / "turntable" / f"{frame:03d}.png")
-    path = directory / f"{name}.ply"
-    write_ply(prediction.gaussians, path)
-    announce(path)
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    facts = {"checkpoint": config["checkpoint"], "seconds": {"predict": time.perf_counter() - begin}}
+    for path in write_prediction(directory, batch, prediction, renderer, options, facts):
+        print(path, flush=True)
+    announce(directory)

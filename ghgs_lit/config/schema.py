@@ -125,6 +125,7 @@ KINDS: dict[str, Kind] = {
     "device": TEXT,
     "dry_run": FLAG,
     "dtype": one_of("float32", "bfloat16", "float16"),
+    "formats": TEXT | TEXTS,
     "illustration": FLAG,
     "init_from": PATH,
     "init_strict": FLAG,
@@ -168,7 +169,9 @@ KINDS: dict[str, Kind] = {
     "test.kind": TEXT,
     "test.unit": TEXT | NULL,
     "token_budgets": list_of(one_of("all", "window") | integer(least=0)) | NULL,
+    "turntable.fps": COUNT,
     "turntable.frames": integer(least=0),
+    "up": TEXT | NULL,
     "vggt": PATH,
     # data
     "data": NULL,

@@ -20,17 +20,36 @@ def look_at_point(cameras: Cameras) -> Tensor:
     return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]
 
 
+def up_direction(cameras: Cameras) -> Tensor:
+    """The world's unit vector [3] that is up in the photographs of ``cameras`` [V], float64.
+
+    Cameras that are held upright may look up or down, but the rows of their images are level: up is at right
+    angles to all of them, and nearest to the mean upward column. An axis of the world within 3 degrees is
+    taken as it is, so that small tilts of the cameras do not tilt a world that is upright.
+    """
+    rows, columns = cameras.extrinsics[:, 0, :3].double(), cameras.extrinsics[:, 1, :3].double()
+    mean = -columns.mean(0)
+    # Least squares; the small weight of the mean decides where all rows of images are parallel.
+    weight = 1e-3 * len(rows)
+    level = rows.mT @ rows + weight * torch.eye(3, dtype=rows.dtype, device=rows.device)
+    up = torch.nn.functional.normalize(torch.linalg.solve(level, weight * mean), dim=0)
+    axis = int(up.abs().argmax())
+    if up[axis].abs() > math.cos(math.radians(3)):
+        up = torch.zeros_like(up).index_fill(0, torch.tensor(axis, device=up.device), float(up[axis].sign()))
+    return up
+
+
 def turntable(cameras: Cameras, frames: int) -> Cameras:
     """Cameras on one turn around the subject, at the mean distance and height of the given ones.
 
-    They begin at the side of the first camera and have its intrinsics; up is the mean of all cameras.
+    They begin at the side of the first camera and have its intrinsics.
 
     Args:
         cameras: the given cameras [V].
         frames: the number of cameras.
     """
     center = look_at_point(cameras)
-    up = torch.nn.functional.normalize(-cameras.extrinsics[:, 1, :3].double().mean(0), dim=0)
+    up = up_direction(cameras)
     offsets = cameras.centers.double() - center
     heights = offsets @ up
     flat = offsets - heights[:, None] * up

@@ -243,7 +243,7 @@ def test_predict_writes_a_splat_that_renders_and_a_turntable(trained, boxes, tmp
         f"hydra.run.dir={tmp_path / 'r'}",
     ]
     assert ghgs("predict", *arguments, "subject=1") == 0
-    assert len(read_ply(tmp_path / "r" / "s4.ply")) > 50
+    assert len(read_ply(tmp_path / "r" / "gaussians.ply")) > 50
     assert len(list((tmp_path / "r" / "turntable").glob("*.png"))) == 3
     assert np.asarray(Image.open(tmp_path / "r" / "turntable" / "000.png")).max() > 50
     assert ghgs("predict", *arguments, "subject=nobody") == 1
@@ -264,7 +264,7 @@ def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeyp
     assert ghgs("predict", *arguments) == 0
     inputs = [("s4", position, 0) for position in (0, 4, 8, 12)]
     assert read == inputs
-    assert (tmp_path / "r" / "s4.png").exists()
+    assert (tmp_path / "r" / "sheet.png").exists()
     read.clear()
     assert ghgs("predict", *arguments, "targets=release") == 0
     assert read == [*inputs, ("s4", 0, 3)]

@@ -1,0 +1,126 @@
+"""What is written of one subject: its prediction, photographs and cameras, in the frame of the files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.errors import choice, require
+from ghgs_lit.export.world import AXES, rotate_world, turn
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
+from ghgs_lit.visualization.turntable import up_direction
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """What is written, and how.
+
+    Args:
+        formats: names of :data:`ghgs_lit.export.prediction.WRITERS`.
+        up: the axis (``y`` or ``z``) that points up in all files; None: the world of the cameras.
+        frames: pictures of the turntable.
+        fps: of these, per second of the video.
+    """
+
+    formats: tuple[str, ...] = ("ply",)
+    up: str | None = None
+    frames: int = 24
+    fps: int = 12
+
+    def __post_init__(self):
+        choice("up", self.up, (None, *AXES))
+        require(self.frames >= 0, "turntable.frames", "a number of at least 0", self.frames)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
+
+    ``points`` are the unprojected pixels of the subject with their ``colors``; ``dropped`` counts Gaussians
+    that are not finite, which no renderer draws and no file holds.
+    """
+
+    name: str
+    views: tuple[str, ...]
+    gaussians: Gaussians
+    dropped: int
+    cameras: Cameras
+    images: Float[Tensor, "V 3 H W"]
+    masks: Bool[Tensor, "V H W"]
+    depth: Float[Tensor, "V H W"]
+    depth_valid: Bool[Tensor, "V H W"]
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    up: Float[Tensor, "3"]
+    renderer: Renderer
+    options: OutputOptions
+
+
+def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions) -> Scene:
+    """The scene of a batch of one subject.
+
+    Raises:
+        InputError: several subjects.
+    """
+    count = len(batch.images)
+    require(count == 1, "write_prediction", "a batch of one subject", count)
+    cameras, gaussians = batch.cameras[0], prediction.gaussians.detach()
+    finite = torch.stack(
+        [getattr(gaussians, f).flatten(1).isfinite().all(1) for f in ("means", "quaternions", "scales")]
+        + [gaussians.colors.isfinite().all(1), gaussians.opacities.isfinite()]
+    ).all(0)
+    kept = int(finite.sum())
+    dropped = len(gaussians) - kept
+    gaussians = gaussians.select(finite, (kept,)) if dropped else gaussians
+    up = up_direction(cameras)
+    if options.up is not None:
+        end = up.new_tensor(AXES[options.up])
+        gaussians, cameras = rotate_world(turn(up, end), gaussians, cameras)
+        up = end
+    depth, valid = prediction.depth[0].detach(), prediction.depth_valid[0] & batch.masks[0]
+    valid = valid & depth.isfinite() & (depth > 0)
+    return Scene(
+        name=batch.subjects[0] if batch.subjects else "subject",
+        views=batch.views[0] if batch.views else tuple(map(str, range(batch.images.shape[1]))),
+        gaussians=gaussians,
+        dropped=dropped,
+        cameras=cameras,
+        images=batch.images[0],
+        masks=batch.masks[0],
+        depth=depth,
+        depth_valid=valid,
+        points=unproject_maps(depth, cameras)[valid],
+        colors=batch.images[0].movedim(1, -1)[valid],
+        up=up,
+        renderer=renderer,
+        options=options,
+    )
+
+
+def file_name(view: str) -> str:
+    """The name of a photograph as a part of a file's name."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+
+
+def options_of(config: Mapping[str, Any], known: tuple[str, ...]) -> OutputOptions:
+    """The options of a verb's configuration: ``formats``, ``up`` and ``turntable``.
+
+    Args:
+        config: plain data.
+        known: the formats that there are; ``all`` stands for them.
+
+    Raises:
+        InputError: an unknown format or a value out of range.
+    """
+    formats = config["formats"]
+    formats = [formats] if isinstance(formats, str) else formats
+    formats = known if "all" in formats else tuple(dict.fromkeys(formats))
+    for name in formats:
+        choice("formats", name, ("all", *known))
+    table = config["turntable"]
+    return OutputOptions(formats, config["up"], table["frames"], table["fps"])

@@ -1,0 +1,151 @@
+"""What is written of a prediction, read by other programs' readers."""
+
+import dataclasses
+import json
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.export import OutputOptions, output_options, write_prediction
+from ghgs_lit.export.maps import depth_unit
+from ghgs_lit.export.ply import read_ply
+from ghgs_lit.export.world import rotate_world, turn
+from ghgs_lit.geometry.projection import project
+from ghgs_lit.rendering import Renderer, render
+from ghgs_lit.types import Cameras
+from ghgs_lit.visualization.turntable import up_direction
+from tests.helpers.splats import camera_ring, cloud
+from tests.helpers.training import Standin, example_batch
+
+CONFIG = {"formats": ["ply"], "up": None, "turntable": {"frames": 2, "fps": 12}}
+
+
+@pytest.fixture
+def subject():
+    """A batch of one subject, with a prediction of it."""
+    batch = example_batch(subjects=1)
+    return batch, Standin()(dataclasses.replace(batch, targets=None))
+
+
+def test_everything_is_written_and_reported(subject, tmp_path):
+    """The report names each file with its size; other programs read depths, points and photographs."""
+    batch, prediction = subject
+    options = OutputOptions(("ply", "turntable", "depth", "points", "inputs"), frames=2)
+    paths = write_prediction(tmp_path, batch, prediction, Renderer(), options, {"seconds": {"predict": 1}})
+    report = json.loads((tmp_path / "report.json").read_text())
+    written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
+    assert {str(p.relative_to(tmp_path)) for p in paths} == written == {*report["files"], "report.json"}
+    assert report["gaussians"] == len(prediction.gaussians)
+    assert report["seconds"] == {"predict": 1}
+    valid = batch.masks[0].numpy()
+    depth = prediction.depth[0].detach().numpy()
+    unit = report["depth_png_unit"]
+    picture = iio.imread(tmp_path / "depth" / "001_0.png")
+    assert picture.dtype == np.uint16
+    assert np.abs(picture * unit - np.where(valid[1], depth[1], 0)).max() <= unit / 2 * 1.001
+    exact = np.load(tmp_path / "depth.npz")
+    assert np.array_equal(exact["depth"][valid], depth[valid])
+    assert np.isnan(exact["depth"][~valid]).all()
+    points = trimesh.load(tmp_path / "points.ply")
+    assert np.allclose(points.vertices, prediction.points.pixels[0].detach()[valid], atol=1e-6)
+    colors = batch.images[0].movedim(1, -1).numpy()[valid]
+    assert np.abs(points.colors[:, :3] / 255 - colors).max() <= 0.5 / 255 * 1.001
+    photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
+    assert np.array_equal(photograph[..., 3] > 0, valid[0])
+    cameras = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
+    assert np.allclose(cameras["001_0.png"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)
+
+
+def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
+    """With up=z the cameras' up is +z; Gaussians, points and cameras fit one another as before."""
+    batch, prediction = subject
+    options = OutputOptions(("ply", "points", "inputs"), up="z")
+    write_prediction(tmp_path, batch, prediction, Renderer(), options)
+    gaussians, own = read_ply(tmp_path / "gaussians.ply"), batch.cameras[0]
+    written = json.loads((tmp_path / "cameras.json").read_text())["cameras"].values()
+    extrinsics = torch.tensor([camera["extrinsics"] for camera in written])
+    cameras = Cameras(own.intrinsics, extrinsics, own.height, own.width)
+    assert torch.allclose(up_direction(cameras), torch.tensor([0, 0, 1.0]).double(), atol=1e-5)
+    assert -extrinsics[:, 1, 2].mean() > 0.9  # the images' rows run downwards
+    before = render(prediction.gaussians, batch.cameras, backend="reference").image
+    after = render(gaussians, cameras[None], backend="reference").image
+    assert torch.allclose(before, after, atol=1e-4)
+    points = torch.tensor(np.asarray(trimesh.load(tmp_path / "points.ply").vertices)).float()
+    count = int(batch.masks[0, 0].sum())
+    pixels, _ = project(points[:count], cameras.intrinsics[0], cameras.extrinsics[0])
+    assert torch.allclose(pixels.round(decimals=2) % 1, torch.tensor(0.5), atol=0.02)
+
+
+@pytest.mark.parametrize("end", ["y", "z"])
+@pytest.mark.parametrize(
+    "up", [(0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, -1), (1, 0, 0), (0.6, -0.64, 0.48), (0, -1, 1e-9)]
+)
+def test_a_world_is_turned_as_scipy_turns_it(up, end):
+    """Opposite directions, too; pictures stay as they were."""
+    up = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    axis = torch.tensor({"y": [0.0, 1, 0], "z": [0.0, 0, 1]}[end], dtype=torch.float64)
+    quaternion = turn(up, axis)
+    rotation = Rotation.from_quat(quaternion.numpy(), scalar_first=True)
+    assert np.allclose(rotation.apply(up.numpy()), axis.numpy(), atol=1e-7)
+    gaussians, cameras = cloud(20), camera_ring(2, 16, 20)
+    turned, moved = rotate_world(quaternion, gaussians, cameras)
+    assert np.allclose(turned.means, rotation.apply(gaussians.means.numpy()), atol=1e-6)
+    images = [render(*pair, backend="reference").image for pair in ((gaussians, cameras), (turned, moved))]
+    assert torch.allclose(*images, atol=1e-4)
+
+
+@pytest.mark.parametrize(("largest", "unit"), [(2.5, 1e-3), (300.0, 1e-2), (0.3, 1e-4), (0.0, 1e-3)])
+def test_depths_of_any_scale_fit_into_16_bits(largest, unit):
+    assert depth_unit(largest) == pytest.approx(unit)
+    assert largest / depth_unit(largest) <= 65535
+
+
+def test_gaussians_that_are_not_finite_are_counted_and_left_out(subject, tmp_path):
+    """A viewer fails on a file with NaN; our renderer does not draw such Gaussians."""
+    batch, prediction = subject
+    prediction.gaussians.means.data[3, 1] = torch.nan
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions())
+    assert json.loads((tmp_path / "report.json").read_text())["gaussians_not_finite"] == 1
+    vertices = PlyData.read(tmp_path / "gaussians.ply")["vertex"]
+    assert len(vertices) == len(prediction.gaussians) - 1
+    assert np.isfinite(vertices["y"]).all()
+
+
+def test_a_subject_without_gaussians_is_written(subject, tmp_path):
+    """Empty masks give empty files and a report without numbers."""
+    batch, _ = subject
+    batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
+    options = OutputOptions(("ply", "turntable", "depth", "points", "inputs"), frames=1)
+    write_prediction(tmp_path, batch, Standin()(batch), Renderer(), options)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["gaussians"] == 0
+    assert set(report["psnr_box_of_inputs"].values()) == {None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"formats": ["obj"]}, "formats: expected one of all, ply, .*; found 'obj'"),
+        ({"up": "x"}, "up: expected one of None, y, z; found 'x'"),
+        ({"turntable": {"frames": -1, "fps": 1}}, r"turntable\.frames: expected .*; found -1"),
+    ],
+)
+def test_wrong_options_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        output_options(CONFIG | changes)
+
+
+def test_options_are_read():
+    """One name, a list with repetitions, and all."""
+    assert output_options(CONFIG | {"formats": "ply"}).formats == ("ply",)
+    assert output_options(CONFIG | {"formats": ["ply", "depth", "ply"]}).formats == ("ply", "depth")
+    assert "inputs" in output_options(CONFIG | {"formats": ["all"]}).formats
+    batch = example_batch()
+    with pytest.raises(InputError, match="a batch of one subject; found 2"):
+        write_prediction(None, batch, Standin()(batch), Renderer(), OutputOptions())
