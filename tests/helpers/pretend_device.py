@@ -1,0 +1,248 @@
+"""A pretend accelerator: its tensors say ``pretend:0``, hold CPU data and refuse to mix with CPU tensors.
+
+What runs on it runs on a GPU as far as devices go, and what a GPU would wait for is counted. It is stricter
+than CUDA in one point: an index on the CPU is refused, since CUDA copies it at every call.
+
+    with pretend_device() as log:
+        model.to(DEVICE)(batch.to(DEVICE))
+    print(log.waits)
+
+PyTorch's interface for backends in Python is experimental; all of its use is in this file.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map_only
+from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+
+import ghgs_lit
+
+_PACKAGE = str(Path(ghgs_lit.__file__).parent)
+
+#: Operators that take tensors of both devices, as on CUDA.
+_COPIES = ("aten::_to_copy", "aten::copy_", "aten::_copy_from")
+#: Operators that take no number (a tensor without dimensions) from the CPU; all others do.
+_WITHOUT_NUMBERS = ("aten::cat", "aten::stack", "aten::index_copy", "aten::scatter", "aten::gather")
+#: Operators after which CUDA's host waits for the device, since it needs a value or a size.
+_WAITING = (
+    "aten::_local_scalar_dense",
+    "aten::bincount",
+    "aten::equal",
+    "aten::masked_select",
+    "aten::nonzero",
+    "aten::unique_consecutive",
+    "aten::unique_dim",
+    "aten::_unique2",
+)
+_INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_unsafe_index")
+
+
+class Log:
+    """What the pretend device was asked for: operator calls, and waits of the host.
+
+    Args:
+        by_line: note the line of the package that each belongs to (slow).
+
+    Attributes:
+        calls: number of calls by (operator, line).
+        waits: number of waits by (reason, line); copies that do not wait are not among them.
+    """
+
+    def __init__(self, by_line: bool = False):
+        self.by_line = by_line
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin again with nothing."""
+        self.calls: Counter[tuple[str, str]] = Counter()
+        self.waits: Counter[tuple[str, str]] = Counter()
+
+    def add(self, name: str, reason: str | None) -> None:
+        """Note a call and, with a ``reason``, a wait."""
+        line = _line() if self.by_line else ""
+        self.calls[name, line] += 1
+        if reason is not None:
+            self.waits[reason, line] += 1
+
+
+def _line() -> str:
+    """The innermost line of the package that is running, ``backward`` where autograd runs by itself."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        file = frame.f_code.co_filename
+        if file.startswith(_PACKAGE):
+            return f"{file.removeprefix(_PACKAGE).lstrip('/')}:{frame.f_lineno}"
+        frame = frame.f_back
+    return "backward"
+
+
+_logs: list[Log] = []
+
+
+class _Backend(_DummyBackendModule):
+    """What autocast and the autograd engine ask a backend."""
+
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.bfloat16, torch.float16]
+
+    def is_autocast_enabled(self) -> bool:
+        return False
+
+
+_setup_privateuseone_for_python_backend("pretend", _Backend())
+CPU, DEVICE = torch.device("cpu"), torch.device("pretend", 0)
+
+
+class PretendTensor(torch.Tensor):
+    """A tensor on the pretend device; ``inner`` holds its values."""
+
+    @staticmethod
+    def __new__(cls, inner: torch.Tensor) -> "PretendTensor":
+        tensor = torch.Tensor._make_wrapper_subclass(
+            cls,
+            inner.shape,
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            device=DEVICE,
+        )
+        tensor.inner = inner
+        return tensor
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def tolist(self):
+        return self.cpu().tolist()
+
+    def numpy(self, *, force: bool = False):
+        raise TypeError(f"can't convert a tensor on {DEVICE} to numpy ({_line()}): copy it with cpu() first")
+
+    def __reduce_ex__(self, protocol):
+        """Files hold the values, as those of CUDA do for a machine without it."""
+        return self.inner.__reduce_ex__(protocol)
+
+    def __repr__(self, **_) -> str:
+        return f"pretend({self.inner!r})"
+
+    @classmethod
+    def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
+        return _call(function, args, kwargs or {})
+
+
+class _Mode(TorchDispatchMode):
+    """Sees factories, which have no tensor of the device among their arguments."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        return _call(function, args, kwargs or {})
+
+
+@contextmanager
+def pretend_device(by_line: bool = False) -> Iterator[Log]:
+    """Inside, ``device="pretend"`` works for every function of PyTorch; gives what is asked of it."""
+    log = Log(by_line)
+    _logs.append(log)
+    try:
+        with _Mode():
+            yield log
+    finally:
+        _logs.remove(log)
+
+
+def _call(function, args, kwargs):
+    """Run an operator on the values of its arguments; its result is on the device that CUDA would choose."""
+    name = function.name().split(".")[0]
+    tensors = [value for value in tree_flatten((args, kwargs))[0] if isinstance(value, torch.Tensor)]
+    is_here = any(isinstance(value, PretendTensor) for value in tensors)
+    if is_here:
+        _refuse_strangers(name, tensors)
+    to_here = is_here
+    if kwargs.get("device") is not None:
+        to_here = torch.device(kwargs["device"]).type == DEVICE.type
+        kwargs = {**kwargs, "device": CPU if to_here else kwargs["device"]}
+        if kwargs.get("pin_memory"):
+            kwargs["pin_memory"] = False
+    if is_here or to_here:
+        reason = _reason_to_wait(name, args, kwargs, to_here)
+        for log in _logs:
+            log.add(name, reason)
+    bare_args, bare_kwargs = tree_map_only(PretendTensor, lambda value: value.inner, (args, kwargs))
+    result = function(*bare_args, **bare_kwargs)
+    if function._schema.is_mutable:
+        written = _written(function, args, kwargs)
+        _require_same_size(name, written)
+        if function._schema.returns and written:
+            return written[0] if len(written) == 1 else tuple(written)
+    return tree_map_only(torch.Tensor, PretendTensor, result) if to_here else result
+
+
+def _refuse_strangers(name: str, tensors: list[torch.Tensor]) -> None:
+    strangers = [value for value in tensors if not isinstance(value, PretendTensor)]
+    if name not in _WITHOUT_NUMBERS:
+        strangers = [value for value in strangers if value.dim() > 0]
+    if strangers and name not in _COPIES:
+        shapes = [tuple(value.shape) for value in strangers]
+        raise RuntimeError(f"{name}: expected all tensors on {DEVICE}; found {shapes} on the CPU ({_line()})")
+
+
+def _reason_to_wait(name, args, kwargs, to_here: bool) -> str | None:
+    """Why CUDA's host waits for this call; None where it does not."""
+    if name in _WAITING:
+        return name.removeprefix("aten::")
+    if name in _INDEXING:
+        masks = sum(x is not None and x.dtype in (torch.bool, torch.uint8) for x in args[1])
+        return "boolean index" if masks else None
+    if name not in _COPIES:
+        return None
+    source, target = (args[1], args[0]) if name == "aten::copy_" else (args[0], None)
+    from_here = isinstance(source, PretendTensor)
+    to_here = to_here if target is None else isinstance(target, PretendTensor)
+    if from_here == to_here:
+        return None
+    if not to_here:
+        return "copy to the host"
+    waits = not (kwargs.get("non_blocking") or (len(args) > 2 and args[2] is True))
+    # A number is an argument of the kernel that fills a tensor with it.
+    return "copy to the device" if waits and source.dim() > 0 else None
+
+
+def _written(function, args, kwargs) -> list[torch.Tensor]:
+    """The arguments that an operator returns after it has changed them."""
+    arguments = function._schema.arguments
+    values = [*args, *(kwargs.get(argument.name) for argument in arguments[len(args) :])]
+    written = [
+        value
+        for argument, value in zip(arguments, values, strict=True)
+        if argument.alias_info is not None and argument.alias_info.is_write
+    ]
+    return [value for value in written if isinstance(value, torch.Tensor)]
+
+
+def _require_same_size(name: str, tensors: list[torch.Tensor]) -> None:
+    for tensor in tensors:
+        if isinstance(tensor, PretendTensor) and tensor.inner.shape != tensor.shape:
+            raise NotImplementedError(f"{name} changes the size of a tensor on {DEVICE} ({_line()})")
+
+
+def _empty_strided(size, stride, *, dtype=None, layout=None, device=None, pin_memory=None):
+    return PretendTensor(torch.empty_strided(size, stride, dtype=dtype, device=CPU))
+
+
+def _empty(size, *, dtype=None, layout=None, device=None, pin_memory=None, memory_format=None):
+    return PretendTensor(torch.empty(size, dtype=dtype, device=CPU, memory_format=memory_format))
+
+
+def _copy_from(source, target, non_blocking=False):
+    return _call(torch.ops.aten.copy_.default, (target, source), {"non_blocking": non_blocking})
+
+
+# Indexing by lists and a few others come from C++ without passing through the mode.
+_library = torch.library.Library("aten", "IMPL")
+_library.impl("empty_strided", _empty_strided, "PrivateUse1")
+_library.impl("empty.memory_format", _empty, "PrivateUse1")
+_library.impl("_copy_from", _copy_from, "PrivateUse1")

@@ -1,0 +1,242 @@
+"""The whole package on a device that refuses to mix with the CPU: what a GPU would refuse fails here."""
+
+import dataclasses
+
+import lightning.pytorch as L
+import pytest
+import torch
+from lightning.pytorch.accelerators import Accelerator
+from lightning.pytorch.strategies import SingleDeviceStrategy
+from torch.utils.data import DataLoader
+
+from ghgs_lit.cli import predict
+from ghgs_lit.config import conf_dir
+from ghgs_lit.encoder import FeatureCache
+from ghgs_lit.evaluation.baselines import BASELINES, baseline
+from ghgs_lit.evaluation.measure import ModelMethod, measure
+from ghgs_lit.losses import Losses
+from ghgs_lit.metrics import ImageMetrics
+from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.training.callbacks import StepTime
+from ghgs_lit.training.checkpoints import Checkpoints
+from ghgs_lit.training.validation_pictures import Pictures
+from ghgs_lit.types import Targets
+from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.models import close, config, make_model
+from tests.helpers.people import render_boxes
+from tests.helpers.pretend_device import DEVICE, pretend_device
+from tests.helpers.scenes import make_batch
+from tests.helpers.verbs import ghgs
+
+PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
+MODELS = ["model=paper", "model=hull", "compat=release"]
+WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
+REFERENCE = Renderer("reference")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Images this small gain nothing from threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def full_batch():
+    """Two elements with all that data can have; the first view is the target, too."""
+    batch = make_batch(2, 3, 28, 42)
+    generator = torch.Generator().manual_seed(0)
+    return dataclasses.replace(
+        batch,
+        targets=Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1], protocols=("own",)),
+        body_vertices=[torch.rand(40, 3, generator=generator) for _ in batch.images],
+        subjects=("a", "b"),
+    )
+
+
+@pytest.mark.parametrize("skip", PRESETS)
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_stage_runs_there_and_predicts_the_same(kind, skip):
+    """A tensor made on the wrong device fails at its line."""
+    model, batch = make_model(kind, f"skip={skip}").eval(), make_batch(2, 3, 28, 42)
+    with torch.no_grad():
+        expected = model(batch)
+        with pretend_device():
+            found = model.to(DEVICE)(batch.to(DEVICE))
+            assert found.gaussians.means.device == found.points.tokens.device == DEVICE
+            found = found.to("cpu")
+    # Unbounded depths amplify rounding.
+    close(found.gaussians, expected.gaussians, 1e-3 if kind == "compat=release" else 1e-5)
+    assert torch.equal(found.depth_valid, expected.depth_valid)
+
+
+class PretendAccelerator(Accelerator):
+    """What Lightning asks of an accelerator."""
+
+    def setup_device(self, device):
+        pass
+
+    def teardown(self):
+        pass
+
+    def get_device_stats(self, device):
+        return {}
+
+    @staticmethod
+    def parse_devices(devices):
+        return devices
+
+    @staticmethod
+    def get_parallel_devices(devices):
+        return [DEVICE]
+
+    @staticmethod
+    def auto_device_count():
+        return 1
+
+    @staticmethod
+    def is_available():
+        return True
+
+    @staticmethod
+    def name():
+        return "pretend"
+
+
+def train(folder, **place):
+    """Two steps and a validation with callbacks; gives the module."""
+    options = Optimization(lr=1e-3, warmup=0.0, freeze_until={"gaussian_head.opacity": 0.4})
+    module = GHGSModule(make_model("model=hull"), REFERENCE, Losses(WEIGHTS), options, config("model=hull"))
+    loader = DataLoader([full_batch()] * 2, batch_size=None, collate_fn=lambda batch: batch)
+    trainer = L.Trainer(
+        **place,
+        max_steps=2,
+        limit_val_batches=1,
+        default_root_dir=folder,
+        callbacks=[StepTime(), Pictures(1), Checkpoints(filename="last", every_n_train_steps=2)],
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
+    trainer.fit(module, loader, loader)
+    return module
+
+
+def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywhere(tmp_path):
+    """Steps with clipping, a validation, callbacks; the checkpoint goes to the CPU and back."""
+    expected = train(tmp_path / "cpu", accelerator="cpu")
+    batch = make_batch(1, 3, 28, 42)
+    path = tmp_path / "there" / "checkpoints" / "last.ckpt"
+    with pretend_device():
+        trained = train(tmp_path / "there", strategy=SingleDeviceStrategy(DEVICE, PretendAccelerator()))
+        again = GHGS.from_checkpoint(path, map_location=DEVICE)
+        with torch.no_grad():
+            found = again(batch.to(DEVICE)).to("cpu")
+        trained.to("cpu")
+    for (name, a), b in zip(trained.named_parameters(), expected.named_parameters(), strict=True):
+        torch.testing.assert_close(a, b[1], atol=1e-4, rtol=1e-3, msg=name)
+    with torch.no_grad():
+        close(GHGS.from_checkpoint(path)(batch).gaussians, found.gaussians)
+
+
+def test_everything_is_measured_there(tmp_path):
+    """The model and all baselines with all metrics and pictures: the rows are those of the CPU."""
+    metrics = ImageMetrics(regions=("image", "box", "subject"), lpips="off")
+
+    def rows(device):
+        def build():
+            return make_model("model=paper").to(device)
+
+        methods = {name: baseline(name, REFERENCE, build) for name in BASELINES}
+        methods["model"] = ModelMethod(build().eval(), REFERENCE)
+        found = []
+        for name, method in methods.items():
+            found += measure(method, name, [full_batch()], metrics.to(device), device, tmp_path, 1)
+        return found
+
+    expected = rows("cpu")
+    with pretend_device():
+        found = rows(DEVICE)
+    for a, b in zip(found, expected, strict=True):
+        numbers = [key for key, value in b.items() if isinstance(value, float) and key != "seconds"]
+        assert "psnr_subject" in numbers
+        assert [a[key] for key in numbers] == pytest.approx([b[key] for key in numbers], rel=1e-4, abs=1e-4)
+
+
+def test_the_feature_cache_serves_the_device(tmp_path):
+    """Tokens come back where the photographs are."""
+    model = make_model("model=hull", "encoder.trainable=none").eval()
+    with pretend_device(), torch.no_grad():
+        model, batch = model.to(DEVICE), make_batch(2, 3, 28, 42).to(DEVICE)
+        model.feature_cache = FeatureCache(tmp_path, tokens="all")
+        first, second = (model(batch).to("cpu") for _ in range(2))
+    assert (model.feature_cache.made, model.feature_cache.hits) == (2, 2)
+    close(first.gaussians, second.gaussians, 0)
+
+
+def test_predict_runs_there(tmp_path, monkeypatch):
+    """From photographs on disk to a splat and a turntable on disk."""
+    render_boxes(tmp_path / "data", tmp_path / "scans", train=1, val=1)
+    checkpoint = tmp_path / "a.ckpt"
+    write_checkpoint(checkpoint, make_model("model=hull").state_dict(), config("model=hull"))
+    monkeypatch.setattr(predict, "pick_device", lambda _: DEVICE)
+    with pretend_device():
+        code = ghgs(
+            "predict", f"checkpoint={checkpoint}", "data=scans", f"data.root={tmp_path / 'data'}",
+            "data.size=42", "views=v3", "turntable.frames=1", "renderer=reference",
+            f"hydra.run.dir={tmp_path / 'run'}",
+        )  # fmt: skip
+    assert code == 0
+    assert list((tmp_path / "run").glob("*.ply"))
+
+
+class Planted:
+    """A stage with a defect in front of it."""
+
+    def __init__(self, stage, defect):
+        self.stage, self.defect = stage, defect
+
+    def __call__(self, depth_maps, tokens, batch):
+        return self.stage(self.defect(depth_maps), tokens, batch)
+
+
+def _buffer_on_the_cpu(maps):
+    return dataclasses.replace(maps, depth=maps.depth * torch.ones(maps.depth.shape[-1]))
+
+
+def _to_numpy(maps):
+    return dataclasses.replace(maps, depth=torch.as_tensor(maps.depth.numpy()))
+
+
+def _mask_on_the_cpu(maps):
+    mask = torch.ones(maps.depth.shape, dtype=torch.bool)
+    return dataclasses.replace(maps, valid=maps.valid & mask)
+
+
+def _index_on_the_cpu(maps):
+    return dataclasses.replace(maps, depth=maps.depth[torch.arange(len(maps.depth))])
+
+
+@pytest.mark.parametrize(
+    ("defect", "said"),
+    [
+        (_buffer_on_the_cpu, r"aten::mul: .*\(42,\).* on the CPU"),
+        (_to_numpy, "can't convert a tensor on pretend:0 to numpy"),
+        (_mask_on_the_cpu, r"aten::(__and__|bitwise_and).*: .* on the CPU"),
+        (_index_on_the_cpu, r"aten::index: .* on the CPU"),
+    ],
+)
+def test_a_planted_defect_is_caught(defect, said):
+    """Each works on the CPU and fails on a GPU, or waits there without need."""
+    model, batch = make_model("model=paper").eval(), make_batch(1, 3, 28, 42)
+    model.unprojection = Planted(model.unprojection, defect)
+    with torch.no_grad():
+        model(batch)
+        with pretend_device():
+            model, batch = model.to(DEVICE), batch.to(DEVICE)
+            with pytest.raises((RuntimeError, TypeError), match=said):
+                model(batch)
