@@ -67,7 +67,7 @@ SMALL = [
      r"\1 encoder=vggt_nano 'scaling={share: [0.1, 0.2], views: [2, 3], size: [56, 70], batch: [1]}'",
      "small photographs"),
     (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
-    (r" init_from=start\.ckpt", "", PUBLISHED),
+    (r" init_from=(?:start|vggt)\.ckpt", "", PUBLISHED),
     (r"runs/train/<time>", "runs/train/$(ls runs/train | grep ^20 | tail -n 1)", "the last run"),
     (r"<run>", "runs/before", "a small run"),
     (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
@@ -132,7 +132,10 @@ BEFORE = {
     "docs/encoder.md": _CHECKPOINTS,
     "docs/sweeps.md": (_SWEEP,),
     "docs/tables.md": (_SWEEP,),
-    "docs/training.md": (f"{_RUN} hydra.run.dir=runs/before",),
+    "docs/training.md": (
+        f"{_RUN} hydra.run.dir=runs/before",
+        f"ghgs prepare task=miniature data=thuman2 data.root=thuman2 {FEW}",
+    ),
 }  # fmt: skip
 # Names that Python blocks of a document take as given.
 GIVEN = {
