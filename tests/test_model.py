@@ -184,15 +184,6 @@ def test_a_view_with_an_empty_mask_gives_no_gaussians():
     assert gaussians.means.isfinite().all()
 
 
-def test_skip_exact_gives_the_gaussians_of_skip_none():
-    """skip=exact promises the same Gaussians."""
-    batch = make_batch(2, 3)
-    batch.masks[0, 1] = False
-    with torch.no_grad():
-        exact, none = (make_model(f"skip={skip}")(batch).gaussians for skip in ("exact", "none"))
-    close(exact, none)
-
-
 def test_skip_fast_gives_the_gaussians_of_skip_exact_where_nothing_is_background():
     """The preset changes what the encoder sees, and nothing else."""
     batch = make_batch(2, 3)
@@ -222,18 +213,31 @@ def test_skip_fast_with_few_pixels_and_with_mates(margin):
         close(together.gaussians[b], model(element(batch, b)).gaussians)
 
 
-def test_views_without_the_subject_are_not_decoded():
+def test_only_windows_around_the_subject_are_decoded():
     """skip=exact must skip the work, except where all tokens need a depth."""
-    batch = make_batch(2, 3)
+    batch = make_batch(2, 3, zoom=0.4)
     batch.masks[1, 0] = False
     model = make_model("skip=exact")
     decoded = []
     for head in (model.depth_head.dpt, model.gaussian_head.decoder):
-        head.register_forward_hook(lambda _, args, maps: decoded.append(len(maps)))
+        head.register_forward_hook(lambda _, args, maps: decoded.append((len(maps), *maps.shape[2:])))
     model(batch)
-    assert decoded == [5, 5]
-    assert config("skip=exact")["skip"]["views"] == "subject"
-    assert GHGS.from_config(config("skip=exact", "compat=release")).depth_head.views == "all"
+    assert [count for count, *_ in decoded] == [3, 2, 3, 2]
+    assert all(max(size) < 56 for _, *size in decoded)
+    assert config("skip=exact")["depth_head"]["pixels"] == "subject"
+    assert GHGS.from_config(config("skip=exact", "compat=release")).depth_head.pixels == "all"
+
+
+@pytest.mark.parametrize("overrides", [["model=hull"], ["unprojection=release"]], ids=operator.itemgetter(0))
+@pytest.mark.parametrize("size", [(70, 70), (154, 98)])
+def test_skip_exact_gives_the_gaussians_of_skip_none(size, overrides):
+    """skip=exact promises the same Gaussians, also where windows are smaller than the photographs."""
+    batch = make_batch(2, 3, *size, zoom=0.3)
+    batch.masks[0, 1] = False
+    batch.masks[1, 2, :5, -9:] = True
+    with torch.no_grad():
+        exact, none = (make_model(f"skip={skip}", *overrides)(batch).gaussians for skip in ("exact", "none"))
+    close(exact, none)
 
 
 def test_ablations_differ_and_say_what_they_leave_out():

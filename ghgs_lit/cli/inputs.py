@@ -26,9 +26,8 @@ MODEL_NODES = (*STAGES, "skip", "model", "compat")
 #: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
 FREE = (
     "bounds",
-    "depth_head.views",
+    "depth_head.pixels",
     "gaussian_head.pixels",
-    "gaussian_head.views",
     "model.pad",
     "recalibration.k",
     "recalibration.neighborhood",
@@ -142,7 +141,7 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
 
 
 def _with_links(before: dict[str, Any], after: dict[str, Any], cfg: DictConfig) -> dict[str, Any]:
-    """``after`` with the values that follow others, such as ``gaussian_head.views: ${skip.views}``.
+    """``after`` with the values that follow others, such as ``gaussian_head.pixels: ${skip.pixels}``.
 
     A checkpoint stores values without their links; ``cfg`` has the links. A value follows where what it is
     linked to differs between ``before`` and ``after``.

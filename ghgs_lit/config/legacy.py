@@ -25,11 +25,13 @@ TARGETS = {
 KEYS: dict[str, str] = {
     "data.render.vids": "data.render.views",
     "depth_head.agreement": "depth_head.consistency_depths",
+    "depth_head.views": "depth_head.pixels",
     "encoder.interval_input": "encoder.bounds_input",
     "feature_cache.ring": "feature_cache.margin",
     "gaussian_head.agreement": "gaussian_head.photo_consistency",
     "optimizer.hold": "optimizer.freeze_until",
     "points": "unprojection",
+    "skip.depth_views": "skip.depth_pixels",
     "targets.training_vids": "targets.training_views",
     "targets.vid": "targets.view",
 }
@@ -75,16 +77,20 @@ def _unprojection_names_its_class(config: dict[str, Any]) -> None:
 
 
 def _heads_name_what_they_skip(config: dict[str, Any]) -> None:
-    """The heads have their own copies of ``skip.views`` and ``skip.pixels``."""
+    """The heads have their own copies of ``skip.pixels``; ``views`` said the same of whole views."""
     skip, head, recalibration = (config.get(name) for name in ("skip", "depth_head", "recalibration"))
+    gaussian_head = config.get("gaussian_head")
+    if isinstance(gaussian_head, dict):
+        gaussian_head.pop("views", None)
     if not (isinstance(skip, dict) and isinstance(head, dict) and isinstance(recalibration, dict)):
         return
-    if "views" in skip:
-        views = skip.setdefault("depth_views", {"subject": skip["views"], "all": "all"})
-        head.setdefault("views", views.get(recalibration.get("tokens", "subject"), "all"))
-    for name in ("pixels", "views"):
-        if name in skip and isinstance(config.get("gaussian_head"), dict):
-            config["gaussian_head"].setdefault(name, skip[name])
+    pixels = skip.get("pixels")
+    views = skip.pop("views", pixels)
+    if views is not None:
+        of_depth = skip.setdefault("depth_pixels", {"subject": views, "all": "all"})
+        head.setdefault("pixels", of_depth.get(recalibration.get("tokens", "subject"), "all"))
+    if pixels is not None and isinstance(gaussian_head, dict):
+        gaussian_head.setdefault("pixels", pixels)
 
 
 def _ablation_is_what_the_model_does(config: dict[str, Any]) -> None:

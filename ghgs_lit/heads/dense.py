@@ -1,14 +1,23 @@
-"""Dense heads whose widths follow the encoder's, run on some of the views."""
+"""Dense heads whose widths follow the encoder's, run on windows around the subject."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.heads.dpt import DPTHead
+from ghgs_lit.heads.window import Span, Window, subject_windows
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
+
+#: Values of the largest map that are held at once where no gradient is kept (32 MB in float32).
+_LARGEST = 1 << 23
 
 
 def proportioned_dpt(
@@ -34,32 +43,64 @@ def proportioned_dpt(
     return DPTHead(dim_latent, features, out_channels, output_dim, **options)
 
 
-def decode_views(
+@dataclass(frozen=True)
+class Part:
+    """Maps of some images in one window; ``images`` are consecutive."""
+
+    images: slice
+    window: Window
+    maps: Float[Tensor, "n o h w"]
+
+    def cut(self, values: Tensor) -> Tensor:
+        """The same images and window of whole maps [B, V, H, W, ...]."""
+        return values.flatten(0, 1)[self.images, *self.window.slices]
+
+
+def decode(
     dpt: DPTHead,
     tokens: Tokens,
     guide: Float[Tensor, "b v k H W"] | None,
-    wanted: Bool[Tensor, "b v"],
-) -> Float[Tensor, "bv o H W"]:
-    """Maps of the images that are ``wanted``; 0 for the others, which ``dpt`` does not see.
+    wanted: Bool[Tensor, "b v H W"] | None,
+) -> Iterator[Part]:
+    """Maps of the windows around wanted pixels, in the order of the images.
+
+    Images whose maps are small share one window. Without a gradient, larger maps are computed one after
+    another, each in a window of its own, to save memory and work.
 
     Args:
         dpt: the dense head.
         tokens: of all images.
         guide: of all images, for a head with a guide.
-        wanted: where none is, all images are decoded: the maps keep their shape and a gradient of 0.
+        wanted: pixels; None: all. An image without any is left out; where no image has one, a single pixel is
+            decoded: there is always a part, through which gradients of 0 flow.
     """
-    flat = wanted.flatten()
-    if flat.all() or not flat.any():
-        return dpt(tokens, guide)
-    kept = flat.nonzero()[:, 0]
-    part = tokens.select(flat[tokens.image])
-    part = dataclasses.replace(
-        part, image=(flat.cumsum(0) - 1)[part.image], grid=(1, len(kept), *tokens.grid[2:])
-    )
-    maps = dpt(part, None if guide is None else guide.flatten(0, 1)[kept][None])
-    return torch.zeros(len(flat), *maps.shape[1:], dtype=maps.dtype, device=maps.device).index_copy(
-        0, kept, maps
-    )
+    b, v, rows, columns = tokens.grid
+    size = (tokens.patch_size * rows, tokens.patch_size * columns)
+    if wanted is None:
+        windows = [Window.whole(size)] * (b * v)
+    else:
+        windows = subject_windows(wanted.flatten(0, 1))
+        if not any(windows):
+            windows[0] = Window(*(Span(0, 1, full) for full in size))
+    most = b * v if torch.is_grad_enabled() else _LARGEST // (dpt.full_channels * math.prod(size))
+    ends = [0, *torch.bincount(tokens.image, minlength=b * v).cumsum(0).tolist()]
+    for images in _runs(windows, most):
+        window = functools.reduce(Window.hull, windows[images])
+        part = tokens.select(slice(ends[images.start], ends[images.stop]))
+        grid = (1, images.stop - images.start, rows, columns)
+        part = dataclasses.replace(part, image=part.image - images.start, grid=grid)
+        seen = None if guide is None else guide.flatten(0, 1)[images][None]
+        yield Part(images, window, dpt(part, seen, window))
+
+
+def _runs(windows: Sequence[Window | None], most: int) -> Iterator[slice]:
+    """Slices of at most ``most`` consecutive images that have a window, of about equal size."""
+    start = 0
+    for has_window, group in itertools.groupby(windows, bool):
+        count = len(list(group))
+        for part in even_parts(count, most) if has_window else ():
+            yield slice(start + part.start, start + part.stop)
+        start += count
 
 
 def _multiple(value: float, of: int) -> int:

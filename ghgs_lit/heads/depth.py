@@ -1,18 +1,19 @@
 """The depth stage: one z-depth and one confidence for each pixel (paper, section 3.2)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import log
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.heads.activations import CONFIDENCES
-from ghgs_lit.heads.dense import decode_views, proportioned_dpt
+from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
 
@@ -48,8 +49,8 @@ class DepthHead(nn.Module):
         parameterization: ``bounded_inverse``, ``log`` or ``linear`` between the near and far of each pixel;
             ``inverse_linear``, without bounds, for the authors' checkpoints only.
         start: fraction of the way from near to far at which training starts.
-        views: ``all``, or ``subject``: views whose mask is empty are not decoded (their depths are
-            meaningless).
+        pixels: ``all``, or ``subject``: only windows around the subject are decoded; elsewhere depths are
+            meaningless.
         guide: let the dense head see photographs, masks and bounds at full resolution.
         consistency_depths: the guide also shows the :func:`photo_consistency` at this number of depths
             between near and far; 0: none.
@@ -61,16 +62,16 @@ class DepthHead(nn.Module):
         dpt: Mapping | None = None,
         parameterization: str = "bounded_inverse",
         start: float = 0.5,
-        views: str = "all",
+        pixels: str = "all",
         guide: bool = False,
         consistency_depths: int = 0,
     ):
         super().__init__()
         choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
-        choice("depth_head.views", views, ("all", "subject"))
+        choice("depth_head.pixels", pixels, ("all", "subject"))
         require(0 < start < 1, "depth_head.start", "a fraction between 0 and 1", start)
         self.parameterization, self.start = parameterization, log(start / (1 - start))
-        self.views = views
+        self.pixels = pixels
         guided_by_bounds = guide and self.is_bounded
         require(
             consistency_depths == 0 or (consistency_depths > 0 and guided_by_bounds),
@@ -102,15 +103,19 @@ class DepthHead(nn.Module):
         Returns:
             Values that are not finite are replaced by 1 m and are not valid.
         """
-        wanted = batch.masks.flatten(2).any(-1) | (self.views == "all")
         guide = None
         if self.dpt.guide is not None:
             maps = [] if bounds is None else [relative_bounds(bounds, batch.masks)]
             if self.consistency_depths:
                 maps.append(photo_consistency(batch, bounds, self.consistency_depths))
             guide = photo_guide(batch, *maps)
-        raw = at_least_float32(decode_views(self.dpt, tokens, guide, wanted))
-        value, confidence = (raw[:, i].unflatten(0, batch.masks.shape[:2]) for i in range(2))
+        wanted = None
+        if self.pixels == "subject":
+            # Whole patches: the token points of the release depend on pixels beside the mask.
+            p = tokens.patch_size
+            patches = patches_around_subject(batch.masks, p, 0)
+            wanted = patches.repeat_interleave(p, -2).repeat_interleave(p, -1)
+        value, confidence = _whole(decode(self.dpt, tokens, guide, wanted), batch, wanted)
         if self.is_bounded:
             fraction = (value + self.start).sigmoid()
             depth = BOUNDED[self.parameterization](fraction, bounds.near, bounds.far)
@@ -123,3 +128,20 @@ class DepthHead(nn.Module):
             confidence=CONFIDENCES["expp1"](confidence),
             bounds=bounds,
         )
+
+
+def _whole(
+    parts: Iterable[Part], batch: Batch, wanted: Bool[Tensor, "B V H W"] | None
+) -> Float[Tensor, "o B V H W"]:
+    """Decoded windows in maps of whole images, float32 or wider; 0 where they are not wanted (None: nowhere).
+
+    Images share windows, so what else lies in them depends on other subjects of the batch.
+    """
+    whole = None
+    for part in parts:
+        if whole is None:
+            whole = part.maps.new_zeros(part.maps.shape[1], *batch.masks.shape)
+        rows, columns = part.window.slices
+        whole.flatten(1, 2)[:, part.images, rows, columns] = part.maps.transpose(0, 1)
+    whole = at_least_float32(whole)
+    return whole if wanted is None else torch.where(wanted, whole, 0)

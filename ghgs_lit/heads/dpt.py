@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -11,13 +12,13 @@ from torch import Tensor, nn
 from ghgs_lit.errors import require
 from ghgs_lit.heads.guide import GuidePyramid
 from ghgs_lit.heads.position import add_positions_
+from ghgs_lit.heads.window import Window, reach
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
-#: Values of the largest map that are held at once where no gradient is kept (128 MB in float32).
-_LARGEST = 1 << 25
+#: Cells of the three finer levels for each patch, along an axis; the coarsest has a cell for two patches.
+CELLS = (4, 2, 1)
 NORM_EPS = 1e-5
 
 
@@ -28,12 +29,6 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
     """A 1x1 convolution as a linear layer of pixels: no copy, since channels are innermost here."""
     return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
-
-
-def _resize(x: Float[Tensor, "n c h w"], size: Sequence[int]) -> Float[Tensor, "n c h2 w2"]:
-    if tuple(x.shape[-2:]) == tuple(size):
-        return x
-    return F.interpolate(x, size, mode="bilinear", align_corners=True)
 
 
 class ResidualUnit(nn.Module):
@@ -61,15 +56,15 @@ class Fusion(nn.Module):
         self.out_conv = nn.Conv2d(features, features, 1)
 
     def forward(
-        self,
-        x: Float[Tensor, "n c h w"],
-        level: Float[Tensor, "n c h w"] | None,
-        size: tuple[int, int],
-    ) -> Float[Tensor, "n c h2 w2"]:
-        if level is not None:
-            x = self.resConfUnit1(level).add_(x)
+        self, x: Float[Tensor, "n c h w"] | None, level: Float[Tensor, "n c h2 w2"], place: "LevelWindows"
+    ) -> Float[Tensor, "n c h w"]:
+        """The sum of ``x`` and ``level``, refined, in the window where they are joined."""
+        if x is not None:
+            level = self.resConfUnit1(level)
+        level = place.level.cut(level, place.joined)
+        x = self.resConfUnit2(level if x is None else x.add_(level))
         # A 1x1 convolution commutes with interpolation; before it, it costs a quarter.
-        return _resize(_pointwise(self.out_conv, self.resConfUnit2(x)), size)
+        return _pointwise(self.out_conv, x)
 
 
 class Scratch(nn.Module):
@@ -84,6 +79,29 @@ class Scratch(nn.Module):
         self.output_conv2 = nn.Sequential(
             _conv3(features // 2, hidden), nn.ReLU(), nn.Conv2d(hidden, output_dim, 1)
         )
+
+
+@dataclass(frozen=True)
+class LevelWindows:
+    """Windows of one level: of tokens, of the level's map and of the sum with the coarser result."""
+
+    tokens: Window
+    level: Window
+    joined: Window
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows that a head computes for the window ``result`` of its result.
+
+    Convolutions pad a window with zeros as they pad a whole map, which spoils its border: each window is
+    larger than what is needed of it by the reach of its layers, as far as the map goes.
+    """
+
+    result: Window
+    full: Window
+    fused: Window
+    levels: tuple[LevelWindows, ...]
 
 
 class DPTHead(nn.Module):
@@ -132,72 +150,85 @@ class DPTHead(nn.Module):
         self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 
     def forward(
-        self, tokens: Tokens, guide: Float[Tensor, "b v k H W"] | None = None
-    ) -> Float[Tensor, "bv o H W"]:
+        self,
+        tokens: Tokens,
+        guide: Float[Tensor, "b v k H W"] | None = None,
+        window: Window | None = None,
+    ) -> Float[Tensor, "bv o h w"]:
         """Raw maps of all images, float32 or wider.
-
-        Without a gradient the images go through the head in parts of equal size, to save memory.
 
         Args:
             tokens: of four layers.
-            guide: where ``guide_channels`` is not 0.
+            guide: where ``guide_channels`` is not 0; of whole images.
+            window: the part of the maps that is computed; None: all.
         """
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
         expected = "none" if self.guide is None else "a map"
         require((guide is None) == (self.guide is None), "guide", expected, guide is not None)
-        levels = self._levels(tokens)
-        flat = None if guide is None else guide.flatten(0, 1)
-        count = levels[0].shape[0]
-        if torch.is_grad_enabled():
-            return self._decode(levels, tokens.patch_size, flat)
-        height, width = (n * tokens.patch_size for n in tokens.grid[2:])
-        maps = None
-        for part in even_parts(count, _LARGEST // (self.full_channels * height * width)):
-            guides = None if flat is None else flat[part]
-            found = self._decode([level[part] for level in levels], tokens.patch_size, guides)
-            if len(found) == count:
-                return found
-            if maps is None:  # channels innermost, as the parts have them
-                maps = found.new_empty(count, height, width, found.shape[1]).permute(0, 3, 1, 2)
-            maps[part] = found
-        return maps
+        rows, columns = tokens.grid[2:]
+        size = (tokens.patch_size * rows, tokens.patch_size * columns)
+        windows = self.windows(window or Window.whole(size), (rows, columns))
+        aspect, s = columns / rows, self.scratch
+        if guide is not None:
+            targets = (windows.full, windows.fused, windows.levels[0].level)
+            full, half, quarter = self.guide(guide.flatten(0, 1), targets)
 
-    def _levels(self, tokens: Tokens) -> list[Float[Tensor, "bv c h w"]]:
-        """Normalised and projected tokens on the grid (a 1x1 convolution is a linear layer of tokens)."""
-        levels = []
-        for latent, project in zip(tokens.latent, self.projects, strict=True):
-            projected = linear(self.norm(latent), project.weight.flatten(1), project.bias)
-            levels.append(dataclasses.replace(tokens, latent=(projected,)).maps(0))
-        return levels
-
-    def _decode(
-        self, levels: list[Tensor], patch_size: int, guide: Tensor | None
-    ) -> Float[Tensor, "n o H W"]:
-        height, width = levels[0].shape[-2:]
-        aspect = width / height
-        s = self.scratch
-        for i, resize in enumerate(self.resize_layers):
-            level = add_positions_(levels[i], aspect)
-            levels[i] = getattr(s, f"layer{i + 1}_rn")(resize(level))
+        x = None
+        # The coarse levels have the large weights, the fine ones the large maps: never hold both.
+        for i in reversed(range(LEVELS)):
+            place = windows.levels[i]
+            level = self._level(i, tokens, place)
+            if guide is not None and i == 0:
+                level = level + quarter
+            x = getattr(s, f"refinenet{i + 1}")(x, level, place)
+            x = place.joined.resize(x, windows.levels[i - 1].joined if i else windows.fused)
 
         if guide is not None:
-            full, half, quarter = self.guide(guide)
-            levels[0] = levels[0] + _resize(quarter, levels[0].shape[-2:])
-
-        sizes = [tuple(level.shape[-2:]) for level in levels]
-        x = s.refinenet4(levels[3], None, sizes[2])
-        x = s.refinenet3(x, levels[2], sizes[1])
-        x = s.refinenet2(x, levels[1], sizes[0])
-        x = s.refinenet1(x, levels[0], (2 * sizes[0][0], 2 * sizes[0][1]))
-
-        if guide is not None:
-            x = x + _resize(half, x.shape[-2:])
-        x = _resize(s.output_conv1(x), (patch_size * height, patch_size * width))
-        x = add_positions_(x, aspect)
+            x = x + half
+        x = windows.fused.resize(s.output_conv1(x), windows.full)
+        x = add_positions_(x, aspect, windows.full)
         if guide is not None:
             x = x + full
         x = s.output_conv2[:-1](x)
         # The last projection stays in float32 under autocast: depths and offsets of millimetres depend on it.
         last = s.output_conv2[-1]
         with torch.autocast(x.device.type, enabled=False):
-            return _pointwise(last, x.to(last.weight.dtype))
+            return windows.full.cut(_pointwise(last, x.to(last.weight.dtype)), windows.result)
+
+    def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
+        """What must be computed for a window of the result, from fine to coarse.
+
+        Args:
+            result: the window.
+            grid: rows and columns of patches.
+        """
+        s = self.scratch
+        full = result.grown(reach(s.output_conv2))
+        fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))
+        target, levels = fused, []
+        for i, resize in enumerate(self.resize_layers):
+            fusion = getattr(s, f"refinenet{i + 1}")
+            size = _times(CELLS[i], grid) if i < len(CELLS) else tuple(-(-n // 2) for n in grid)
+            joined = target.sources(size).grown(reach(fusion.resConfUnit2))
+            level = joined.grown(reach(getattr(s, f"layer{i + 1}_rn"), fusion) - reach(fusion.resConfUnit2))
+            if i < len(CELLS):
+                tokens = level.coarser(CELLS[i])
+                level = tokens.finer(CELLS[i], size)
+            else:
+                level = level.grown(reach(resize))
+                tokens = level.finer(2, grid)
+            levels.append(LevelWindows(tokens, level, joined))
+            target = joined
+        return Windows(result, full, fused, tuple(levels))
+
+    def _level(self, i: int, tokens: Tokens, place: LevelWindows) -> Float[Tensor, "bv c h w"]:
+        """Normalised and projected tokens as a map (a 1x1 convolution is a linear layer of tokens)."""
+        project, aspect = self.projects[i], tokens.grid[3] / tokens.grid[2]
+        projected = linear(self.norm(tokens.latent[i]), project.weight.flatten(1), project.bias)
+        maps = dataclasses.replace(tokens, latent=(projected,)).maps(0)[..., *place.tokens.slices]
+        level = self.resize_layers[i](add_positions_(maps, aspect, place.tokens))
+        return getattr(self.scratch, f"layer{i + 1}_rn")(level)
+
+
+def _times(factor: int, grid: tuple[int, int]) -> tuple[int, int]:
+    return factor * grid[0], factor * grid[1]

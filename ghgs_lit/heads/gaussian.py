@@ -14,7 +14,7 @@ from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.heads.activations import unit
-from ghgs_lit.heads.dense import decode_views, proportioned_dpt
+from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens
 
@@ -127,9 +127,8 @@ class GaussianHead(nn.Module):
         parameterization: ``footprint`` (:class:`FootprintAttributes`, raw values start at 0) or
             ``release`` (:func:`release_attributes`, PyTorch's initialisation).
         attributes: options of :class:`FootprintAttributes`.
-        pixels: ``subject`` runs the four networks on the subject's pixels, ``all`` on every pixel and
-            selects afterwards; the Gaussians are the same.
-        views: ``subject`` decodes only views with a pixel of the subject, ``all`` every view.
+        pixels: ``subject`` decodes windows around the subject and runs the four networks on its pixels,
+            ``all`` computes every pixel and selects afterwards; the Gaussians are the same.
         guide: let the dense head see photographs, masks and depths at full resolution.
         photo_consistency: the guide also shows the :func:`photo_consistency` at the predicted depth: a splat
             off the surface can become transparent.
@@ -146,7 +145,6 @@ class GaussianHead(nn.Module):
         parameterization: str = "footprint",
         attributes: Mapping | None = None,
         pixels: str = "subject",
-        views: str = "subject",
         guide: bool = False,
         photo_consistency: bool = False,
         color_limit: float = 0.0,
@@ -154,12 +152,11 @@ class GaussianHead(nn.Module):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
-        choice("gaussian_head.views", views, ("subject", "all"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
         allowed = guide or not photo_consistency
         require(allowed, "gaussian_head.photo_consistency", "false where there is no guide", True)
         require(color_limit >= 0, "gaussian_head.color_limit", "0 or more", color_limit)
-        self.pixels, self.views = pixels, views
+        self.pixels = pixels
         self.photo_consistency, self.color_limit = photo_consistency, color_limit
         guided = PHOTO_CHANNELS + 1 + photo_consistency if guide else 0
         self.decoder = proportioned_dpt(dim_latent, channels, guide_channels=guided, **(dpt or {}))
@@ -190,17 +187,11 @@ class GaussianHead(nn.Module):
             points: of the pixels.
             depth_maps: of the same pixels.
         """
-        wanted = points.valid.flatten(2).any(-1) | (self.views == "all")
-        maps = decode_views(self.decoder, tokens, self._guide(batch, points, depth_maps), wanted)
+        wanted = None if self.pixels == "all" else points.valid
+        parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), wanted)
+        raw = zip(*(self._of_subject(part, points) for part in parts), strict=True)
+        offset, scale, rotation, opacity, *color = (torch.cat(values) for values in raw)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
-        descriptors = maps.flatten(2).transpose(1, 2)
-        if self.pixels == "subject":
-            raw = self._raw(descriptors[image, pixel])
-        else:
-            # One image at a time: the networks' hidden layers are wider than the maps.
-            each = [self._raw(pixels) for pixels in descriptors]
-            raw = tuple(torch.stack(values)[image, pixel] for values in zip(*each, strict=True))
-        offset, scale, rotation, opacity, *color = raw
         focal = (
             at_least_float32(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
         )
@@ -230,6 +221,18 @@ class GaussianHead(nn.Module):
             depth = at_least_float32(depth_maps.depth.detach())
             maps.append(photo_consistency(batch, DepthBounds(depth, depth), 1))
         return photo_guide(batch, *maps)
+
+    def _of_subject(self, part: Part, points: Points) -> Sequence[Tensor]:
+        """The raw values (:meth:`_raw`) of the valid pixels of a part."""
+        descriptors, valid = part.maps.permute(0, 2, 3, 1), part.cut(points.valid)
+        if self.pixels == "subject":
+            return self._raw(descriptors[valid])
+        # One image at a time: the networks' hidden layers are wider than the maps.
+        each = [
+            [values[own] for values in self._raw(pixels)]
+            for pixels, own in zip(descriptors, valid, strict=True)
+        ]
+        return [torch.cat(values) for values in zip(*each, strict=True)]
 
     def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:
         """Raw offset, scale, rotation, opacity and, where there is a network for it, color."""

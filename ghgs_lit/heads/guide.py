@@ -3,12 +3,15 @@
 A patch is one token, so a head that sees tokens alone draws soft edges. Published weights use no guide.
 """
 
+import functools
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.heads.window import Window
 from ghgs_lit.types import Batch
 
 #: Channels of :func:`photo_guide` without further maps.
@@ -37,7 +40,28 @@ class GuidePyramid(nn.Module):
         self.to_half = nn.Conv2d(features // 2, features, 3, stride=2, padding=1)
         self.to_quarter = nn.Conv2d(features, features, 3, stride=2, padding=1)
 
-    def forward(self, guide: Float[Tensor, "n c H W"]) -> tuple[Tensor, Tensor, Tensor]:
-        full = F.relu(self.to_full(guide.contiguous(memory_format=torch.channels_last)))
+    def forward(
+        self, guide: Float[Tensor, "n c H W"], targets: tuple[Window, Window, Window]
+    ) -> list[Float[Tensor, "n o h w"]]:
+        """Maps to add to the head's: at full resolution, and at half and quarter resolution, resized.
+
+        Args:
+            guide: of whole images.
+            targets: windows of the head's maps.
+        """
+        whole = Window.whole(tuple(guide.shape[2:]))
+        size = whole.full
+        sizes = [whole.coarser(factor).full for factor in (1, 2, 4)]
+        needed = [target.sources(n) for target, n in zip(targets, sizes, strict=True)]
+        seen = functools.reduce(
+            Window.hull,
+            (window.grown(1).finer(factor, size) for window, factor in zip(needed, (1, 2, 4), strict=True)),
+        )
+        seen = seen.coarser(4).finer(4, size)
+        full = F.relu(self.to_full(guide[..., *seen.slices].contiguous(memory_format=torch.channels_last)))
         half = F.relu(self.to_half(full))
-        return full, half, F.relu(self.to_quarter(half))
+        maps = (full, half, F.relu(self.to_quarter(half)))
+        return [
+            seen.coarser(factor).resize(found, target)
+            for found, factor, target in zip(maps, (1, 2, 4), targets, strict=True)
+        ]

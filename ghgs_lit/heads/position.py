@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ghgs_lit.heads.window import Window
+
 SCALE = 0.1
 BASE = 100.0
 
@@ -29,7 +31,9 @@ def _axis_waves(
     return torch.cat((angles.sin(), angles.cos())).float() * SCALE
 
 
-def add_positions_(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, "n c h w"]:
+def add_positions_(
+    x: Float[Tensor, "n c h w"], aspect: float, window: Window | None = None
+) -> Float[Tensor, "n c h w"]:
     """Add ``0.1 E`` to ``x`` in place, in its precision: waves of x in the first half of the channels, of y
     in the second.
 
@@ -39,12 +43,16 @@ def add_positions_(x: Float[Tensor, "n c h w"], aspect: float) -> Float[Tensor, 
     Args:
         x: maps whose number of channels is a multiple of 4; float64 gives float64 coordinates.
         aspect: width / height of the image.
+        window: the part of whole maps that ``x`` is; None: all of it.
     """
+    window = window or Window.whole(tuple(x.shape[2:]))
     half = x.shape[1] // 2
     dtype = torch.float64 if x.dtype == torch.float64 else torch.float32
     diagonal = math.hypot(aspect, 1.0)
-    across = _axis_waves(half, x.shape[3], aspect / diagonal, dtype, x.device)
-    down = _axis_waves(half, x.shape[2], 1.0 / diagonal, dtype, x.device)
+    across, down = (
+        _axis_waves(half, span.full, extent / diagonal, dtype, x.device)[:, span.start : span.stop]
+        for span, extent in ((window.columns, aspect), (window.rows, 1.0))
+    )
     x[:, :half].add_(across[:, None, :].to(x.dtype))
     x[:, half:].add_(down[:, :, None].to(x.dtype))
     return x

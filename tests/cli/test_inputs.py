@@ -58,7 +58,7 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
     ]
     model = inputs.model_of(checkpoint, composed(verb, f"checkpoint={checkpoint}", *said))
     assert model == config(*TRAINED, *said)
-    assert model["gaussian_head"]["pixels"] == model["depth_head"]["views"] == "all"
+    assert model["gaussian_head"]["pixels"] == model["depth_head"]["pixels"] == "all"
     model = inputs.model_of(
         checkpoint, composed(verb, f"checkpoint={checkpoint}", "recalibration.tokens=all")
     )

@@ -89,8 +89,8 @@ def test_an_old_configuration_builds_the_same_model(name):
     assert shapes[0]
     assert (type(old.bounds), old.unprojection) == (type(new.bounds), new.unprojection)
     assert vars(old.bounds) == vars(new.bounds)
-    assert (old.crop, old.pad, old.depth_head.views) == (new.crop, new.pad, new.depth_head.views)
-    assert (old.gaussian_head.views, old.gaussian_head.pixels) == ("subject", "subject")
+    assert (old.crop, old.pad, old.depth_head.pixels) == (new.crop, new.pad, new.depth_head.pixels)
+    assert old.gaussian_head.pixels == "subject"
 
 
 @pytest.mark.parametrize("name", list(OLD))
@@ -168,13 +168,15 @@ def test_bounds_of_the_depth_head_become_a_stage(bounds, search, expected):
     assert upgraded["unprojection"]["_target_"].endswith("Unprojection")
 
 
-@pytest.mark.parametrize(("tokens", "views"), [("subject", "subject"), ("all", "all")])
-def test_heads_get_what_skipping_said(tokens, views):
+@pytest.mark.parametrize(("tokens", "pixels"), [("subject", "subject"), ("all", "all")])
+def test_heads_get_what_skipping_said(tokens, pixels):
     """With all tokens recalibrated, a view without the subject still needs its depth."""
-    old = {"skip": {"views": "subject", "pixels": "all"}, "depth_head": {}, "gaussian_head": {}}
+    old = {"skip": {"views": "subject", "pixels": "all"}, "depth_head": {}, "gaussian_head": {"views": "all"}}
     upgraded = upgrade(old | {"recalibration": {"tokens": tokens}})
-    assert upgraded["depth_head"]["views"] == views
-    assert upgraded["gaussian_head"] == {"views": "subject", "pixels": "all"}
+    assert upgraded["depth_head"] == {"pixels": pixels}
+    assert upgraded["gaussian_head"] == {"pixels": "all"}
+    assert upgraded["skip"]["depth_pixels"] == {"subject": "subject", "all": "all"}
+    assert "views" not in upgraded["skip"]
 
 
 def test_an_ablation_is_what_the_model_does():

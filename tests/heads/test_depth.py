@@ -139,7 +139,7 @@ def test_widths_follow_the_published_ones():
     ("options", "key"),
     [
         ({"parameterization": "linar"}, "depth_head.parameterization: expected one of bounded_inverse"),
-        ({"views": "some"}, "depth_head.views"),
+        ({"pixels": "some"}, "depth_head.pixels"),
         ({"start": 1.0}, "depth_head.start"),
     ],
 )

@@ -11,6 +11,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.relative_depth import UNIT, relative_bounds, relative_depth
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.guide import GuidePyramid, photo_guide
+from ghgs_lit.heads.window import Window
 from ghgs_lit.types import DepthBounds
 from tests.helpers.scenes import make_batch
 
@@ -57,10 +58,11 @@ def test_an_empty_mask_gives_empty_maps():
 @pytest.mark.parametrize("size", [(28, 42), (35, 21)])
 def test_pyramid_halves_twice(size):
     """Odd image sides must give maps of the expected sizes."""
-    full, half, quarter = GuidePyramid(6, 16)(torch.rand(2, 6, *size))
-    assert full.shape == (2, 8, *size)
-    assert half.shape == (2, 16, *((n + 1) // 2 for n in size))
-    assert quarter.shape == (2, 16, *((n + 3) // 4 for n in size))
+    sizes = [size, tuple((n + 1) // 2 for n in size), tuple((n + 3) // 4 for n in size)]
+    full, half, quarter = GuidePyramid(6, 16)(torch.rand(2, 6, *size), tuple(map(Window.whole, sizes)))
+    assert full.shape == (2, 8, *sizes[0])
+    assert half.shape == (2, 16, *sizes[1])
+    assert quarter.shape == (2, 16, *sizes[2])
 
 
 def test_depth_follows_the_guide():

@@ -1,0 +1,134 @@
+"""Windows of maps, and how large a window each layer of a dense head needs for a window of its result."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ghgs_lit.geometry.masks import first_and_last
+from ghgs_lit.geometry.projection import at_least_float32
+
+
+class Span(NamedTuple):
+    """Cells ``start`` to ``stop``, which is excluded, of the ``full`` cells of a map along one axis."""
+
+    start: int
+    stop: int
+    full: int
+
+    def grown(self, cells: int) -> "Span":
+        return Span(max(self.start - cells, 0), min(self.stop + cells, self.full), self.full)
+
+    def sources(self, full: int) -> "Span":
+        """The cells of a map of ``full`` cells that these are interpolated from."""
+        first, last = (cell * (full - 1) // max(self.full - 1, 1) for cell in (self.start, self.stop - 1))
+        return Span(first, min(last + 2, full), full)
+
+    def coarser(self, factor: int) -> "Span":
+        """The blocks of ``factor`` cells that hold these."""
+        return Span(self.start // factor, -(-self.stop // factor), -(-self.full // factor))
+
+    def finer(self, factor: int, full: int) -> "Span":
+        """The cells of these blocks of ``factor`` cells; the last block may be cut."""
+        return Span(self.start * factor, min(self.stop * factor, full), full)
+
+    def hull(self, other: "Span") -> "Span":
+        return Span(min(self.start, other.start), max(self.stop, other.stop), self.full)
+
+
+class Window(NamedTuple):
+    """A rectangle of a map: the same part of every image."""
+
+    rows: Span
+    columns: Span
+
+    @classmethod
+    def whole(cls, size: tuple[int, int]) -> "Window":
+        return cls(*(Span(0, full, full) for full in size))
+
+    @property
+    def full(self) -> tuple[int, int]:
+        """Height and width of the whole map."""
+        return self.rows.full, self.columns.full
+
+    @property
+    def is_whole(self) -> bool:
+        return self == Window.whole(self.full)
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        return slice(*self.rows[:2]), slice(*self.columns[:2])
+
+    def grown(self, cells: int) -> "Window":
+        return Window(*(span.grown(cells) for span in self))
+
+    def sources(self, full: tuple[int, int]) -> "Window":
+        return Window(*(span.sources(n) for span, n in zip(self, full, strict=True)))
+
+    def coarser(self, factor: int) -> "Window":
+        return Window(*(span.coarser(factor) for span in self))
+
+    def finer(self, factor: int, full: tuple[int, int]) -> "Window":
+        return Window(*(span.finer(factor, n) for span, n in zip(self, full, strict=True)))
+
+    def hull(self, other: "Window") -> "Window":
+        return Window(*(mine.hull(its) for mine, its in zip(self, other, strict=True)))
+
+    def cut(self, maps: Float[Tensor, "n c h w"], inner: "Window") -> Float[Tensor, "n c h2 w2"]:
+        """The part ``inner`` of maps of this window."""
+        if inner == self:
+            return maps
+        rows, columns = (
+            slice(its.start - mine.start, its.stop - mine.start)
+            for mine, its in zip(self, inner, strict=True)
+        )
+        return maps[..., rows, columns]
+
+    def resize(self, maps: Float[Tensor, "n c h w"], target: "Window") -> Float[Tensor, "n c h2 w2"]:
+        """Maps of this window as those of ``target``, a window of maps of another size.
+
+        Bilinear, as ``F.interpolate`` with ``align_corners=True`` on the whole maps.
+        """
+        if self.full == target.full:
+            return self.cut(maps, target)
+        if self.is_whole and target.is_whole:
+            return F.interpolate(maps, target.full, mode="bilinear", align_corners=True)
+        found = at_least_float32(maps).permute(0, 2, 3, 1)  # channels are innermost here
+        for axis, source, wanted in zip((1, 2), self, target, strict=True):
+            found = _interpolate(found, axis, source, wanted)
+        return found.permute(0, 3, 1, 2).to(maps.dtype)
+
+
+def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
+    """Linear interpolation along one axis, with the weights of ``F.interpolate``."""
+    # One division, then one product, both rounded to the precision of the maps, as PyTorch does.
+    step = torch.tensor((source.full - 1) / max(target.full - 1, 1), dtype=maps.dtype).item()
+    place = torch.arange(target.start, target.stop, dtype=maps.dtype, device=maps.device) * step
+    low = place.long().clamp(source.start, source.stop - 1)
+    high = (low + 1).clamp(max=source.stop - 1)
+    weight = (place - low).unflatten(0, (-1, *[1] * (3 - axis)))
+    below, above = (maps.index_select(axis, cell - source.start) for cell in (low, high))
+    return torch.lerp(below, above, weight) if torch.is_grad_enabled() else below.lerp_(above, weight)
+
+
+def subject_windows(masks: Bool[Tensor, "n H W"]) -> list[Window | None]:
+    """The smallest window that holds the mask of each image; None for an empty one."""
+    ends = [first_and_last(masks.any(axis)) for axis in (2, 1)]
+    found = torch.stack([end for pair in ends for end in pair], dim=-1).tolist()
+    height, width = masks.shape[1:]
+    return [
+        Window(Span(top, bottom + 1, height), Span(left, right + 1, width)) if bottom >= 0 else None
+        for top, bottom, left, right in found
+    ]
+
+
+def reach(*modules: nn.Module) -> int:
+    """How many cells on each side the result of these layers, one after another, depends on."""
+    return sum(
+        layer.kernel_size[0] // 2
+        for module in modules
+        for layer in module.modules()
+        if isinstance(layer, nn.Conv2d)
+    )
