@@ -12,11 +12,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.rays import depths_in_box, pixel_axes, projection_matrices
 from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, silhouettes, votes_outside
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import first_and_last
-from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, project
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: The largest bound, in metres: cameras of absurd sizes overflow.
@@ -106,8 +107,8 @@ def subject_box(
         depth = _project_one((lower + upper) / 2, cameras)[1]
         # Half a cell's diagonal in pixels, for subjects that come up to 0.6 of the distance of their middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
-        grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int().tolist()
-        grown = torch.stack([dilate(mask, radius + more) for mask, more in zip(masks, grow, strict=True)])
+        grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
+        grown = dilate(masks, radius + grow[:, None, None, None])
         kept = _carve(votes_outside(grown, masks), cameras, lower, cell, cells, tolerance)
         found = kept.flatten(1).any(-1)[:, None]
         # Along each axis, whether any cell of the slice is kept.
@@ -126,16 +127,16 @@ def _carve(
     steps = torch.arange(cells, device=lower.device, dtype=lower.dtype) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
-    kept = []
-    for b in range(outside.shape[0]):
-        votes = torch.zeros(3 * (cells,), dtype=torch.uint8, device=lower.device)
-        for v in range(outside.shape[1]):
-            x, y, z = (matrices[b, v, :, axis, None] * position[b, axis] for axis in range(3))
-            z = z + matrices[b, v, :, 3, None]
-            pixel = (x[:, :, None] + y[:, None, :])[..., None] + z[:, None, None, :]
-            votes += look_up(outside[b, v], *pixel.unbind(0))
-        kept.append(votes <= tolerance)
-    return torch.stack(kept)
+    if cpu.is_supported(matrices, position):
+        return cpu.carve(outside, matrices, position, tolerance)
+    element = torch.arange(len(lower), device=lower.device)[:, None, None, None]
+    votes = torch.zeros(len(lower), *3 * (cells,), dtype=torch.uint8, device=lower.device)
+    for v in range(outside.shape[1]):
+        x, y, z = (matrices[:, v, :, axis, None] * position[:, None, axis] for axis in range(3))
+        z = z + matrices[:, v, :, 3, None]
+        pixel = (x[..., :, None] + y[..., None, :])[..., None] + z[..., None, None, :]
+        votes += look_up(outside[:, v], element, *pixel.unbind(1))
+    return votes <= tolerance
 
 
 def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:
@@ -158,7 +159,7 @@ def _center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "
     centroid = torch.where(counts[..., None] > 0, sums / counts.clamp(min=1)[..., None], axis)
     rays = torch.stack((centroid, axis), dim=-2)
     rays = torch.cat((rays, torch.ones_like(rays[..., :1])), -1)
-    to_world = extrinsics[..., :3, :3].mT @ torch.linalg.inv(intrinsics)
+    to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
     directions = F.normalize(torch.einsum("bvij,bvrj->bvri", to_world, rays), dim=-1)
     weights = torch.stack((counts > 0, torch.full_like(counts, 1e-3, dtype=rays.dtype)), -1)
     identity = torch.eye(3, device=rays.device, dtype=rays.dtype)

@@ -8,13 +8,18 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.box import SubjectBox
 from ghgs_lit.bounds.rays import depths_in_box, projection_matrices, ray_directions
 from ghgs_lit.bounds.silhouettes import Silhouettes, dilate, look_up, votes_outside
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Batch, Cameras, DepthBounds
+
+#: Depths that are held at once (bounds memory).
+_DEPTHS = 1 << 23
 
 
 @dataclass(frozen=True)
@@ -63,30 +68,51 @@ def hull_bounds(
         samples: depths that are tried along each ray.
     """
     outside = votes_outside(dilate(masks, radius), masks)
-    near, far = start.near.clone(), start.far.clone()
+    near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
     steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
-    directions, centers = ray_directions(cameras), cameras.centers
-    projections = projection_matrices(cameras)
-    for b in range(masks.shape[0]):
-        for v in range(masks.shape[1]):
-            rays = masks[b, v].nonzero(as_tuple=True)
-            begin, length = near[b, v][rays], (far - near)[b, v][rays]
-            depth = begin[:, None] + steps * length[:, None]
-            votes = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
-            for u in range(masks.shape[1]):
-                if u != v:
-                    along = (projections[b, u, :, :3] * directions[b, v][rays][:, None]).sum(-1)
-                    origin = (projections[b, u, :, :3] * centers[b, v]).sum(-1) + projections[b, u, :, 3]
-                    pixel = [torch.addcmul(origin[i], depth, along[:, i, None]) for i in range(3)]
-                    votes += look_up(outside[b, u], *pixel)
-            inside = (votes <= tolerance).to(torch.uint8)
-            hit = inside.amax(1).bool()
-            half = length / (2 * samples)
-            first = depth.gather(1, inside.argmax(1, keepdim=True))[:, 0] - half
-            last = depth.gather(1, samples - 1 - inside.flip(1).argmax(1, keepdim=True))[:, 0] + half
-            near[b, v][rays] = torch.where(hit, first, begin)
-            far[b, v][rays] = torch.where(hit, last, begin + length)
+    directions, matrices = ray_directions(cameras), projection_matrices(cameras)
+    if cpu.is_supported(near, directions, matrices):
+        cpu.march(outside, masks, matrices, directions, cameras.centers, near, far, steps, tolerance)
+        return DepthBounds(near, far)
+    rays = masks.flatten().nonzero()[:, 0]
+    for part in even_parts(len(rays), _DEPTHS // samples):
+        _march(rays[part], outside, matrices, directions, cameras.centers, near, far, steps, tolerance)
     return DepthBounds(near, far)
+
+
+def _march(
+    rays: Int[Tensor, " r"],
+    outside: UInt8[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    directions: Float[Tensor, "B V h w 3"],
+    centers: Float[Tensor, "B V 3"],
+    near: Float[Tensor, "B V h w"],
+    far: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, " s"],
+    tolerance: int,
+) -> None:
+    """As :func:`ghgs_lit.bounds.cpu.march`, for pixels ``rays`` of all images together."""
+    views, samples = outside.shape[1], len(steps)
+    image = rays // outside[0, 0].numel()
+    begin, end = (bound.view(-1)[rays] for bound in (near, far))
+    length = end - begin
+    depth = begin[:, None] + steps * length[:, None]
+    direction, center = directions.reshape(-1, 1, 3)[rays], centers.reshape(-1, 1, 3)[image]
+    votes = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
+    for turn in range(1, views):
+        other = image // views * views + (image + turn) % views
+        matrix = matrices.flatten(0, 1)[other]
+        along = (matrix[..., :3] * direction).sum(-1)
+        origin = (matrix[..., :3] * center).sum(-1) + matrix[..., 3]
+        pixel = [torch.addcmul(origin[:, i, None], depth, along[:, i, None]) for i in range(3)]
+        votes += look_up(outside.flatten(0, 1), other[:, None], *pixel)
+    inside = (votes <= tolerance).to(torch.uint8)
+    hit = inside.amax(1).bool()
+    half = length / (2 * samples)
+    first = depth.gather(1, inside.argmax(1, keepdim=True))[:, 0] - half
+    last = depth.gather(1, samples - 1 - inside.flip(1).argmax(1, keepdim=True))[:, 0] + half
+    near.view(-1)[rays] = torch.where(hit, first, begin)
+    far.view(-1)[rays] = torch.where(hit, last, end)
 
 
 def _enlarge(values: Tensor, stride: int, size: tuple[int, int]) -> Tensor:

@@ -7,7 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, world_to_camera
+from ghgs_lit.geometry.projection import (
+    at_least_float32,
+    inverse_intrinsics,
+    pixel_centers,
+    world_to_camera,
+)
 from ghgs_lit.types import Cameras, DepthBounds
 
 
@@ -16,7 +21,7 @@ def ray_directions(cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     centers = pixel_centers(cameras.height, cameras.width, intrinsics)
     centers = torch.cat((centers, torch.ones_like(centers[..., :1])), dim=-1)
-    to_world = extrinsics[..., :3, :3].mT @ torch.linalg.inv(intrinsics)
+    to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
     return torch.einsum("...ij,hwj->...hwi", to_world, centers)
 
 

@@ -5,7 +5,7 @@ from math import ceil
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, Shaped, UInt8
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
@@ -48,15 +48,22 @@ def silhouettes(batch: Batch, resolution: int, dilation: float) -> Silhouettes:
     return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)))
 
 
-def dilate(masks: Bool[Tensor, "*batch h w"], radius: int) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it)."""
+def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tensor, "*batch h w"]:
+    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it).
+
+    Args:
+        masks: to be grown.
+        radius: one for all masks, or integers that broadcast with them.
+    """
     grown = masks
     for dim in (-2, -1):
         size = masks.shape[dim]
         index = torch.arange(size, device=masks.device)
+        index = index[:, None] if dim == -2 else index
         counts = F.pad(grown.cumsum(dim, dtype=torch.int32), (0, 0, 1, 0) if dim == -2 else (1, 0))
-        high = counts.index_select(dim, (index + radius + 1).clamp(max=size))
-        grown = high > counts.index_select(dim, (index - radius).clamp(min=0))
+        high, low = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
+        high, low = (counts.gather(dim, ends.long().expand(masks.shape)) for ends in (high, low))
+        grown = high > low
     return grown
 
 
@@ -68,15 +75,22 @@ def votes_outside(
     return (~dilated & votes[..., None, None]).to(torch.uint8)
 
 
-def look_up(table: Tensor, x: Tensor, y: Tensor, w: Tensor) -> Tensor:
-    """Entries of one table [h, w] at homogeneous pixels; overwrites ``x``, ``y`` and ``w``.
+def look_up(
+    tables: Shaped[Tensor, "n h w"], image: Int[Tensor, "..."], x: Tensor, y: Tensor, w: Tensor
+) -> Tensor:
+    """Entries of ``tables`` at homogeneous pixels; overwrites ``x``, ``y`` and ``w``.
 
     Points outside the frame take the entry of the nearest border pixel: a mask that does not touch the border
     has the whole subject in its frame. Points behind the camera land far outside the frame.
+
+    Args:
+        tables: one for each image.
+        image: which table; broadcasts with the pixels.
+        x, y, w: homogeneous pixels.
     """
-    height, width = table.shape
+    height, width = tables.shape[1:]
     inverse = w.clamp_(min=NEAREST).reciprocal_()
     # Cameras of absurd sizes overflow to NaN, which has no index.
     column = x.mul_(inverse).nan_to_num_().clamp_(0, width - 1).int()
     row = y.mul_(inverse).nan_to_num_().clamp_(0, height - 1).int()
-    return table.flatten().take(row.mul_(width).add_(column).long())
+    return tables.flatten().take(row.mul_(width).add_(column) + image * (height * width))

@@ -6,11 +6,16 @@ in the views that see it.
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import at_least_float32, pixel_centers
+from ghgs_lit.geometry import cpu
+from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Batch, Cameras, DepthBounds
+
+#: Samples that are held at once (bounds memory).
+_SAMPLES = 1 << 22
 
 #: Mean absolute difference of two colours at which the consistency is 1 / e.
 TOLERANCE = 0.1
@@ -43,34 +48,57 @@ def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V 
     near, far = at_least_float32(bounds.near), at_least_float32(bounds.far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     colors = _smooth(batch.images.to(near), batch.masks)
-    centers = pixel_centers(height, width, near)
     turn, shift, facing = (relation.to(near) for relation in _relations(batch.cameras))
-    result = near.new_zeros(b, v, height, width, steps)
-    for i in range(b):
-        for j in range(v):
-            mask = batch.masks[i, j]
-            low, high = near[i, j][mask], far[i, j][mask]
-            depth = low[:, None] + (high - low)[:, None] * shares
-            pixels = F.pad(centers[mask], (0, 1), value=1.0)
-            own = colors[i, j, :3][:, mask].T
-            best = torch.zeros_like(depth)
-            for k in range(v):
-                if k == j or facing[i, j, k] < WIDEST:
-                    continue
-                rays = pixels @ turn[i, j, k].T
-                best = torch.maximum(best, _match(colors[i, k], own, rays, shift[i, j, k], depth))
-            result[i, j][mask] = best
-    return result.permute(0, 1, 4, 2, 3)
+    compared = ~(facing < WIDEST)
+    if cpu.is_supported(near, far):
+        result = cpu.sweep(colors, batch.masks, near, far, turn, shift, compared, shares, TOLERANCE)
+        return result.permute(0, 1, 4, 2, 3)
+    result = near.new_zeros(b * v * height * width, steps)
+    pixels = batch.masks.flatten().nonzero()[:, 0]
+    for part in even_parts(len(pixels), _SAMPLES // steps):
+        some = pixels[part]
+        low, high = (bound.flatten()[some, None] for bound in (near, far))
+        depth = low + (high - low) * shares
+        result[some] = _best_match(some, depth, colors, turn, shift, compared)
+    return result.view(b, v, height, width, steps).permute(0, 1, 4, 2, 3)
 
 
-def _match(other: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tensor) -> Tensor:
-    """Agreement [n, S] of colours ``own`` with the view ``other`` [4, H, W] along their rays in it."""
-    points = rays[:, None] * depth[..., None] + shift
+def _best_match(
+    pixels: Int[Tensor, " n"],
+    depth: Float[Tensor, "n S"],
+    colors: Float[Tensor, "B V 4 H W"],
+    turn: Float[Tensor, "B V V 3 3"],
+    shift: Float[Tensor, "B V V 3"],
+    compared: Bool[Tensor, "B V V"],
+) -> Float[Tensor, "n S"]:
+    """Agreement of pixels of all images together, at their depths, with the best other view."""
+    views, _, height, width = colors.shape[1:]
+    image, place = pixels // (height * width), pixels % (height * width)
+    centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
+    flat = colors.flatten(0, 1)
+    own = flat.flatten(2)[image, :3, place]
+    best = torch.zeros_like(depth)
+    for turned in range(1, views):
+        k = (image + turned) % views
+        pair = image * views + k
+        rays = (turn.flatten(0, 2)[pair] * centers[:, None]).sum(-1)
+        found = _match(flat, image // views * views + k, own, rays, shift.flatten(0, 2)[pair], depth)
+        best = torch.maximum(best, found * compared.flatten()[pair, None])
+    return best
+
+
+def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tensor) -> Tensor:
+    """Agreement [n, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W] along their rays in them."""
+    points = rays[:, None] * depth[..., None] + shift[:, None]
     z = points[..., 2:]
     front = z > 0
-    size = points.new_tensor([other.shape[-1], other.shape[-2]])
+    count, _, height, width = images.shape
+    size = points.new_tensor([width, height])
     grid = points[..., :2] / torch.where(front, z, 1.0) * (2 / size) - 1
-    seen = F.grid_sample(other[None], grid[None], align_corners=False)[0]
+    # The images are the layers of a volume; all points lie in the middle of a layer.
+    layer = ((2 * image + 1) / count - 1).to(grid)[:, None, None].expand(*depth.shape, 1)
+    grid = torch.cat((grid, layer), -1)
+    seen = F.grid_sample(images.transpose(0, 1)[None], grid[None, None], align_corners=False)[0, :, 0]
     difference = (seen[:3] - own.T[:, :, None]).abs().mean(0)
     return torch.exp(-difference / TOLERANCE) * seen[3] * front[..., 0]
 
@@ -89,6 +117,6 @@ def _relations(cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
     intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
     rotation, translation = extrinsics[..., :3, :3], extrinsics[..., :3, 3:]
     relative = rotation[:, None] @ rotation[:, :, None].mT
-    turn = intrinsics[:, None] @ relative @ torch.linalg.inv(intrinsics)[:, :, None]
+    turn = intrinsics[:, None] @ relative @ inverse_intrinsics(intrinsics)[:, :, None]
     shift = intrinsics[:, None] @ (translation[:, None] - relative @ translation[:, :, None])
     return turn, shift[..., 0], relative[..., 2, 2]

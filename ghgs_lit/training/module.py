@@ -160,7 +160,7 @@ class GHGSModule(L.LightningModule):
             DivergedError: the norm is not finite (names a parameter).
         """
         self.optimization.drop_frozen_gradients(self.model, self.used_budget)
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
         if torch.isfinite(norm):
             self.log("train/gradient_norm", norm)
         elif self._scaler is None or self._scaler.get_scale() <= 1:

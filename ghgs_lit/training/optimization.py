@@ -86,6 +86,8 @@ class Optimization:
         AdamW then leaves these parameters unchanged, without weight decay.
         """
         frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
+        if not frozen:
+            return
         for name, parameter in model.named_parameters():
             if name.startswith(frozen):
                 parameter.grad = None

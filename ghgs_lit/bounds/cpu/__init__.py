@@ -1,0 +1,5 @@
+"""The two searches of the bounds for CPUs: a cell or a ray is left as soon as its answer is known."""
+
+from ghgs_lit.bounds.cpu.search import carve, is_supported, march
+
+__all__ = ["carve", "is_supported", "march"]

@@ -1,0 +1,89 @@
+"""Carving and marching, distributed over threads; the result has the same bits with any number of them."""
+
+from functools import partial
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from ghgs_lit.kernels import pool
+from ghgs_lit.kernels.parts import even_parts
+
+#: Slices of a grid, or rows of an image, of one task.
+_SLICES, _ROWS = 8, 16
+
+
+def is_supported(*tensors: Tensor) -> bool:
+    """Whether the kernels can work on these: on a CPU, floats in float32."""
+    return all(
+        x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in tensors
+    )
+
+
+def carve(
+    outside: UInt8[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    position: Float[Tensor, "B 3 n"],
+    tolerance: int,
+) -> Bool[Tensor, "B n n n"]:
+    """Which cells of a grid at most ``tolerance`` views place outside; see :func:`subject_box`.
+
+    Args:
+        outside: 1 where a view says "outside".
+        matrices: world points to pixels.
+        position: of the cells along each axis.
+        tolerance: votes that a kept cell may have.
+    """
+    from ghgs_lit.bounds.cpu.kernel import carve_slices  # here: it loads a compiler
+
+    elements, cells = position.shape[0], position.shape[2]
+    kept = torch.empty(elements, cells, cells, cells, dtype=torch.bool)
+    arrays = [x.contiguous().numpy() for x in (outside, matrices, position, kept)]
+    pool.run(
+        [
+            partial(carve_slices(), *arrays, tolerance, element, part.start, part.stop)
+            for element in range(elements)
+            for part in even_parts(cells, _SLICES)
+        ],
+        kept.numel(),
+    )
+    return kept
+
+
+def march(
+    outside: UInt8[Tensor, "B V h w"],
+    masks: Bool[Tensor, "B V h w"],
+    matrices: Float[Tensor, "B V 3 4"],
+    directions: Float[Tensor, "B V h w 3"],
+    centers: Float[Tensor, "B V 3"],
+    near: Float[Tensor, "B V h w"],
+    far: Float[Tensor, "B V h w"],
+    steps: Float[Tensor, " s"],
+    tolerance: int,
+) -> None:
+    """Change ``near`` and ``far`` to the first and the last depth that the other views allow.
+
+    Args:
+        outside: 1 where a view says "outside".
+        masks: rays of their pixels are searched.
+        matrices: world points to pixels.
+        directions: of the rays, per metre of depth.
+        centers: of the cameras.
+        near, far: contiguous; rays that miss the hull keep theirs.
+        steps: shares of the way from near to far that are tried.
+        tolerance: votes that an allowed depth may have.
+    """
+    from ghgs_lit.bounds.cpu.kernel import march_rows
+
+    elements, views, height, _ = masks.shape
+    tables = (outside, masks, matrices, directions, centers)
+    arrays = [x.contiguous().numpy() for x in tables] + [near.numpy(), far.numpy(), steps.numpy()]
+    pool.run(
+        [
+            partial(march_rows(), *arrays, tolerance, element, view, part.start, part.stop)
+            for element in range(elements)
+            for view in range(views)
+            for part in even_parts(height, _ROWS)
+        ],
+        masks.numel(),
+    )

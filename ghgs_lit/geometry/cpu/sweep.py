@@ -1,0 +1,71 @@
+"""The plane sweep, distributed over threads; the result has the same bits with any number of them."""
+
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.kernels import pool
+from ghgs_lit.kernels.parts import even_parts
+
+#: Rows of an image of one task.
+_ROWS = 16
+
+
+def is_supported(*tensors: Tensor) -> bool:
+    """Whether the kernel can work on these."""
+    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+
+
+def sweep(
+    colors: Float[Tensor, "B V 4 H W"],
+    masks: Bool[Tensor, "B V H W"],
+    near: Float[Tensor, "B V H W"],
+    far: Float[Tensor, "B V H W"],
+    turn: Float[Tensor, "B V V 3 3"],
+    shift: Float[Tensor, "B V V 3"],
+    compared: Bool[Tensor, "B V V"],
+    shares: Float[Tensor, " S"],
+    tolerance: float,
+) -> Float[Tensor, "B V H W S"]:
+    """Agreement of the subject's pixels with the best other view; 0 elsewhere.
+
+    Args:
+        colors: smoothed photographs, and their masks as a fourth channel.
+        masks: of the subject.
+        near, far: of the depths that are compared.
+        turn, shift: from pixels of a view (second axis) to those of another (third axis).
+        compared: which pairs of views are compared.
+        shares: of the way from near to far.
+        tolerance: difference of colours at which the agreement is 1 / e.
+    """
+    from ghgs_lit.geometry.cpu.kernel import sweep_rows  # here: it loads a compiler
+
+    elements, views, height, width = masks.shape
+    # A rim of zeros is what lies outside a photograph; one pixel's channels lie side by side.
+    padded = np.zeros((elements, views, height + 2, width + 2, 4), np.float32)
+    padded[:, :, 1:-1, 1:-1] = colors.movedim(2, -1).numpy()
+    result = np.zeros((elements, views, height, width, len(shares)), np.float32)
+    tables = [x.detach().contiguous().numpy() for x in (masks, near, far, turn, shift, compared, shares)]
+    pool.run(
+        [
+            partial(
+                sweep_rows(),
+                padded.reshape(-1),
+                *tables,
+                tolerance,
+                result,
+                element,
+                view,
+                part.start,
+                part.stop,
+            )
+            for element in range(elements)
+            for view in range(views)
+            for part in even_parts(height, _ROWS)
+        ],
+        masks.numel(),
+    )
+    return torch.from_numpy(result)
