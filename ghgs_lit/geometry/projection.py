@@ -50,10 +50,14 @@ def unproject(
     fx, fy = intrinsics[..., 0, 0], intrinsics[..., 1, 1]
     y = (pixels[..., 1] - intrinsics[..., 1, 2]) / fy
     x = (pixels[..., 0] - intrinsics[..., 0, 2] - intrinsics[..., 0, 1] * y) / fx
-    camera = torch.stack((x * depth, y * depth, depth), dim=-1)
-    centered = camera - extrinsics[..., :3, 3]
-    # A product with R^T, written out because matmul would run in half precision under autocast.
-    return (extrinsics[..., :3, :3] * centered[..., :, None]).sum(-2)
+    shift = extrinsics[..., :3, 3]
+    x, y, z = x * depth - shift[..., 0], y * depth - shift[..., 1], depth - shift[..., 2]
+    # A product with R^T, written out: matmul would run in half precision under autocast, and axis by axis
+    # there is no temporary of nine numbers for each pixel.
+    rows = extrinsics[..., :3, :3].unbind(-2)
+    return torch.stack(
+        [x * rows[0][..., k] + y * rows[1][..., k] + z * rows[2][..., k] for k in range(3)], -1
+    )
 
 
 def unproject_maps(

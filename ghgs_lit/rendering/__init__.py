@@ -1,8 +1,7 @@
 """Gaussian splatting: ``render`` and ``Renderer``; ``settings`` defines the image."""
 
 from ghgs_lit.rendering.api import Renderer, render
-from ghgs_lit.rendering.culling import Culled, cull
 from ghgs_lit.rendering.gsplat_backend import BackendUnavailable
 from ghgs_lit.rendering.settings import RasterSettings
 
-__all__ = ["BackendUnavailable", "Culled", "RasterSettings", "Renderer", "cull", "render"]
+__all__ = ["BackendUnavailable", "RasterSettings", "Renderer", "render"]
