@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
@@ -50,7 +50,7 @@ class GHGS(nn.Module):
         crop: let the stages see crops around the subject; the prediction is that of whole photographs.
         pad: ``multiple`` gives photographs of any size a black border up to the next multiple of the patch
             size; ``none`` refuses them.
-        check_inputs: refuse values that are not finite or out of range (:func:`check_values`).
+        check_inputs: refuse values that are not finite or out of range (:func:`check_batch`).
     """
 
     def __init__(
@@ -103,11 +103,9 @@ class GHGS(nn.Module):
         """Gaussians, depths and points of a batch.
 
         Raises:
-            InputError: :func:`check_batch` or :func:`check_values` refuses the batch.
+            InputError: :func:`check_batch` refuses the batch.
         """
-        check_batch(batch, self.side_multiple)
-        if self.check_inputs:
-            check_values(batch)
+        check_batch(batch, self.side_multiple, self.check_inputs)
         # From whole photographs: a crop hides what lies at its border, padding invents something there.
         bounds = self.bounds(batch)
         padding = pad_to_patches(batch.masks, self.encoder.patch_size) if self.pad == "multiple" else None
@@ -217,16 +215,33 @@ class GHGS(nn.Module):
         self.load_state_dict(state, assign=True)
 
 
-def check_batch(batch: Batch, patch_size: int) -> None:
+#: A field, what was expected of it, and which elements [B] or views [B, V] are not so.
+Finding = tuple[str, str, Tensor]
+
+
+def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
     """Refuse a batch that the stages cannot work on.
+
+    Values are looked at together, so that the host waits for a GPU once.
 
     Args:
         batch: the inputs; targets are not looked at.
         patch_size: must divide height and width, in pixels.
+        values: look also at every value, which would spread through every view: one NaN in the background
+            leaves no Gaussian.
 
     Raises:
-        InputError: names the field, what was expected and what was found.
+        InputError: names the field, what was expected and what was found, and where.
     """
+    _check_shapes(batch, patch_size)
+    findings = _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
+    if bool(torch.stack([bad.any() for _, _, bad in findings]).any()):
+        for name, expected, bad in findings:
+            found = f"others at {bad.nonzero().tolist()} (element, view)"
+            require(not bool(bad.any()), f"batch.{name}", expected, found)
+
+
+def _check_shapes(batch: Batch, patch_size: int) -> None:
     require(batch.images.dim() == 5, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
     for name, tensor in (("images", batch.images), ("depths", batch.depths)):
         floating = tensor is None or tensor.is_floating_point()
@@ -247,41 +262,32 @@ def check_batch(batch: Batch, patch_size: int) -> None:
     require(cameras.shape == (b, v), "batch.cameras", f"cameras of shape {(b, v)}", tuple(cameras.shape))
     size = (cameras.height, cameras.width)
     require(size == (height, width), "batch.cameras", f"the images' size {(height, width)}", size)
-    for name in ("intrinsics", "extrinsics"):
-        finite = getattr(cameras, name).isfinite().flatten(2).all(-1)
-        require(bool(finite.all()), f"batch.cameras.{name}", "finite values", _where(~finite))
-    positive = (cameras.intrinsics[..., [0, 1], [0, 1]] > 0).all(-1)
-    require(bool(positive.all()), "batch.cameras.intrinsics", "focal lengths above 0", _where(~positive))
-    seen = batch.masks.flatten(1).any(1)
-    require(bool(seen.all()), "batch.masks", "the subject in one view at least", _where(~seen))
 
 
-def check_values(batch: Batch) -> None:
-    """Refuse values that would spread through every view: one NaN in the background leaves no Gaussian.
+def _findings_of_cameras(batch: Batch) -> list[Finding]:
+    found = [
+        (f"cameras.{name}", "finite values", ~getattr(batch.cameras, name).isfinite().flatten(2).all(-1))
+        for name in ("intrinsics", "extrinsics")
+    ]
+    focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2]
+    found.append(("cameras.intrinsics", "focal lengths above 0", ~(focal > 0).all(-1)))
+    found.append(("masks", "the subject in one view at least", ~batch.masks.flatten(1).any(1)))
+    return found
 
-    Reads every value once.
 
-    Args:
-        batch: targets are not looked at.
-
-    Raises:
-        InputError: names the field, what was expected and where others were found.
-    """
-    _check_range("images", "finite values within [0, 1]", batch.images, 1.0)
+def _findings_of_values(batch: Batch) -> list[Finding]:
+    found = [("images", "finite values within [0, 1]", _beyond(batch.images, 1.0))]
     if batch.depths is not None:
-        _check_range("depths", "finite depths of 0 or more metres", batch.depths, torch.finfo().max)
-    for element, vertices in enumerate(batch.body_vertices or []):
-        finite = bool(vertices.isfinite().all())
-        require(finite, "batch.body_vertices", "finite coordinates", f"others in element {element}")
+        expected = "finite depths of 0 or more metres"
+        found.append(("depths", expected, _beyond(batch.depths, torch.finfo().max)))
+    if batch.body_vertices:
+        infinite = torch.stack([~vertices.isfinite().all() for vertices in batch.body_vertices])
+        found.append(("body_vertices", "finite coordinates", infinite))
+    return found
 
 
-def _check_range(name: str, expected: str, values: torch.Tensor, highest: float) -> None:
-    """Refuse values of views [B, V, ...] outside 0 to ``highest``, up to rounding, and NaN."""
+def _beyond(values: Tensor, highest: float) -> Tensor:
+    """Which views of values [B, V, ...] have one outside 0 to ``highest``, up to rounding, or NaN."""
     low, high = values.flatten(2).aminmax(dim=-1)
     # Written so that NaN, which both of them repeat, is not within.
-    within = (low >= -_ROUNDING) & (high <= highest + _ROUNDING)
-    require(bool(within.all()), f"batch.{name}", expected, _where(~within))
-
-
-def _where(bad: torch.Tensor) -> str:
-    return f"others at {bad.nonzero().tolist()} (element, view)"
+    return ~((low >= -_ROUNDING) & (high <= highest + _ROUNDING))

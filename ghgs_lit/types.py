@@ -80,10 +80,10 @@ class Cameras(_TensorStruct):
 
     def resized(self, height: int, width: int) -> "Cameras":
         """The same cameras for an image resized to ``height`` x ``width``."""
-        scale = self.intrinsics.new_tensor([width / self.width, height / self.height, 1.0])
-        return dataclasses.replace(
-            self, intrinsics=self.intrinsics * scale[:, None], height=height, width=width
-        )
+        intrinsics = self.intrinsics.clone()
+        intrinsics[..., 0, :] *= width / self.width
+        intrinsics[..., 1, :] *= height / self.height
+        return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def cropped(
         self, top: Int[Tensor, "*batch"] | int, left: Int[Tensor, "*batch"] | int, height: int, width: int

@@ -354,7 +354,7 @@ def spoiled(name, index, value):
         (spoiled("images", (0, 0, 0, 0, 0), -0.5), r"batch.images: .*within \[0, 1\]"),
         (spoiled("depths", (0, 1, 3, 3), torch.nan), r"batch.depths: .*\[\[0, 1\]\]"),
         (spoiled("depths", (0, 1, 3, 3), -1.0), r"batch.depths: expected finite depths"),
-        ({"body_vertices": [torch.tensor([[0.0, torch.nan, 0.0]])]}, r"batch.body_vertices: .* element 0"),
+        ({"body_vertices": [torch.tensor([[0.0, torch.nan, 0.0]])]}, r"batch.body_vertices: .*\[\[0\]\]"),
         ({"images": torch.zeros(1, 2, 3, 56, 56, dtype=torch.uint8)}, r"batch.images: .*torch.uint8"),
         ({"masks": torch.ones(1, 2, 56, 56, dtype=torch.uint8)}, r"batch.masks: .*torch.uint8"),
     ],

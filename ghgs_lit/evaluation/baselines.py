@@ -47,7 +47,7 @@ def splats_at(
         opacity: in (0, 1).
     """
     points = unproject_maps(depth, batch.cameras)[valid]
-    focal = batch.cameras.intrinsics[..., [0, 1], [0, 1]].mean(-1)
+    focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1)
     scale = (sigma * depth / focal[..., None, None])[valid]
     return Gaussians(
         means=points,

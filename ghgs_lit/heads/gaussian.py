@@ -91,7 +91,7 @@ class FootprintAttributes:
         opacity: Float[Tensor, " N"],
         footprint: Float[Tensor, " N"],
     ) -> Attributes:
-        identity = rotation.new_tensor([1.0, 0.0, 0.0, 0.0])
+        identity = F.pad(rotation.new_ones(1), (0, 3))
         scale = self.scale_floor * torch.exp(self.scale_range * (scale + self.scale_bias).sigmoid())
         opacity = self.opacity_floor + (1 - self.opacity_floor) * (opacity + self.opacity_bias).sigmoid()
         return (
@@ -193,7 +193,11 @@ class GaussianHead(nn.Module):
         offset, scale, rotation, opacity, *color = (torch.cat(values) for values in raw)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
         focal = (
-            at_least_float32(batch.cameras.intrinsics)[..., [0, 1], [0, 1]].prod(-1).sqrt().flatten()[image]
+            at_least_float32(batch.cameras.intrinsics)
+            .diagonal(dim1=-2, dim2=-1)[..., :2]
+            .prod(-1)
+            .sqrt()
+            .flatten()[image]
         )
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
         # Without a gradient: a splat that is too large must not move nearer to become smaller.

@@ -1,0 +1,134 @@
+"""What a GPU would be asked for, by stage: operator calls, and waits of the host. No GPU is needed.
+
+Counted on the pretend device of the tests. A GPU starves where calls are many and small, and it idles where
+the host waits for a value. A list that is copied to the device makes the host wait, too.
+
+    python benchmarks/device.py                          # vggt_nano, two elements of four views of 140 x 140
+    python benchmarks/device.py --lines model=paper      # which lines wait; with overrides of `ghgs train`
+
+Rendering is left out: it is one call of gsplat for each element.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import nn
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from ghgs_lit.benchmark.scene import ellipsoid_batch
+from ghgs_lit.benchmark.stages import OTHER, TOTAL, top_level, watched
+from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.losses import Losses
+from ghgs_lit.model import GHGS
+from ghgs_lit.training import Optimization
+from ghgs_lit.types import Batch, Rendering
+from tests.helpers.pretend_device import DEVICE, Log, pretend_device
+
+Counts = dict[str, tuple[int, int]]
+
+
+class CountingProbe:
+    """Calls and waits of each stage (a probe of ``ghgs_lit.benchmark.stages``)."""
+
+    def __init__(self, log: Log):
+        self.log = log
+        self.counts: Counts = {}
+        self._open: list[tuple[int, int]] = []
+
+    def begin(self, stage: str) -> None:
+        self._open.append(self._so_far())
+
+    def end(self, stage: str) -> None:
+        numbers = zip(self.counts.get(stage, (0, 0)), self._so_far(), self._open.pop(), strict=True)
+        self.counts[stage] = tuple(old + now - before for old, now, before in numbers)
+
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        self.begin(stage)
+        yield
+        self.end(stage)
+
+    def _so_far(self) -> tuple[int, int]:
+        return self.log.calls.total(), self.log.waits.total()
+
+
+def forward(model: GHGS, batch: Batch, log: Log) -> Counts:
+    """Counts of one prediction without a gradient."""
+    probe = CountingProbe(log)
+    with torch.no_grad(), watched(model, probe), probe.of(TOTAL):
+        model(batch)
+    stages = [probe.counts[name] for name in top_level(probe.counts)]
+    rest = (sum(numbers) for numbers in zip(*stages, strict=True))
+    probe.counts[OTHER] = tuple(a - b for a, b in zip(probe.counts[TOTAL], rest, strict=True))
+    return probe.counts
+
+
+def second_step(model: GHGS, options: Optimization, batch: Batch, log: Log) -> Counts:
+    """Counts of a training step whose renderer gives black images, without making the optimizer's state."""
+    optimizer = options.build(model)
+    step(model, options, optimizer, batch, log)
+    optimizer.zero_grad()
+    return step(model, options, optimizer, batch, log)
+
+
+def step(
+    model: GHGS, options: Optimization, optimizer: torch.optim.Optimizer, batch: Batch, log: Log
+) -> Counts:
+    losses, probe = Losses({"render_l1": 0.8, "depth": 0.2}), CountingProbe(log)
+    with probe.of("forward"):
+        prediction = model(batch)
+    with probe.of("loss"):
+        gaussians = prediction.gaussians
+        seen = sum(
+            getattr(gaussians, name).sum() for name in ("quaternions", "scales", "opacities", "colors")
+        )
+        black = torch.zeros_like(batch.targets.images) + seen * 0
+        total = losses(prediction, Rendering(black, black[:, :, :1], black[:, :, :1]), batch)[0]
+    with probe.of("backward"):
+        total.backward()
+    with probe.of("optimizer"):
+        nn.utils.clip_grad_norm_(model.parameters(), options.clip)
+        optimizer.step()
+    return probe.counts
+
+
+def show(title: str, found: list[Counts], sizes: list[int]) -> None:
+    heads = "".join(f"{f'batch {size}':>16}" for size in sizes)
+    print(f"\n{title:24}{heads}\n{'':24}" + f"{'calls':>9}{'waits':>7}" * len(sizes))
+    for name in found[0]:
+        print(f"{name:24}" + "".join(f"{counts[name][0]:9}{counts[name][1]:7}" for counts in found))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("overrides", nargs="*", help="of the configuration, such as model=paper skip=fast")
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--size", type=int, default=140)
+    parser.add_argument("--lines", action="store_true", help="name the lines that wait")
+    options = parser.parse_args()
+    config = resolve(compose("train", ["encoder=vggt_nano", *options.overrides]))
+    predictions, steps = [], []
+    with pretend_device(options.lines) as log:
+        model = GHGS.from_config(config).to(DEVICE)
+        for size in options.batches:
+            batch = ellipsoid_batch(0.15, options.views, options.size, size)
+            depths = 2.0 * batch.masks
+            batch = Batch(batch.images, batch.masks, batch.cameras, batch.targets, depths=depths).to(DEVICE)
+            log.clear()
+            predictions.append(forward(model, batch, log))
+            if options.lines:
+                for (reason, line), count in log.waits.most_common():
+                    print(f"batch {size}: {count:4} {reason:20} {line}")
+            steps.append(second_step(model, build(config["optimizer"], "optimizer"), batch, log))
+    show("prediction", predictions, options.batches)
+    show("training step", steps, options.batches)
+
+
+if __name__ == "__main__":
+    main()
