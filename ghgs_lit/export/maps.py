@@ -72,25 +72,23 @@ def write_points(scene: Scene, directory: Path) -> list[Path]:
 
 
 def write_inputs(scene: Scene, directory: Path) -> list[Path]:
-    """``inputs/<view>.png``, what the model saw with its mask as alpha, and ``cameras.json``."""
+    """``inputs/<view>.png``, what the model saw with its mask as alpha, and ``cameras.json``.
+
+    Both are what ``ghgs predict images=inputs cameras=cameras.json`` reads.
+    """
     paths = [directory / "inputs" / f"{file_name(view)}.png" for view in scene.views]
     for path, image, mask in zip(paths, scene.images, scene.masks, strict=True):
         alpha = mask.cpu().numpy()[..., None].astype(np.uint8) * 255
         picture = Image.fromarray(np.concatenate([to_uint8(image), alpha], -1))
         write_atomically(path, lambda p, image=picture: image.save(p, format="PNG"))
     cameras = {
-        path.name: {
-            "width": scene.cameras.width,
-            "height": scene.cameras.height,
+        path.stem: {
             "intrinsics": camera.intrinsics.tolist(),
             "extrinsics": camera.extrinsics.tolist(),
+            "size": [camera.height, camera.width],
         }
         for path, camera in zip(paths, (scene.cameras[i] for i in range(len(paths))), strict=True)
     }
-    content = {
-        "convention": "OpenCV axes; extrinsics: world to camera; pixel centres at +0.5",
-        "cameras": cameras,
-    }
     path = directory / "cameras.json"
-    write_text_atomically(path, json.dumps(content, indent=1))
+    write_text_atomically(path, json.dumps({"cameras": cameras}, indent=1))
     return [*paths, path]

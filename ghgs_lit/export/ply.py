@@ -4,6 +4,7 @@ Positions in metres in the world frame, opacity as logit, standard deviations as
 ``(w, x, y, z)``, colour as the constant term of spherical harmonics.
 """
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,12 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     Raises:
         InputError: several subjects, or other colours.
     """
+    data = ply_bytes(gaussians)
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
+
+
+def ply_bytes(gaussians: Gaussians) -> bytes:
+    """The content of the file; see :func:`write_ply`."""
     require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
     channels = gaussians.colors.shape[1]
     require(channels == 3, "write_ply", "colours of 3 channels", channels)
@@ -53,7 +60,9 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     for group, names in _GROUPS.items():
         for column, name in enumerate(names):
             vertices[name] = values[group][:, column].numpy()
-    write_atomically(path, PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write)
+    content = BytesIO()
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
+    return content.getvalue()
 
 
 def read_ply(path: Path) -> Gaussians:

@@ -2,23 +2,28 @@
 
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from ghgs_lit.export.compact import FORMATS, write_compact
+from ghgs_lit.export.gltf import write_glb
 from ghgs_lit.export.maps import depth_unit, write_depths, write_inputs, write_points
-from ghgs_lit.export.ply import write_ply
+from ghgs_lit.export.page import write_page
+from ghgs_lit.export.ply import ply_bytes, write_ply
 from ghgs_lit.export.scene import OutputOptions, Scene, options_of, scene_of
-from ghgs_lit.files import write_text_atomically
+from ghgs_lit.export.splat import to_records
+from ghgs_lit.export.video import write_mp4
+from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.runs.results import plain
 from ghgs_lit.types import Batch, Prediction
-from ghgs_lit.visualization.pictures import save_png, sheet, to_uint8
-from ghgs_lit.visualization.turntable import turntable
+from ghgs_lit.visualization.pictures import save_png, sheet
 
 
 def _ply(scene: Scene, directory: Path) -> list[Path]:
@@ -27,19 +32,53 @@ def _ply(scene: Scene, directory: Path) -> list[Path]:
     return [path]
 
 
+def _compact(scene: Scene, directory: Path, name: str) -> list[Path]:
+    path = directory / f"gaussians.{FORMATS[name]}"
+    write_compact(ply_bytes(scene.gaussians), path, name)
+    return [path]
+
+
+def _splat(scene: Scene, directory: Path) -> list[Path]:
+    path = directory / "gaussians.splat"
+    data = to_records(scene.gaussians).tobytes()
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))
+    return [path]
+
+
+def _glb(scene: Scene, directory: Path) -> list[Path]:
+    path = directory / "gaussians.glb"
+    write_glb(scene.gaussians, scene.up, path)
+    return [path]
+
+
+def _html(scene: Scene, directory: Path) -> list[Path]:
+    path = directory / "viewer.html"
+    write_page(scene.gaussians, scene.cameras, scene.views, scene.up, scene.name, path)
+    return [path]
+
+
 def _turntable(scene: Scene, directory: Path) -> list[Path]:
     """Pictures from all around, ``turntable/000.png`` and so on."""
-    orbit = turntable(scene.cameras, scene.options.frames)
     paths = [directory / "turntable" / f"{frame:03d}.png" for frame in range(scene.options.frames)]
-    for frame, path in enumerate(paths):
-        image = scene.renderer(scene.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
-        save_png(to_uint8(image), path)
+    for picture, path in zip(scene.turntable, paths, strict=True):
+        save_png(picture, path)
     return paths
+
+
+def _mp4(scene: Scene, directory: Path) -> list[Path]:
+    path = directory / "turntable.mp4"
+    write_mp4(scene.turntable, path, scene.options.fps)
+    return [path]
 
 
 WRITERS: dict[str, Callable[[Scene, Path], list[Path]]] = {
     "ply": _ply,
+    **{name: partial(_compact, name=name) for name in FORMATS},
+    "splat": _splat,
+    "glb": _glb,
+    "html": _html,
     "turntable": _turntable,
+    "mp4": _mp4,
     "depth": write_depths,
     "points": write_points,
     "inputs": write_inputs,

@@ -2,18 +2,31 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.export.world import AXES, rotate_world, turn
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
-from ghgs_lit.visualization.turntable import up_direction
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import turntable, up_direction
+
+#: The package that a format needs, and the extra that installs it.
+PACKAGES = {
+    "compressed_ply": ("gaussforge", "formats"),
+    "spz": ("gaussforge", "formats"),
+    "sog": ("gaussforge", "formats"),
+    "glb": ("pygltflib", "formats"),
+    "mp4": ("imageio_ffmpeg", "video"),
+}
 
 
 @dataclass(frozen=True)
@@ -22,7 +35,7 @@ class OutputOptions:
 
     Args:
         formats: names of :data:`ghgs_lit.export.prediction.WRITERS`.
-        up: the axis (``y`` or ``z``) that points up in all files; None: the world of the cameras.
+        up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
         frames: pictures of the turntable.
         fps: of these, per second of the video.
     """
@@ -59,6 +72,16 @@ class Scene:
     up: Float[Tensor, "3"]
     renderer: Renderer
     options: OutputOptions
+
+    @cached_property
+    def turntable(self) -> list[np.ndarray]:
+        """Pictures [h, w, 3] uint8 from all around."""
+        orbit = turntable(self.cameras, self.options.frames)
+        images = (
+            self.renderer(self.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
+            for frame in range(self.options.frames)
+        )
+        return [to_uint8(image) for image in images]
 
 
 def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions) -> Scene:
@@ -115,12 +138,18 @@ def options_of(config: Mapping[str, Any], known: tuple[str, ...]) -> OutputOptio
         known: the formats that there are; ``all`` stands for them.
 
     Raises:
-        InputError: an unknown format or a value out of range.
+        InputError: an unknown format, a value out of range, or a package that is not installed.
     """
     formats = config["formats"]
     formats = [formats] if isinstance(formats, str) else formats
     formats = known if "all" in formats else tuple(dict.fromkeys(formats))
     for name in formats:
         choice("formats", name, ("all", *known))
+        package, extra = PACKAGES.get(name, (None, None))
+        if package is not None and find_spec(package) is None:
+            hint = f"pip install 'ghgs-lit[{extra}]'"
+            raise InputError(f"formats: expected the package {package} for {name} ({hint}); found none")
     table = config["turntable"]
-    return OutputOptions(formats, config["up"], table["frames"], table["fps"])
+    frames = table["frames"]
+    require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
+    return OutputOptions(formats, config["up"], frames, table["fps"])

@@ -9,7 +9,7 @@ from torch import Tensor
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.types import Cameras, Gaussians
 
-AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4"]:

@@ -11,11 +11,13 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
+from ghgs_lit.capture.calibration import calibrate
+from ghgs_lit.capture.formats.json_and_toml import read_json
 from ghgs_lit.errors import InputError
 from ghgs_lit.export import OutputOptions, output_options, write_prediction
 from ghgs_lit.export.maps import depth_unit
 from ghgs_lit.export.ply import read_ply
-from ghgs_lit.export.world import rotate_world, turn
+from ghgs_lit.export.world import AXES, rotate_world, turn
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.types import Cameras
@@ -59,7 +61,10 @@ def test_everything_is_written_and_reported(subject, tmp_path):
     photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
     assert np.array_equal(photograph[..., 3] > 0, valid[0])
     cameras = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
-    assert np.allclose(cameras["001_0.png"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)
+    stored = read_json(tmp_path / "cameras.json")
+    camera = calibrate(stored.cameras["001_0"], stored.convention, (16, 16))
+    assert np.allclose(camera.intrinsics, batch.cameras.intrinsics[0, 1], atol=1e-6)
+    assert np.allclose(cameras["001_0"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)
 
 
 def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
@@ -82,14 +87,14 @@ def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
     assert torch.allclose(pixels.round(decimals=2) % 1, torch.tensor(0.5), atol=0.02)
 
 
-@pytest.mark.parametrize("end", ["y", "z"])
+@pytest.mark.parametrize("end", AXES)
 @pytest.mark.parametrize(
     "up", [(0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, -1), (1, 0, 0), (0.6, -0.64, 0.48), (0, -1, 1e-9)]
 )
 def test_a_world_is_turned_as_scipy_turns_it(up, end):
     """Opposite directions, too; pictures stay as they were."""
     up = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
-    axis = torch.tensor({"y": [0.0, 1, 0], "z": [0.0, 0, 1]}[end], dtype=torch.float64)
+    axis = torch.tensor(AXES[end], dtype=torch.float64)
     quaternion = turn(up, axis)
     rotation = Rotation.from_quat(quaternion.numpy(), scalar_first=True)
     assert np.allclose(rotation.apply(up.numpy()), axis.numpy(), atol=1e-7)
@@ -121,7 +126,7 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     """Empty masks give empty files and a report without numbers."""
     batch, _ = subject
     batch = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), targets=None)
-    options = OutputOptions(("ply", "turntable", "depth", "points", "inputs"), frames=1)
+    options = OutputOptions(("ply", "splat", "html", "turntable", "depth", "points", "inputs"), frames=1)
     write_prediction(tmp_path, batch, Standin()(batch), Renderer(), options)
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["gaussians"] == 0
@@ -132,7 +137,11 @@ def test_a_subject_without_gaussians_is_written(subject, tmp_path):
     ("changes", "message"),
     [
         ({"formats": ["obj"]}, "formats: expected one of all, ply, .*; found 'obj'"),
-        ({"up": "x"}, "up: expected one of None, y, z; found 'x'"),
+        ({"up": "x"}, "up: expected one of None, y, -y, z; found 'x'"),
+        (
+            {"formats": "all", "turntable": {"frames": 0, "fps": 1}},
+            r"turntable\.frames: expected at least 1 for formats=mp4; found 0",
+        ),
         ({"turntable": {"frames": -1, "fps": 1}}, r"turntable\.frames: expected .*; found -1"),
     ],
 )
@@ -149,3 +158,11 @@ def test_options_are_read():
     batch = example_batch()
     with pytest.raises(InputError, match="a batch of one subject; found 2"):
         write_prediction(None, batch, Standin()(batch), Renderer(), OutputOptions())
+
+
+def test_a_missing_package_is_named_before_any_work(monkeypatch):
+    monkeypatch.setattr("ghgs_lit.export.scene.find_spec", lambda name: None)
+    with pytest.raises(
+        InputError, match=r"gaussforge for spz \(pip install 'ghgs-lit\[formats\]'\); found none"
+    ):
+        output_options(CONFIG | {"formats": ["ply", "spz"]})
