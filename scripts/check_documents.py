@@ -68,6 +68,7 @@ SMALL = [
      "small photographs"),
     (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
     (r" init_from=(?:start|vggt)\.ckpt", "", PUBLISHED),
+    (r"^(ghgs view .*)", r"\1 seconds=1", "a server: stopped after 1 s"),
     (r"runs/train/<time>", "runs/train/$(ls runs/train | grep ^20 | tail -n 1)", "the last run"),
     (r"<run>", "runs/before", "a small run"),
     (r"(?<=runs=runs/train/)(<sweep>|mine)", "paper", "a small sweep"),
@@ -130,6 +131,7 @@ BEFORE = {
         _SCANS.format("THuman2.0_Release"),
     ),
     "docs/encoder.md": _CHECKPOINTS,
+    "docs/outputs.md": _CHECKPOINTS,
     "docs/sweeps.md": (_SWEEP,),
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (

@@ -1,19 +1,59 @@
-"""``ghgs export``: a checkpoint to the names of the authors' release and of VGGT-1B."""
+"""``ghgs export``: a checkpoint to the published names, or to a small one for prediction."""
 
+from pathlib import Path
+
+import torch
 from omegaconf import DictConfig
 
+from ghgs_lit.benchmark.error import differences as prediction_differences
+from ghgs_lit.benchmark.scene import ellipsoid_batch
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.errors import require
+from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.exporting import export_weights
+from ghgs_lit.weights.inference import write_inference
 from ghgs_lit.weights.switches import differences
+
+_PATCHES = 8  # along each side of the photographs that two models are compared on
+
+
+@torch.no_grad()
+def parity(checkpoint: str, exported: str) -> dict[str, float]:
+    """How far the prediction of one checkpoint is from another's, on photographs of noise on an ellipsoid."""
+    results, batch = [], None
+    for path in (exported, checkpoint):  # one model in memory at a time
+        model = GHGS.from_checkpoint(path).eval()
+        if batch is None:
+            batch = ellipsoid_batch(0.15, 4, _PATCHES * model.encoder.patch_size, 1)
+        prediction = model(batch)
+        results.append((prediction, render(prediction.gaussians, batch.targets.cameras)))
+        del model
+    return prediction_differences(*results, batch.masks)
 
 
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the written weights last."""
     config = save_config(cfg, output_dir())
-    report = export_weights(config["checkpoint"], config["vggt"], config["release"])
-    print("\n".join(report), flush=True)
-    differing = differences(read_checkpoint(config["checkpoint"])["config"])
-    if config["release"] is not None and differing:
-        print(f"differs from the release: {', '.join(differing)}", flush=True)
-    announce(config["release"] or config["vggt"])
+    checkpoint, vggt, release, inference = (
+        config[key] for key in ("checkpoint", "vggt", "release", "inference")
+    )
+    paths = [path for path in (vggt, release, inference) if path is not None]
+    require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
+    if vggt is not None or release is not None:
+        print("\n".join(export_weights(checkpoint, vggt, release)), flush=True)
+        differing = differences(read_checkpoint(checkpoint)["config"])
+        if release is not None and differing:
+            print(f"differs from the release: {', '.join(differing)}", flush=True)
+    if inference is not None:
+        write_inference(checkpoint, inference, config["dtype"])
+        found = parity(checkpoint, inference)
+        sizes = (Path(path).stat().st_size / 1e6 for path in (checkpoint, inference))
+        print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
+        print(
+            f"against the checkpoint, on an ellipsoid: {found['psnr_to_none']:.1f} dB between renders;"
+            f" largest relative difference of depth {found['depth']:.1e}, of means {found['means']:.1e}",
+            flush=True,
+        )
+    announce(paths[-1])

@@ -44,16 +44,20 @@ VERBS = {
         "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt",
     ),
     "predict": (
-        "turn photographs into a splat (PLY) and a turntable",
+        "turn photographs into a splat, pictures and a page",
         "ghgs predict checkpoint=runs/train/.../checkpoints/last.ckpt subject=0",
+    ),
+    "view": (
+        "a page in the browser to look around in a prediction",
+        "ghgs view path=runs/predict/...",
     ),
     "import": (
         "published weights to a checkpoint",
         "ghgs import vggt=facebook/VGGT-1B release=release.pth out=release.ckpt",
     ),
     "export": (
-        "a checkpoint to the published names",
-        "ghgs export checkpoint=checkpoints/last.ckpt vggt=vggt.safetensors release=release.pth",
+        "a checkpoint to a small one for prediction, or to the published names",
+        "ghgs export checkpoint=checkpoints/last.ckpt inference=small.ckpt",
     ),
     "benchmark": (
         "run time against error of the presets of skip, by stage",
@@ -129,7 +133,8 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     """
     if verb == "table":
         return [re.sub("^sweep=", "runs=", argument) for argument in arguments]
-    if verb in ("evaluate", "predict") and not any(argument.startswith("data=") for argument in arguments):
+    has_data = any(argument.startswith("data=") for argument in arguments)
+    if verb in ("evaluate", "predict", "view") and not has_data:
         return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
     return arguments
 

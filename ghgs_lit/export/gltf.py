@@ -73,7 +73,10 @@ def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
     attributes = gltf.Attributes(**{name: index for index, name in enumerate(columns)})
     primitive = gltf.Primitive(attributes=attributes, mode=gltf.POINTS, extensions={EXTENSION: _KERNEL})
     w, x, y, z = turn(up.cpu(), torch.tensor(AXES["y"])).tolist()
-    model.nodes, model.meshes = [gltf.Node(mesh=0, rotation=[x, y, z, w])], [gltf.Mesh([primitive])]
+    model.nodes, model.meshes = (
+        [gltf.Node(mesh=0, rotation=[x, y, z, w])],
+        [gltf.Mesh(primitives=[primitive])],
+    )
     model.extensionsUsed, model.buffers = [EXTENSION], [gltf.Buffer(byteLength=len(blob))]
     model.set_binary_blob(blob)
     content = b"".join(model.save_to_bytes())

@@ -14,7 +14,7 @@ from torch import Tensor
 from ghgs_lit.export.splat import to_records
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.types import Cameras, Gaussians
-from ghgs_lit.visualization.turntable import look_at_point
+from ghgs_lit.visualization.turntable import look_at_point, pixel_size
 
 
 def write_page(
@@ -30,14 +30,11 @@ def write_page(
         name: of the subject, for the title.
         path: the file to write.
     """
-    target = look_at_point(cameras)
-    depths = (target - cameras.centers) @ cameras.extrinsics[:, 2, :3].double().mT
     scene = {
         "size": [cameras.width, cameras.height],
         "up": up.tolist(),
-        "target": target.tolist(),
-        # the size of a photograph's pixel at the subject
-        "pixel": float((depths.diagonal() / cameras.intrinsics[:, 0, 0]).mean()),
+        "target": look_at_point(cameras).tolist(),
+        "pixel": pixel_size(cameras),
         "cameras": [
             {"name": view, "intrinsics": k, "extrinsics": e}
             for view, k, e in zip(

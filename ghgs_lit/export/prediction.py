@@ -28,26 +28,26 @@ from ghgs_lit.visualization.pictures import save_png, sheet
 
 def _ply(scene: Scene, directory: Path) -> list[Path]:
     path = directory / "gaussians.ply"
-    write_ply(scene.gaussians, path)
+    write_ply(scene.stored, path)
     return [path]
 
 
 def _compact(scene: Scene, directory: Path, name: str) -> list[Path]:
     path = directory / f"gaussians.{FORMATS[name]}"
-    write_compact(ply_bytes(scene.gaussians), path, name)
+    write_compact(ply_bytes(scene.stored), path, name)
     return [path]
 
 
 def _splat(scene: Scene, directory: Path) -> list[Path]:
     path = directory / "gaussians.splat"
-    data = to_records(scene.gaussians).tobytes()
+    data = to_records(scene.stored).tobytes()
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
     return [path]
 
 
 def _glb(scene: Scene, directory: Path) -> list[Path]:
     path = directory / "gaussians.glb"
-    write_glb(scene.gaussians, scene.up, path)
+    write_glb(scene.stored, scene.up, path)
     return [path]
 
 

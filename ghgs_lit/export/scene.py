@@ -1,5 +1,6 @@
 """What is written of one subject: its prediction, photographs and cameras, in the frame of the files."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
-from ghgs_lit.visualization.turntable import turntable, up_direction
+from ghgs_lit.visualization.turntable import pixel_size, turntable, up_direction
 
 #: The package that a format needs, and the extra that installs it.
 PACKAGES = {
@@ -36,12 +37,14 @@ class OutputOptions:
     Args:
         formats: names of :data:`ghgs_lit.export.prediction.WRITERS`.
         up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
+        smooth: the files of Gaussians hold what a renderer adds in pixels of the photographs.
         frames: pictures of the turntable.
         fps: of these, per second of the video.
     """
 
     formats: tuple[str, ...] = ("ply",)
     up: str | None = None
+    smooth: bool = False
     frames: int = 24
     fps: int = 12
 
@@ -72,6 +75,20 @@ class Scene:
     up: Float[Tensor, "3"]
     renderer: Renderer
     options: OutputOptions
+
+    @cached_property
+    def stored(self) -> Gaussians:
+        """The Gaussians as their files hold them.
+
+        A renderer adds ``low_pass`` square pixels of its own screen to a Gaussian that was made for the
+        photographs' pixels; with ``smooth`` the file has these already (as the 3D smoothing of
+        Mip-Splatting, Yu et al. 2024), and a larger screen shows no gaps.
+        """
+        if not self.options.smooth:
+            return self.gaussians
+        added = self.renderer.settings.low_pass * pixel_size(self.cameras) ** 2
+        scales = (self.gaussians.scales.square() + added).sqrt()
+        return dataclasses.replace(self.gaussians, scales=scales)
 
     @cached_property
     def turntable(self) -> list[np.ndarray]:
@@ -152,4 +169,4 @@ def options_of(config: Mapping[str, Any], known: tuple[str, ...]) -> OutputOptio
     table = config["turntable"]
     frames = table["frames"]
     require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
-    return OutputOptions(formats, config["up"], frames, table["fps"])
+    return OutputOptions(formats, config["up"], config["smooth"], frames, table["fps"])

@@ -20,6 +20,13 @@ def look_at_point(cameras: Cameras) -> Tensor:
     return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]
 
 
+def pixel_size(cameras: Cameras) -> float:
+    """The side of a photograph's pixel at the subject, mean of ``cameras`` [V]."""
+    away = look_at_point(cameras) - cameras.centers
+    depths = (away * cameras.extrinsics[:, 2, :3].double()).sum(-1)
+    return float((depths / cameras.intrinsics[:, 0, 0]).mean())
+
+
 def up_direction(cameras: Cameras) -> Tensor:
     """The world's unit vector [3] that is up in the photographs of ``cameras`` [V], float64.
 

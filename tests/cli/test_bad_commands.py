@@ -131,7 +131,7 @@ MISSING = [
     ("import out={tmp}/x.ckpt encoder=vggt_nano compat=none", 1, "vggt: expected a file"),
     ("import out={tmp}/x.ckpt vggt={tmp}/none.pt encoder=vggt_nano compat=none", 1, "{tmp}/none.pt"),
     ("export", 1, "checkpoint: expected a value", "found none"),
-    ("export checkpoint={ckpt}", 1, "vggt: expected vggt=<file>, release=<file> or both"),
+    ("export checkpoint={ckpt}", 1, "vggt: expected vggt=<file>, release=<file> or inference"),
     ("export checkpoint={tmp}/none.ckpt vggt={tmp}/x.pt", 1, "{tmp}/none.ckpt: expected"),
     ("table", 1, "runs: expected a value (runs=...); found none"),
     ("table runs={tmp}/none", 1, "{tmp}/none: expected a directory of runs"),

@@ -94,7 +94,7 @@ def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path)
     turned = Rotation.from_quat(model.nodes[0].rotation).apply(UP.numpy())
     assert np.allclose(turned, [0, 1, 0], atol=1e-6)
     cloud = trimesh.load(tmp_path / "a.glb").to_geometry()  # as points, for programs without the extension
-    upright = np.array(gaussians.means) * [1, -1, -1]
+    upright = gaussians.means.numpy() * [1, -1, -1]
     assert np.allclose(np.sort(cloud.vertices[:, 1]), np.sort(upright[:, 1]), atol=1e-5)
     colors = (gaussians.colors.clamp(0, 1) * 255).round().numpy()
     assert np.array_equal(cloud.colors[:, :3], colors)

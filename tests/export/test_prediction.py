@@ -20,12 +20,12 @@ from ghgs_lit.export.ply import read_ply
 from ghgs_lit.export.world import AXES, rotate_world, turn
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.rendering import Renderer, render
-from ghgs_lit.types import Cameras
+from ghgs_lit.types import Batch, Cameras
 from ghgs_lit.visualization.turntable import up_direction
-from tests.helpers.splats import camera_ring, cloud
+from tests.helpers.splats import body, camera_ring, cloud
 from tests.helpers.training import Standin, example_batch
 
-CONFIG = {"formats": ["ply"], "up": None, "turntable": {"frames": 2, "fps": 12}}
+CONFIG = {"formats": ["ply"], "up": None, "smooth": False, "turntable": {"frames": 2, "fps": 12}}
 
 
 @pytest.fixture
@@ -166,3 +166,21 @@ def test_a_missing_package_is_named_before_any_work(monkeypatch):
         InputError, match=r"gaussforge for spz \(pip install 'ghgs-lit\[formats\]'\); found none"
     ):
         output_options(CONFIG | {"formats": ["ply", "spz"]})
+
+
+def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path):
+    """At four times the resolution a smooth file shows the same picture, enlarged; another shows dots."""
+    gaussians, cameras = body(1500, 60), camera_ring(2, 60, 60)
+    gaussians = dataclasses.replace(gaussians, scales=gaussians.scales * 0.3)
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
+    alphas = {}
+    for smooth in (False, True):
+        write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(smooth=smooth))
+        large = render(read_ply(tmp_path / "gaussians.ply"), cameras.resized(240, 240)).alpha[0, :, 0]
+        alphas[smooth] = torch.nn.functional.avg_pool2d(large, 4)
+    wanted = rendering.alpha[0, :, 0]
+    errors = {smooth: float((alpha - wanted).abs()[wanted > 0.5].mean()) for smooth, alpha in alphas.items()}
+    assert errors[True] < 0.1
+    assert errors[False] > 3 * errors[True]

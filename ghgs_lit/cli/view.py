@@ -1,0 +1,41 @@
+"""``ghgs view``: a page in the browser with a prediction, its photographs and its cameras."""
+
+import ipaddress
+import time
+
+from omegaconf import DictConfig
+
+from ghgs_lit.cli import predict
+from ghgs_lit.cli.runtime import output_dir, save_config
+from ghgs_lit.errors import require
+from ghgs_lit.viewer.content import read_content
+from ghgs_lit.viewer.server import Viewer
+
+
+def run(cfg: DictConfig) -> None:
+    """The verb; shows ``path``, or predicts first where there is none. Ctrl-C ends it."""
+    has_source = any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
+    require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
+    if cfg.path is None:
+        predict.run(cfg)
+    else:
+        save_config(cfg, output_dir())
+    # What was predicted is in the frame of ``up`` already: its cameras say which axis that is.
+    content = read_content(cfg.path or output_dir(), cfg.up if cfg.path else None)
+    viewer = Viewer(content, cfg.host, cfg.port)
+    print(f"viewer: {viewer.address} ({_reach(cfg.host)}); Ctrl-C ends it", flush=True)
+    end = time.monotonic() + (float("inf") if cfg.seconds is None else cfg.seconds)
+    try:
+        while time.monotonic() < end:
+            time.sleep(0.2)
+    finally:
+        viewer.stop()
+
+
+def _reach(host: str) -> str:
+    """Who can open a page at this address, for the message."""
+    try:
+        is_own = host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        is_own = False
+    return "for this machine only; host=0.0.0.0 opens it to the network" if is_own else "open to the network"

@@ -1,0 +1,188 @@
+"""The page: a viser server with the Gaussians, cameras, points and hull, and controls for them."""
+
+import logging
+import math
+import threading
+from typing import Any
+
+import numpy as np
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.viewer.content import Content
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import look_at_point, pixel_size
+
+_LOW_PASS = 0.3  # px^2 of the photographs, which the Gaussians were made for
+PICTURES = ("render", "photograph", "FLIP")
+
+
+class Viewer:
+    """A running page.
+
+    Args:
+        content: what is shown.
+        host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
+        port: the first one to try.
+
+    Raises:
+        InputError: viser is not installed.
+    """
+
+    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
+        try:
+            import viser
+        except ImportError as error:
+            raise InputError(
+                f"ghgs view: expected the extra viewer (pip install 'ghgs-lit[viewer]'); found {error}"
+            ) from error
+        self.content = content
+        self._lock = threading.Lock()  # controls are answered by several threads
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor otherwise
+        self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
+        self.server.scene.set_up_direction(content.up.numpy())
+        self._prepare()
+        with self.server.gui.add_folder("Gaussians"):
+            self._add_splat_controls()
+        self._add_points()
+        if content.batch is not None:
+            self._add_cameras()
+            with self.server.gui.add_folder("Photographs"):
+                self._add_comparison()
+        self.show_splats()
+
+    @property
+    def address(self) -> str:
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        self.server.stop()
+
+    def _prepare(self) -> None:
+        """Covariances of all Gaussians, in the order in which a count takes them."""
+        g, order = self.content.gaussians, self.content.order
+        root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
+        covariances = (root @ root.mT).numpy()
+        if self.content.batch is not None:
+            # What a renderer adds in pixels of the photographs: on a larger screen there would be gaps.
+            blur = _LOW_PASS * pixel_size(self.content.cameras) ** 2
+            covariances = covariances + np.eye(3, dtype=np.float32) * np.float32(blur)
+        self._covariances = covariances
+        self._colors = g.colors[order].clamp(0, 1).numpy()
+        self._opacities = g.opacities[order][:, None].numpy()
+
+    def _add_splat_controls(self) -> None:
+        gui, count = self.server.gui, len(self.content.gaussians)
+        self.visible = gui.add_checkbox("show", True)
+        self.opacity = gui.add_slider("opacity", 0.0, 2.0, 0.05, 1.0, hint="factor of all opacities")
+        self.count = gui.add_slider("count", min(1, count), max(1, count), 1, max(1, count))
+        for control in (self.visible, self.opacity, self.count):
+            control.on_update(lambda _: self.show_splats())
+
+    def show_splats(self) -> None:
+        """Show as many Gaussians, and as opaque ones, as the controls say."""
+        with self._lock:
+            n = min(self.count.value, len(self._opacities))
+            self.splats = self.server.scene.add_gaussian_splats(
+                "/gaussians",
+                self.content.points[0][:n],
+                self._covariances[:n],
+                self._colors[:n],
+                (self._opacities[:n] * self.opacity.value).clip(0, 1),
+                visible=self.visible.value,
+            )
+
+    def _add_points(self) -> None:
+        means, colors = self.content.points
+        extent = np.ptp(means, axis=0).max() if len(means) else 1.0
+        clouds = {"points": (means, colors)}
+        if self.content.batch is not None:
+            clouds["hull"] = (self.content.hull, np.array([90, 160, 255], np.uint8))
+        with self.server.gui.add_folder("Layers"):
+            for name, cloud in clouds.items():
+                node = self.server.scene.add_point_cloud(
+                    f"/{name}", *cloud, point_size=float(extent) / 400, precision="float32", visible=False
+                )
+                self._switch(name, [node])
+
+    def _switch(self, name: str, nodes: list[Any]) -> None:
+        """A checkbox that shows and hides nodes of the scene."""
+        box = self.server.gui.add_checkbox(name, nodes[0].visible)
+
+        @box.on_update
+        def _(_) -> None:
+            for node in nodes:
+                node.visible = box.value
+
+    def _add_cameras(self) -> None:
+        from viser.transforms import SO3
+
+        cameras, images = self.content.cameras, self.content.batch.images[0]
+        self._poses = []
+        target = look_at_point(cameras).numpy()
+        size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
+        nodes = []
+        for view, name in enumerate(self.content.batch.views[0]):
+            k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
+            pose = {
+                "wxyz": SO3.from_matrix(e[:3, :3].T).wxyz,
+                "position": -e[:3, :3].T @ e[:3, 3],
+            }
+            fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
+            node = self.server.scene.add_camera_frustum(
+                f"/cameras/{name}",
+                fov,
+                cameras.width / cameras.height,
+                scale=size / 12,
+                image=to_uint8(images[view]),
+                **pose,
+            )
+            node.on_click(lambda _, view=view: self.go_to(view))
+            nodes.append(node)
+            self._poses.append((pose, fov))
+        self._switch("cameras", nodes)
+        start = self.server.initial_camera
+        start.position, start.look_at = self._poses[0][0]["position"], target
+        start.up, start.fov = self.content.up.numpy(), self._poses[0][1]
+
+    def go_to(self, view: int) -> None:
+        """Put every visitor at the camera of a photograph."""
+        pose, fov = self._poses[view]
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.wxyz, client.camera.position = pose["wxyz"], pose["position"]
+                client.camera.fov = fov
+        self.view.value = self.content.batch.views[0][view]
+
+    def _add_comparison(self) -> None:
+        gui, views = self.server.gui, self.content.batch.views[0]
+        self.view = gui.add_dropdown("view", views)
+        self.picture = gui.add_button_group("picture", PICTURES, hint="one after the other at one place")
+        self.text = gui.add_markdown("")
+        self._shown = PICTURES[0]
+        self._comparison = self.content.comparison(0)
+        self.image = gui.add_image(self._comparison[self._shown])
+        go = gui.add_button("go to this camera")
+        go.on_click(lambda _: self.go_to(views.index(self.view.value)))
+
+        def show() -> None:
+            found = self._comparison
+            self.image.image = found[self._shown]
+            self.text.content = (
+                f"{self._shown} of {self.view.value}; in the subject's box:"
+                f" FLIP {found['flip']:.4f}, PSNR {found['psnr']:.2f} dB"
+            )
+
+        @self.view.on_update
+        def _(_) -> None:
+            with self._lock:
+                self._comparison = self.content.comparison(views.index(self.view.value))
+                show()
+
+        @self.picture.on_click
+        def _(_) -> None:
+            with self._lock:
+                self._shown = self.picture.value
+                show()
+
+        show()

@@ -1,0 +1,58 @@
+"""Checkpoints for prediction alone."""
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from ghgs_lit.weights.checkpoint import read_checkpoint, write_checkpoint
+from ghgs_lit.weights.inference import write_inference
+from tests.helpers.models import config, make_model
+from tests.helpers.verbs import ghgs
+
+
+@pytest.fixture
+def checkpoint(tmp_path):
+    """A checkpoint with what training adds to it."""
+    path, state = tmp_path / "a.ckpt", make_model().state_dict()
+    moments = [{name: tensor.clone() for name, tensor in state.items()} for _ in range(2)]
+    write_checkpoint(path, state, config(), optimizer_states=moments, global_step=7)
+    return path
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
+def test_weights_and_configuration_alone_are_written(checkpoint, tmp_path, dtype):
+    """Every tensor is the rounded one; optimizer and progress are gone; the model is built without a YAML."""
+    write_inference(checkpoint, tmp_path / "b.ckpt", dtype)
+    before, after = read_checkpoint(checkpoint), read_checkpoint(tmp_path / "b.ckpt")
+    assert set(after) == {"state_dict", "config", "format_version"}
+    assert after["config"] == before["config"]
+    assert after["state_dict"].keys() == before["state_dict"].keys()
+    for name, tensor in before["state_dict"].items():
+        assert torch.equal(after["state_dict"][name], tensor.to(getattr(torch, dtype)))
+    share = (tmp_path / "b.ckpt").stat().st_size / checkpoint.stat().st_size
+    assert share < (0.4 if dtype == "float32" else 0.25)
+    GHGS.from_checkpoint(tmp_path / "b.ckpt")
+
+
+def test_the_verb_prints_how_far_predictions_are(checkpoint, tmp_path, capsys):
+    arguments = [f"checkpoint={checkpoint}", f"hydra.run.dir={tmp_path / 'r'}"]
+    assert ghgs("export", *arguments, f"inference={tmp_path / 'b.ckpt'}", "dtype=float32") == 0
+    text = capsys.readouterr().out
+    assert "against the checkpoint, on an ellipsoid: 100.0 dB between renders" in text
+    assert text.rstrip().endswith(f"wrote {tmp_path / 'b.ckpt'}")
+    assert ghgs("export", *arguments, f"inference={tmp_path / 'b.ckpt'}") == 0
+    decibels = float(capsys.readouterr().out.split("ellipsoid: ")[1].split(" dB")[0])
+    assert 40 < decibels < 100  # half precision is near, and not the same
+
+
+def test_what_half_precision_cannot_hold_is_refused(tmp_path):
+    path, state = tmp_path / "a.ckpt", make_model().state_dict()
+    name = next(name for name in state if name.startswith("gaussian_head"))
+    state[name] = torch.full_like(state[name], 1e6)
+    write_checkpoint(path, state, config())
+    with pytest.raises(InputError, match=rf"a\.ckpt as float16: {name}: expected finite numbers"):
+        write_inference(path, tmp_path / "b.ckpt", "float16")
+    write_inference(path, tmp_path / "b.ckpt", "bfloat16")
+    with pytest.raises(InputError, match="expected another file than the checkpoint"):
+        write_inference(path, path, "float16")
