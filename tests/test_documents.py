@@ -14,7 +14,18 @@ from omegaconf import OmegaConf
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
-VERBS = ("train", "evaluate", "predict", "prepare", "benchmark", "table", "import", "export", "view")
+VERBS = (
+    "train",
+    "evaluate",
+    "predict",
+    "prepare",
+    "benchmark",
+    "stress",
+    "table",
+    "import",
+    "export",
+    "view",
+)
 # What a reader makes, and options and names that are not in this repository.
 MADE = ("conf/data/my_people.yaml", "conf/sweep/<name>.yaml")
 OPTIONS = {

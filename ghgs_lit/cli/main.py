@@ -63,6 +63,7 @@ VERBS = {
         "run time against error of the presets of skip, by stage",
         "ghgs benchmark checkpoint=runs/train/.../checkpoints/last.ckpt presets=[none,exact,balanced]",
     ),
+    "stress": ("every stage on adversarial inputs, against float64", "ghgs stress quick=true"),
     "table": ("collect a sweep into the paper's table", "ghgs table runs=runs/train/sweep_..."),
 }
 

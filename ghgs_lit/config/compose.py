@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.paths import conf_dir
@@ -19,8 +20,14 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
         overrides: as on the command line (``key=value``, ``group=option``).
         with_hydra: whether to keep the node ``hydra``.
     """
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
+    # A verb that is running has initialized Hydra already.
+    running = GlobalHydra.instance().hydra
+    GlobalHydra.instance().hydra = None
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
+    finally:
+        GlobalHydra.instance().hydra = running
 
 
 def check_groups(verb: str, cfg: DictConfig) -> None:

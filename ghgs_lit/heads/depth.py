@@ -12,7 +12,7 @@ from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
-from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.activations import CONFIDENCES, bounded_sigmoid
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
@@ -35,9 +35,22 @@ def _linear(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
 BOUNDED = {"bounded_inverse": _bounded_inverse, "log": _log, "linear": _linear}
 
 
+def bounded_depth(
+    raw: Float[Tensor, "*n"], near: Float[Tensor, "*n"], far: Float[Tensor, "*n"], parameterization: str
+) -> Float[Tensor, "*n"]:
+    """Depth between ``near`` and ``far``, in metres, from raw values of a head, by one of :data:`BOUNDED`."""
+    return BOUNDED[parameterization](bounded_sigmoid(raw), near, far)
+
+
 def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound."""
-    return 1 / (x + 1e-8)
+    """``1 / (x + 1e-8)`` as in the authors' release: of either sign and without bound.
+
+    Infinite at -1e-8, where the gradient is 0: the argument is replaced, since a result that is replaced
+    later would still have a gradient of 0 times infinity.
+    """
+    shifted = x + 1e-8
+    is_pole = shifted == 0
+    return torch.where(is_pole, torch.inf, 1 / torch.where(is_pole, 1.0, shifted))
 
 
 class DepthHead(nn.Module):
@@ -117,8 +130,7 @@ class DepthHead(nn.Module):
             wanted = patches.repeat_interleave(p, -2).repeat_interleave(p, -1)
         value, confidence = _whole(decode(self.dpt, tokens, guide, wanted), batch, wanted)
         if self.is_bounded:
-            fraction = (value + self.start).sigmoid()
-            depth = BOUNDED[self.parameterization](fraction, bounds.near, bounds.far)
+            depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.parameterization)
         else:
             depth = inverse_linear(value)
         finite = depth.isfinite()

@@ -13,12 +13,16 @@ from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
-from ghgs_lit.heads.activations import unit
+from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
+
+#: The gradient of a shorter quaternion is that of this length: it would grow without bound near 0.
+_SHORTEST = 0.1
 
 
 def _logit(probability: float) -> float:
@@ -92,13 +96,13 @@ class FootprintAttributes:
         footprint: Float[Tensor, " N"],
     ) -> Attributes:
         identity = F.pad(rotation.new_ones(1), (0, 3))
-        scale = self.scale_floor * torch.exp(self.scale_range * (scale + self.scale_bias).sigmoid())
-        opacity = self.opacity_floor + (1 - self.opacity_floor) * (opacity + self.opacity_bias).sigmoid()
+        scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale + self.scale_bias))
+        shown = bounded_sigmoid(opacity + self.opacity_bias)
         return (
-            self.offset_limit * offset.tanh(),
+            self.offset_limit * bounded_tanh(offset),
             footprint[:, None] * scale,
-            unit(identity + rotation),
-            opacity,
+            unit(identity + rotation, _SHORTEST),
+            self.opacity_floor + (1 - self.opacity_floor) * shown,
         )
 
 
@@ -209,7 +213,7 @@ class GaussianHead(nn.Module):
             quaternions=quaternions,
             scales=scales,
             opacities=opacities,
-            colors=colors + self.color_limit * color[0].tanh() if color else colors,
+            colors=colors + self.color_limit * bounded_tanh(color[0]) if color else colors,
             splits=tuple(points.valid.flatten(1).sum(1).tolist()),
             image=image,
             pixel=pixel,

@@ -3,12 +3,12 @@
 import dataclasses
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.recalibration import cpu
@@ -107,7 +107,7 @@ class Recalibration(nn.Module):
         if self.neighborhood == "xyz":
             return points.tokens.detach()
         if self.neighborhood == "feature":
-            return F.normalize(at_least_float32(tokens.semantic), dim=-1)
+            return unit(tokens.semantic)
         # Half pixels are exact in float32, so that equal distances are equal numbers.
         return token_corners(tokens, batch) + tokens.patch_size / 2
 
@@ -138,7 +138,7 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
             return cpu.cosines(semantic, neighbors.index)
         # Allocated first: after the features it would keep their memory occupied once they are freed.
         cosines = semantic.new_empty(neighbors.index.shape)
-        unit = F.normalize(semantic, dim=-1, eps=1e-12)
-        for rows in even_parts(len(unit), _COSINES // max(1, len(unit))):
-            torch.gather(linear(unit[rows], unit), 1, neighbors.index[rows], out=cosines[rows])
+        directions = unit(semantic)
+        for rows in even_parts(len(directions), _COSINES // max(1, len(directions))):
+            torch.gather(linear(directions[rows], directions), 1, neighbors.index[rows], out=cosines[rows])
     return cosines

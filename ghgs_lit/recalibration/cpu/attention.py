@@ -13,6 +13,8 @@ from ghgs_lit.kernels.parts import even_parts
 
 # Floats of a vector; products above which the kernel is worth it; tokens of a task.
 _LANES, _LARGE, _TOKENS = 16, 1 << 22, 32
+# Features whose largest component is smaller are scaled before they are squared.
+_LEAST = 1e-15
 
 
 def is_supported(x: Tensor, heads: int, k: int) -> bool:
@@ -63,7 +65,12 @@ def cosines(features: Float[Tensor, "n c"], index: Int[Tensor, "n k"]) -> Float[
     from ghgs_lit.recalibration.cpu.kernel import compare_tokens
 
     out = torch.empty(index.shape)
-    inverse_lengths = 1 / features.detach().norm(dim=-1).clamp(min=1e-12)
+    features = features.detach()
+    largest = features.abs().amax(-1, keepdim=True)
+    if bool(((largest < _LEAST) | (largest > 1 / _LEAST)).any()):  # their squares would vanish or overflow
+        features = features / torch.where(largest > 0, largest, 1.0)
+    lengths = features.norm(dim=-1)
+    inverse_lengths = 1 / torch.where(lengths > 0, lengths, 1.0)
     tables = (inverse_lengths, index.contiguous(), out)
     _run(compare_tokens(), _rows(features), *(x.numpy() for x in tables))
     return out

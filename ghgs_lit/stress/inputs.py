@@ -1,0 +1,167 @@
+"""Random inputs of one case, in float64; a family changes its own ingredient, the others stay ordinary."""
+
+import math
+
+import torch
+from torch import Generator, Tensor
+
+F64 = torch.float64
+
+
+def normal(g: Generator, *shape: int) -> Tensor:
+    return torch.randn(shape, generator=g, dtype=F64)
+
+
+def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
+    return low + (high - low) * torch.rand(shape, generator=g, dtype=F64)
+
+
+def directions(g: Generator, *shape: int) -> Tensor:
+    """Unit vectors along the last axis."""
+    found = normal(g, *shape)
+    return found / found.norm(dim=-1, keepdim=True)
+
+
+#: Size of the scene by family.
+UNITS = {"large": 1e3, "small": 1e-3}
+
+
+def place(family: str, g: Generator) -> Tensor:
+    """The middle of the scene in the world [3]."""
+    away = 1e4 if family == "shifted" else 0.1
+    return directions(g, 3) * away * UNITS.get(family, 1.0)
+
+
+def cameras(family: str, g: Generator, views: int, size: int, middle: Tensor) -> tuple[Tensor, Tensor]:
+    """Lenses [v, 4] (focal lengths, principal point), poses [v, 3, 4], two units from ``middle``."""
+    unit = UNITS.get(family, 1.0)
+    focal = {"wide": 0.1 * size, "long": 1e5}.get(family, float(uniform(g, 0.8, 1.2)) * size)
+    distance = 2.0 * unit * (focal / size if family == "long" else 1.0)
+    start = float(uniform(g, 0, 2 * math.pi))
+    poses = torch.empty(views, 3, 4, dtype=F64)
+    principal = size / 2 + uniform(g, -0.5, 0.5, views, 2)
+    lenses = torch.cat((torch.tensor([[focal, 1.03 * focal]], dtype=F64).expand(views, 2), principal), 1)
+    for v in range(views):
+        angle = start + 2 * math.pi * v / views
+        back = torch.tensor([math.sin(angle), 0.2, math.cos(angle)], dtype=F64)
+        forward = -back / back.norm()
+        right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
+        right = right / right.norm()
+        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        if family == "skewed":
+            rotation = rotation + 1e-3 * normal(g, 3, 3)
+        if family == "mirrored":
+            rotation = rotation * torch.tensor([[-1.0], [1.0], [1.0]], dtype=F64)
+        if family == "degenerate":
+            rotation = torch.stack((rotation[1], rotation[1], rotation[2]))
+        poses[v, :, :3] = rotation
+        poses[v, :, 3] = -rotation @ middle + torch.tensor([0.0, 0.0, distance], dtype=F64)
+    return lenses, poses
+
+
+def matrices(lenses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4]."""
+    fx, fy, cx, cy = lenses.unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    rows = ((fx, zero, cx), (zero, fy, cy), (zero, zero, one))
+    intrinsics = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=poses.dtype).expand(*poses.shape[:-2], 1, 4)
+    return intrinsics, torch.cat((poses, last), -2)
+
+
+def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor | None = None) -> Tensor:
+    """World points [count, 3] of a subject at ``middle``; those relative to a camera need its pose."""
+    unit = UNITS.get(family, 1.0)
+    found = middle + 0.3 * unit * normal(g, count, 3)
+    if family == "duplicates":
+        return found[torch.arange(count) // 2]
+    if family == "collapsed":
+        return found[:1].expand(count, 3).clone()
+    if family == "far":
+        return found + 1e6 * directions(g, 1, 3)
+    if poses is None:
+        return found
+    rotation, translation = poses[0, :, :3], poses[0, :, 3]
+    center = -rotation.mT @ translation
+    if family == "behind":
+        return center - rotation[2] * uniform(g, 0.1, 3, count, 1) + 0.1 * normal(g, count, 3)
+    if family == "on_camera":
+        return center + 1e-6 * (rotation[2] * uniform(g, 0.5, 1, count, 1) + 0.2 * normal(g, count, 3))
+    return found
+
+
+def depths(family: str, g: Generator, *shape: int) -> Tensor:
+    """Depths of about two units."""
+    found = uniform(g, 1.5, 2.5, *shape) * UNITS.get(family, 1.0)
+    if family == "equal_depths":
+        return torch.full_like(found, float(uniform(g, 1.5, 2.5)))
+    factor = {"zero_depth": 0.0, "negative_depth": -1.0, "near_zero_depth": 1e-12, "huge_depth": 1e12}
+    return found * factor.get(family, 1.0)
+
+
+def quaternions(family: str, g: Generator, count: int) -> Tensor:
+    length = {"zero_quaternion": 0.0, "tiny_quaternion": 1e-20, "huge_quaternion": 1e20}
+    return normal(g, count, 4) * length.get(family, 1.0)
+
+
+def scales(family: str, g: Generator, count: int, unit: float = 0.05) -> Tensor:
+    found = unit * uniform(g, 0.2, 1.0, count, 3) * UNITS.get(family, 1.0)
+    if family == "thin":
+        return found * torch.tensor([1.0, 1e-6, 1e-6], dtype=F64)
+    factor = {"zero_scale": 0.0, "tiny_scale": 1e-12 / unit, "huge_scale": 1e4 / unit}
+    return found * factor.get(family, 1.0)
+
+
+def opacities(family: str, g: Generator, count: int) -> Tensor:
+    found = uniform(g, 0.05, 0.98, count)
+    fixed = {"transparent": 0.0, "opaque": 1.0}
+    return torch.full_like(found, fixed[family]) if family in fixed else found
+
+
+def features(family: str, g: Generator, count: int, width: int) -> Tensor:
+    found = normal(g, count, width)
+    if family == "parallel_features":
+        return found[:1].expand(count, width).clone()
+    if family == "opposite_features":
+        signs = 1 - 2 * (torch.arange(count) % 2)
+        return found[:1] * signs[:, None]
+    factor = {"zero_features": 0.0, "tiny_features": 1e-20, "huge_features": 1e18}
+    return found * factor.get(family, 1.0)
+
+
+def raw(family: str, g: Generator, *shape: int) -> Tensor:
+    """Raw values of a head; adverse ones of both signs."""
+    found = normal(g, *shape)
+    factor = {"saturated": 100.0, "extreme": 1e4}
+    return found.sign() * factor[family] * uniform(g, 0.5, 1.5, *shape) if family in factor else found
+
+
+def images(family: str, g: Generator, *shape: int) -> Tensor:
+    found = uniform(g, 0, 1, *shape)
+    if family == "constant":
+        return torch.full_like(found, float(uniform(g, 0, 1)))
+    if family == "black":
+        return torch.zeros_like(found)
+    return 20 * found - 10 if family == "out_of_range" else found
+
+
+def disc(size: int) -> Tensor:
+    """A mask of a disc in the middle [size, size]."""
+    place = torch.arange(size, dtype=F64) + 0.5 - size / 2
+    return place[:, None].square() + place.square() < (0.3 * size) ** 2
+
+
+def spoiled(family: str, g: Generator, masks: Tensor) -> Tensor:
+    """Masks [v, h, w] of a subject; in the families of masks, the last view's is spoiled."""
+    masks = masks.clone()
+    if family == "empty_mask":
+        masks[-1] = False
+    elif family == "one_pixel":
+        row, column = (int(torch.randint(n, (), generator=g)) for n in masks.shape[1:])
+        masks[-1] = False
+        masks[-1, row, column] = True
+    elif family == "noise_mask":
+        masks[-1] = torch.rand(masks.shape[1:], generator=g) < 0.3
+    elif family == "wrong_mask":
+        masks[-1, masks.shape[1] // 2 :] = False
+    return masks
