@@ -1,5 +1,7 @@
 """Attention on a CPU, our kernel and PyTorch's, in the encoder's shapes: ``python benchmarks/attention.py``.
 
+docs/encoder.md says how to limit a processor to AVX2.
+
 Errors are root mean squares of the difference to float64, relative to that of the result, for one head.
 """
 

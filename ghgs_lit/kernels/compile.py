@@ -53,8 +53,16 @@ def helper(function):
 
 
 def processor_features() -> set[str]:
-    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``."""
-    names = numba.config.CPU_FEATURES
-    if names is None:
-        names = llvmlite.binding.get_host_cpu_features().flatten()
-    return {name[1:] for name in names.split(",") if name.startswith("+")}
+    """LLVM's names of the processor features that kernels may use, such as ``avx512bf16``.
+
+    Those of this processor, changed by Numba's setting ``NUMBA_CPU_FEATURES``: with ``-avx512f`` kernels are
+    those of a processor with AVX2. With ``NUMBA_CPU_NAME``, too, only the features that the setting lists
+    count.
+    """
+    changes = numba.config.CPU_FEATURES
+    is_own = numba.config.CPU_NAME is None or changes is None
+    own = llvmlite.binding.get_host_cpu_features() if is_own else {}
+    features = {name for name, found in own.items() if found}
+    for change in filter(None, (changes or "").split(",")):
+        (features.add if change[0] == "+" else features.discard)(change[1:])
+    return features

@@ -7,8 +7,10 @@ import torch.nn.functional as F
 
 from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.cpu import attention
-from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES, ROWS
+from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES, WIDTH
+from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
 from ghgs_lit.kernels.compile import processor_features
+from tests.helpers.processes import run_python
 
 HALF = pytest.param(
     torch.bfloat16,
@@ -132,7 +134,7 @@ def test_inputs_whose_numbers_lie_apart():
 
 def test_what_the_kernel_is_asked_for(monkeypatch):
     """The kernel is used only where it is supported and faster."""
-    monkeypatch.setattr(attention, "_has", lambda feature: feature == "avx512f")
+    monkeypatch.setattr(attention, "_features", lambda: {"avx2", "fma", "avx512bf16"})
     q, _, v = scene(1, 4, 1024, 32, torch.float32)
     assert not cpu.is_supported(q, v)  # a gradient may be needed
     with torch.no_grad():
@@ -143,11 +145,41 @@ def test_what_the_kernel_is_asked_for(monkeypatch):
         assert not cpu.is_supported(q, v.half())
         assert not cpu.is_supported(q, v.bfloat16())  # the processor has no products for it
         assert not cpu.is_supported(q.to("meta"), v.to("meta"))
-        monkeypatch.setattr(attention, "_has", lambda feature: False)
+        monkeypatch.setattr(attention, "_features", lambda: {"avx2"})
         assert not cpu.is_supported(q, v)
 
 
 def test_features_of_the_processor_may_be_limited(monkeypatch):
     """Features that a user disables by Numba's setting are not used."""
-    monkeypatch.setattr(numba.config, "CPU_FEATURES", "+avx2,-avx512f")
-    assert processor_features() == {"avx2"}
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", "+made_up,-avx512f")
+    assert "made_up" in processor_features()
+    assert "avx512f" not in processor_features()
+    monkeypatch.setattr(numba.config, "CPU_NAME", "haswell")
+    assert processor_features() == {"made_up"}
+
+
+NARROW = """
+import torch
+import torch.nn.functional as F
+from ghgs_lit.encoder import cpu
+from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
+
+assert (ROWS, PANEL) == (6, 16)
+for n, heads, queries, keys, width in ((1, 1, 1, 1, 32), (2, 3, 7, 7, 64), (1, 2, 299, 333, 96)):
+    g = torch.Generator().manual_seed(0)
+    q, k, v = (torch.randn(n, heads, t, width, generator=g) for t in (queries, keys, keys))
+    expected = F.scaled_dot_product_attention(q.double(), k.double(), v.double()).transpose(1, 2)
+    assert (cpu.attend(q, k, v) - expected).norm() < 6e-7 * expected.norm()
+"""
+
+
+def test_attention_without_512_bit_vectors():
+    """The kernel of a processor with AVX2 alone is as accurate; a wider one is limited by Numba's setting."""
+    if not {"avx2", "fma"} <= processor_features():
+        pytest.skip("needs AVX2")
+    run_python(NARROW, NUMBA_CPU_FEATURES="-avx512f")
+
+
+def test_tiles_fit_the_blocks():
+    """Blocks of queries are whole tiles and heads are whole panels on every processor."""
+    assert QUERIES % ROWS == WIDTH % PANEL == KEYS % PANEL == 0

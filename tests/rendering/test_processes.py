@@ -3,13 +3,10 @@
 import dataclasses
 import importlib.util
 import multiprocessing
-import os
 import platform
-import subprocess
 import sys
 import threading
 import warnings
-from pathlib import Path
 
 import numba
 import pytest
@@ -18,6 +15,7 @@ import torch
 from ghgs_lit.kernels import compile, pool
 from ghgs_lit.rendering import render
 from ghgs_lit.rendering.cpu import backend
+from tests.helpers.processes import run_python
 from tests.helpers.splats import FIELDS, body, camera_ring, with_gradients
 
 
@@ -131,6 +129,7 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
 @pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])
 def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
     """A slow processor is reported once, and a fast one never."""
+    monkeypatch.setattr(numba.config, "CPU_NAME", "x86-64")
     monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
     backend._warn_of_narrow_vectors.cache_clear()
     with warnings.catch_warnings(record=True) as caught:
@@ -157,12 +156,7 @@ def test_the_same_image_without_wide_vectors():
     """A processor with 128-bit vectors only gives the same image (the first run compiles for a while)."""
 
     def run(**variables):
-        path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
-        environment = {**os.environ, "PYTHONPATH": path, **variables}
-        done = subprocess.run(
-            [sys.executable, "-c", _SUM], env=environment, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
+        done = run_python(_SUM, **variables)
         return [float(number) for number in done.stdout.split()], done.stderr
 
     wanted, _ = run()

@@ -1,4 +1,4 @@
-"""Attention for CPUs with 512-bit vectors: one pass, without a matrix of all scores in memory."""
+"""Attention for CPUs with AVX2 or AVX-512: one pass, without a matrix of all scores in memory."""
 
 from ghgs_lit.encoder.cpu.attention import attend, is_supported
 

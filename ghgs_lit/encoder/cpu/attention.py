@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.encoder.cpu.layout import PANEL, QUERIES
+from ghgs_lit.encoder.cpu.layout import QUERIES, WIDTH
 from ghgs_lit.kernels import pool
 
 # Multiplications above which the kernel is worth it: smaller products take PyTorch only milliseconds.
 _LARGE = 1 << 27
-# Processor feature that the kernel needs: enough registers for its tiles, and bfloat16 products.
-_FEATURE = {torch.float32: "avx512f", torch.bfloat16: "avx512bf16"}
+# Processor features that the kernel needs: fused multiplications, and products of bfloat16.
+_FEATURES = {torch.float32: {"avx2", "fma"}, torch.bfloat16: {"avx512f", "avx512bf16"}}
 
 
 def is_supported(q: Tensor, v: Tensor) -> bool:
@@ -23,17 +23,17 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
         q: queries [n, a, t, d].
         v: values [n, a, s, d].
     """
-    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURE:
+    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURES:
         return False
     n, a, t, d = q.shape
-    return d % PANEL == 0 and n * a * t * v.shape[2] * d >= _LARGE and _has(_FEATURE[v.dtype])
+    return d % WIDTH == 0 and n * a * t * v.shape[2] * d >= _LARGE and _features() >= _FEATURES[v.dtype]
 
 
 @cache
-def _has(feature: str) -> bool:
+def _features() -> set[str]:
     from ghgs_lit.kernels.compile import processor_features  # here, like the kernel: it loads a compiler
 
-    return feature in processor_features()
+    return processor_features()
 
 
 def attend(

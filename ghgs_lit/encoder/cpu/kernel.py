@@ -12,8 +12,9 @@ from numba.core import types
 from numba.np.numpy_support import from_dtype
 
 from ghgs_lit.encoder.cpu.bfloat16 import aligned_words, pack_line, per_word, store_numbers
-from ghgs_lit.encoder.cpu.layout import KEYS, PANEL, QUERIES, ROWS
+from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
 from ghgs_lit.encoder.cpu.products import add_values, score
+from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
 from ghgs_lit.kernels.simd import EXP2_LIMIT

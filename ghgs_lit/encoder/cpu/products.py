@@ -10,7 +10,8 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ghgs_lit.encoder.cpu.bfloat16 import PAIRS, holds_pairs
-from ghgs_lit.encoder.cpu.layout import KEYS, PANEL, ROWS
+from ghgs_lit.encoder.cpu.layout import KEYS
+from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I32, I64, LANES, call, constant, floats, indices
 

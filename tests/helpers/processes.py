@@ -1,0 +1,17 @@
+"""Running code in a fresh interpreter."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+
+def run_python(code: str, **variables: str) -> subprocess.CompletedProcess:
+    """``code``, which must succeed, in a process of its own, with these environment variables."""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": path, **variables}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done
