@@ -50,7 +50,7 @@ def subject_batch(
 
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the files, and their directory last."""
+    """The verb; prints the files (not those in folders), and the directory last."""
     directory = output_dir()
     config = resolve(with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
     write_config(config, directory)
@@ -70,6 +70,6 @@ def run(cfg: DictConfig) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize()
     facts = {"checkpoint": config["checkpoint"], "seconds": {"predict": time.perf_counter() - begin}}
-    for path in write_prediction(directory, batch, prediction, renderer, options, facts):
-        print(path, flush=True)
+    paths = write_prediction(directory, batch, prediction, renderer, options, facts)
+    print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
     announce(directory)

@@ -1,6 +1,7 @@
 """Everything that is written of a prediction: one entry of ``WRITERS`` for each format."""
 
 import json
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -119,11 +120,16 @@ def write_prediction(
         InputError: several subjects.
     """
     scene = scene_of(batch, prediction, renderer, options)
-    paths = [path for name in options.formats for path in WRITERS[name](scene, directory)]
+    paths, seconds = [], {}
+    for name in options.formats:
+        begin = time.perf_counter()
+        paths += WRITERS[name](scene, directory)
+        seconds[f"write {name}"] = time.perf_counter() - begin
     image = None if batch.targets is None else renderer(prediction.gaussians, batch.targets.cameras).image
     paths.append(directory / "sheet.png")
     save_png(sheet(batch, image, 0, prediction.depth, prediction.depth_valid), paths[-1])
-    report = {**_report(scene), **(facts or {})}
+    facts = dict(facts or {})
+    report = {**_report(scene), **facts, "seconds": {**facts.get("seconds", {}), **seconds}}
     report["files"] = {str(path.relative_to(directory)): path.stat().st_size for path in paths}
     path = directory / "report.json"
     write_text_atomically(path, json.dumps(plain(report), indent=1, allow_nan=False))

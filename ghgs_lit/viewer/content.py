@@ -55,7 +55,7 @@ class Content:
     @cached_property
     def hull(self) -> np.ndarray:
         """Points [n, 3] of the visual hull: where the rays of the subject's pixels enter it."""
-        near = VisualHull()(self.batch).near
+        near = VisualHull(dilation=0.0)(self.batch).near
         points = unproject_maps(near, self.batch.cameras)[self.batch.masks]
         return points[:: -(-max(len(points), 1) // _HULL_POINTS)].numpy()
 

@@ -103,47 +103,57 @@ class Viewer:
                 node = self.server.scene.add_point_cloud(
                     f"/{name}", *cloud, point_size=float(extent) / 400, precision="float32", visible=False
                 )
-                self._switch(name, [node])
+                self._switch(name, node)
 
-    def _switch(self, name: str, nodes: list[Any]) -> None:
-        """A checkbox that shows and hides nodes of the scene."""
-        box = self.server.gui.add_checkbox(name, nodes[0].visible)
+    def _switch(self, name: str, node: Any) -> None:
+        """A checkbox that shows and hides a node of the scene."""
+        box = self.server.gui.add_checkbox(name, node.visible)
 
         @box.on_update
         def _(_) -> None:
-            for node in nodes:
-                node.visible = box.value
+            node.visible = box.value
+
+    def _show_frustums(self) -> None:
+        """At a camera, ``picture`` says whether its photograph lies over the Gaussians."""
+        for view, frustum in enumerate(self._frustums):
+            is_clear = view != self._at or self._shown == "photograph"
+            frustum.visible = self.cameras.value and is_clear
 
     def _add_cameras(self) -> None:
         from viser.transforms import SO3
 
-        cameras, images = self.content.cameras, self.content.batch.images[0]
-        self._poses = []
+        cameras, batch = self.content.cameras, self.content.batch
+        self._poses, self._frustums = [], []
         target = look_at_point(cameras).numpy()
         size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
-        nodes = []
-        for view, name in enumerate(self.content.batch.views[0]):
+        for view, name in enumerate(batch.views[0]):
             k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
             pose = {
                 "wxyz": SO3.from_matrix(e[:3, :3].T).wxyz,
                 "position": -e[:3, :3].T @ e[:3, 3],
             }
             fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
+            alpha = batch.masks[0, view].numpy() * np.uint8(255)
             node = self.server.scene.add_camera_frustum(
                 f"/cameras/{name}",
                 fov,
                 cameras.width / cameras.height,
                 scale=size / 12,
-                image=to_uint8(images[view]),
+                thickness=size / 400,
+                image=np.dstack([to_uint8(batch.images[0, view]), alpha]),
                 **pose,
             )
             node.on_click(lambda _, view=view: self.go_to(view))
-            nodes.append(node)
+            self._frustums.append(node)
             self._poses.append((pose, fov))
-        self._switch("cameras", nodes)
+        self.cameras = self.server.gui.add_checkbox("cameras", True)
+        self.cameras.on_update(lambda _: self._show_frustums())
+        self._at: int | None = None  # the camera that visitors were put at
+        # Behind the first camera and beside it: its photograph would hide the subject.
+        away, up = self._poses[0][0]["position"] - target, self.content.up.numpy().astype(np.float64)
         start = self.server.initial_camera
-        start.position, start.look_at = self._poses[0][0]["position"], target
-        start.up, start.fov = self.content.up.numpy(), self._poses[0][1]
+        start.position = target + 1.5 * away + 0.6 * np.cross(up, away)
+        start.look_at, start.up, start.fov = target, up, self._poses[0][1]
 
     def go_to(self, view: int) -> None:
         """Put every visitor at the camera of a photograph."""
@@ -153,6 +163,8 @@ class Viewer:
                 client.camera.wxyz, client.camera.position = pose["wxyz"], pose["position"]
                 client.camera.fov = fov
         self.view.value = self.content.batch.views[0][view]
+        self._at = view
+        self._show_frustums()
 
     def _add_comparison(self) -> None:
         gui, views = self.server.gui, self.content.batch.views[0]
@@ -167,6 +179,7 @@ class Viewer:
 
         def show() -> None:
             found = self._comparison
+            self._show_frustums()
             self.image.image = found[self._shown]
             self.text.content = (
                 f"{self._shown} of {self.view.value}; in the subject's box:"

@@ -38,15 +38,18 @@ def subject():
 def test_everything_is_written_and_reported(subject, tmp_path):
     """The report names each file with its size; other programs read depths, points and photographs."""
     batch, prediction = subject
+    depth = prediction.depth.detach() + torch.rand(batch.masks.shape)
+    prediction = dataclasses.replace(prediction, depth=depth)
     options = OutputOptions(("ply", "turntable", "depth", "points", "inputs"), frames=2)
     paths = write_prediction(tmp_path, batch, prediction, Renderer(), options, {"seconds": {"predict": 1}})
     report = json.loads((tmp_path / "report.json").read_text())
     written = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
     assert {str(p.relative_to(tmp_path)) for p in paths} == written == {*report["files"], "report.json"}
     assert report["gaussians"] == len(prediction.gaussians)
-    assert report["seconds"] == {"predict": 1}
+    assert report["seconds"]["predict"] == 1
+    assert {f"write {name}" for name in options.formats} < set(report["seconds"])
     valid = batch.masks[0].numpy()
-    depth = prediction.depth[0].detach().numpy()
+    depth = depth[0].numpy()
     unit = report["depth_png_unit"]
     picture = iio.imread(tmp_path / "depth" / "001_0.png")
     assert picture.dtype == np.uint16
@@ -55,15 +58,19 @@ def test_everything_is_written_and_reported(subject, tmp_path):
     assert np.array_equal(exact["depth"][valid], depth[valid])
     assert np.isnan(exact["depth"][~valid]).all()
     points = trimesh.load(tmp_path / "points.ply")
-    assert np.allclose(points.vertices, prediction.points.pixels[0].detach()[valid], atol=1e-6)
+    camera, positions = batch.cameras[0, 0], torch.tensor(np.asarray(points.vertices)).float()
+    pixels, z = project(positions, camera.intrinsics, camera.extrinsics)
+    count, (rows, columns) = valid[0].sum(), valid[0].nonzero()
+    assert np.allclose(pixels[:count], np.stack([columns, rows], -1) + 0.5, atol=1e-3)
+    assert np.allclose(z[:count], depth[0][valid[0]], atol=1e-5)
     colors = batch.images[0].movedim(1, -1).numpy()[valid]
     assert np.abs(points.colors[:, :3] / 255 - colors).max() <= 0.5 / 255 * 1.001
     photograph = iio.imread(tmp_path / "inputs" / "000_0.png")
     assert np.array_equal(photograph[..., 3] > 0, valid[0])
     cameras = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
     stored = read_json(tmp_path / "cameras.json")
-    camera = calibrate(stored.cameras["001_0"], stored.convention, (16, 16))
-    assert np.allclose(camera.intrinsics, batch.cameras.intrinsics[0, 1], atol=1e-6)
+    read = calibrate(stored.cameras["001_0"], stored.convention, (16, 16))
+    assert np.allclose(read.intrinsics, batch.cameras.intrinsics[0, 1], atol=1e-6)
     assert np.allclose(cameras["001_0"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)
 
 

@@ -80,8 +80,10 @@ def test_the_page_is_served_on_this_machine_and_its_controls_work(directory):
         viewer.count.value, viewer.opacity.value = 7, 0.5
         viewer.show_splats()
         assert viewer.splats.buffer.shape[0] == 7
+        assert all(frustum.visible for frustum in viewer._frustums)
         viewer.view.value = "2"
         viewer.go_to(0)
+        assert [frustum.visible for frustum in viewer._frustums] == [False, True, True]
     finally:
         viewer.stop()
 
