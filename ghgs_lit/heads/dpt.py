@@ -222,12 +222,22 @@ class DPTHead(nn.Module):
         return Windows(result, full, fused, tuple(levels))
 
     def _level(self, i: int, tokens: Tokens, place: LevelWindows) -> Float[Tensor, "bv c h w"]:
-        """Normalised and projected tokens as a map (a 1x1 convolution is a linear layer of tokens)."""
-        project, aspect = self.projects[i], tokens.grid[3] / tokens.grid[2]
-        projected = linear(self.norm(tokens.latent[i]), project.weight.flatten(1), project.bias)
-        maps = dataclasses.replace(tokens, latent=(projected,)).maps(0)[..., *place.tokens.slices]
+        """The level's map."""
+        aspect = tokens.grid[3] / tokens.grid[2]
+        if tokens.is_dense:  # then the tokens outside the window can be left out without a copy
+            b, v, *grid = tokens.grid
+            inside = tokens.latent[i].unflatten(0, (b * v, *grid))[:, *place.tokens.slices]
+            maps = self._project(i, inside).permute(0, 3, 1, 2)
+        else:
+            projected = dataclasses.replace(tokens, latent=(self._project(i, tokens.latent[i]),))
+            maps = projected.maps(0)[..., *place.tokens.slices]
         level = self.resize_layers[i](add_positions_(maps, aspect, place.tokens))
         return getattr(self.scratch, f"layer{i + 1}_rn")(level)
+
+    def _project(self, i: int, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n o"]:
+        """Normalised and projected tokens (a 1x1 convolution is a linear layer of tokens)."""
+        project = self.projects[i]
+        return linear(self.norm(x), project.weight.flatten(1), project.bias)
 
 
 def _times(factor: int, grid: tuple[int, int]) -> tuple[int, int]:
