@@ -21,6 +21,7 @@ from ghgs_lit.benchmark.scene import ellipsoid_batch
 from ghgs_lit.benchmark.stages import TOTAL, SecondsProbe, forward, top_level
 from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.config import compose, resolve
+from ghgs_lit.kernels.allocation import keep_freed_memory
 from ghgs_lit.types import Batch
 from ghgs_lit.visualization.pictures import to_uint8
 
@@ -58,6 +59,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
+    keep_freed_memory()  # as the command line does
     cfg = compose("benchmark", options.options)
     config = resolve(cfg)
     device = pick_device(config["device"])

@@ -24,6 +24,7 @@ from ghgs_lit.cli.messages import (
     raised_by_hydra,
 )
 from ghgs_lit.config import check_groups, conf_dir, resolve
+from ghgs_lit.kernels.allocation import keep_freed_memory
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
 
@@ -174,6 +175,7 @@ def main() -> int:
     argv = list(sys.argv)
     # OpenMP threads that spin while they wait slow down other processes on the same cores tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    keep_freed_memory()
     if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
         completed = _completion_argv(argv)
         return 0 if completed is None else _run(completed[1], completed)

@@ -106,10 +106,20 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
 def _smooth(images: Tensor, masks: Tensor) -> Tensor:
     """Colours averaged over the subject's pixels in 3 x 3, and the mask as a fourth channel."""
     inside = masks.to(images.dtype)[:, :, None]
-    both = F.avg_pool2d(torch.cat((images * inside, inside), 2).flatten(0, 1), 3, 1, 1)
-    both = both.unflatten(0, masks.shape[:2])
+    both = torch.cat((images * inside, inside), 2)
+    for axis in (-2, -1):  # sums of three, several times as fast as an average pool
+        both = _sum_of_three(both, axis)
     colors = both[:, :, :3] / torch.where(both[:, :, 3:] > 0, both[:, :, 3:], 1.0)
     return torch.cat((colors, inside), 2)
+
+
+def _sum_of_three(values: Tensor, axis: int) -> Tensor:
+    """Of each value and its neighbours along an axis; beyond the border lies 0."""
+    found = values.clone()
+    inner = values.shape[axis] - 1
+    found.narrow(axis, 1, inner).add_(values.narrow(axis, 0, inner))
+    found.narrow(axis, 0, inner).add_(values.narrow(axis, 1, inner))
+    return found
 
 
 def _relations(cameras: Cameras) -> tuple[Tensor, Tensor, Tensor]:
