@@ -4,6 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ghgs_lit.capture.capture import Capture
+    from ghgs_lit.capture.predict import predict
     from ghgs_lit.model import GHGS
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Cameras, Gaussians
@@ -12,10 +14,12 @@ _MODULES = {
     "GHGS": "ghgs_lit.model",
     "Batch": "ghgs_lit.types",
     "Cameras": "ghgs_lit.types",
+    "Capture": "ghgs_lit.capture.capture",
     "Gaussians": "ghgs_lit.types",
+    "predict": "ghgs_lit.capture.predict",
     "render": "ghgs_lit.rendering",
 }
-__all__ = ["GHGS", "Batch", "Cameras", "Gaussians", "render"]
+__all__ = ["GHGS", "Batch", "Cameras", "Capture", "Gaussians", "predict", "render"]
 
 
 def __getattr__(name: str):

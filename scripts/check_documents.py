@@ -122,6 +122,22 @@ for phase in ("train", "val"):
         np.savez(folder / "cameras.npz", **cameras)
         np.save(folder / "body.npy", np.random.default_rng(0).normal(size=(99, 3)) * 0.2)
 END"""
+# The same as the photographs of a user: a folder of photographs, one of masks, and a calibration.
+_CAPTURE = """python - <<'END'
+import json, shutil
+from pathlib import Path
+import numpy as np
+root, cameras = Path("rendered/val"), {}
+names = sorted(p.name for p in (root / "img").iterdir())[:16:4]
+for folder in ("photographs", "masks"):
+    Path(folder).mkdir()
+for name in names:
+    shutil.copy(root / "img" / name / "0.jpg", f"photographs/{name}.jpg")
+    shutil.copy(root / "mask" / name / "0.png", f"masks/{name}.png")
+    cameras[name] = {kind + "s": np.load(root / "parm" / name / f"0_{kind}.npy").tolist()
+                     for kind in ("intrinsic", "extrinsic")}
+Path("cameras.json").write_text(json.dumps({"cameras": cameras}))
+END"""
 # A document, and the commands that make what its reader has.
 BEFORE = {
     "docs/add_a_data_set.md": (_SCANS.format("scans"), _RENDER.format("scans"), _PHOTOGRAPHS),
@@ -132,6 +148,11 @@ BEFORE = {
     ),
     "docs/encoder.md": _CHECKPOINTS,
     "docs/outputs.md": _CHECKPOINTS,
+    "docs/photographs.md": (
+        f"{_RUN} hydra.run.dir=runs/mine",
+        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
+        _CAPTURE,
+    ),
     "docs/sweeps.md": (_SWEEP,),
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (

@@ -25,6 +25,7 @@ VERBS = (
     "import",
     "export",
     "view",
+    "doctor",
 )
 # What a reader makes, and options and names that are not in this repository.
 MADE = ("conf/data/my_people.yaml", "conf/sweep/<name>.yaml")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics
+from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError, choice, require
 
 EXTRINSICS = ("world_to_camera", "camera_to_world")
@@ -33,8 +34,7 @@ class Convention:
         intrinsics: ``pixels``, or shares of the width and of the height: ``normalized`` (all of them) |
             ``normalized_principal`` (the principal point alone).
         pixel_centers: the first pixel's centre lies at 0.5 (``half``) or at 0 (``integer``, as OpenCV's).
-        size: (height, width) in pixels of the images that were calibrated; None: what the file says, and that
-            of the photographs where it says nothing.
+        resized: by what photographs were resized after the calibration, beyond the sizes that the file says.
         unit: metres of one unit of length.
     """
 
@@ -42,7 +42,7 @@ class Convention:
     axes: str = "opencv"
     intrinsics: str = "pixels"
     pixel_centers: str = "half"
-    size: tuple[int, int] | None = None
+    resized: float = 1.0
     unit: float = 1.0
 
     def __post_init__(self) -> None:
@@ -50,7 +50,9 @@ class Convention:
         choice("calibration.axes", self.axes, AXES)
         choice("calibration.intrinsics", self.intrinsics, INTRINSICS)
         choice("calibration.pixel_centers", self.pixel_centers, PIXEL_CENTERS)
-        require(self.unit > 0, "calibration.unit", "above 0", self.unit)
+        for name in ("resized", "unit"):
+            value = getattr(self, name)
+            require(0 < value < float("inf"), f"calibration.{name}", "a number above 0", value)
 
 
 @dataclass(frozen=True)
@@ -103,13 +105,6 @@ class Calibration:
     fisheye: bool
 
 
-def calibrated_size(
-    camera: StoredCamera, convention: Convention, photograph: tuple[int, int]
-) -> tuple[int, int]:
-    """The (height, width) that the intrinsics are for: as said, as stored, or that of the photograph."""
-    return convention.size or camera.size or photograph
-
-
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
     """What a stored camera means for a photograph.
 
@@ -122,14 +117,14 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     Raises:
         InputError: the ratio of the sides differs.
     """
-    size = calibrated_size(camera, convention, photograph)
+    size = camera.size or photograph
     intrinsics = camera.intrinsics.copy()
     height, width = size
     if convention.intrinsics != "pixels":
         columns = slice(None) if convention.intrinsics == "normalized" else slice(2, None)
         intrinsics[:2, columns] *= np.array([[width], [height]])
     if convention.pixel_centers == "integer":
-        intrinsics[:2, 2] += 0.5
+        intrinsics = half_centers(intrinsics)
     if size != photograph:
         if not same_ratio(size, photograph):
             raise InputError(
@@ -137,6 +132,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
                 f"from it, as it was calibrated; found {photograph[0]}x{photograph[1]}"
             )
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
+    intrinsics[:2] *= convention.resized
     extrinsics = extrinsics_of(camera.pose, convention)
     return Calibration(intrinsics, extrinsics, camera.distortion, camera.fisheye)
 

@@ -46,7 +46,11 @@ VERBS = {
     ),
     "predict": (
         "turn photographs into a splat, pictures and a page",
-        "ghgs predict checkpoint=runs/train/.../checkpoints/last.ckpt subject=0",
+        "ghgs predict checkpoint=last.ckpt images=photographs cameras=cameras.json masks=masks out=splat",
+    ),
+    "doctor": (
+        "find out whether cameras, masks and photographs fit together",
+        "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks",
     ),
     "view": (
         "a page in the browser to look around in a prediction",

@@ -1,12 +1,17 @@
-"""``ghgs predict``: one subject's photographs to a splat, and to what else ``formats`` lists."""
+"""``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
 
 import dataclasses
 import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
 
+from ghgs_lit.capture.doctor import diagnose
+from ghgs_lit.capture.predict import predict, trained_size
 from ghgs_lit.cli.inputs import (
     build_data,
     build_renderer,
@@ -15,13 +20,17 @@ from ghgs_lit.cli.inputs import (
     pick_device,
     with_trained_data,
 )
+from ghgs_lit.cli.photographs import capture_folder, require_consistent
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
+from ghgs_lit.config.settings import image_size
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.export import output_options, write_prediction
 from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def subject_batch(
@@ -51,16 +60,17 @@ def subject_batch(
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
     """The verb; prints the files (not those in folders), and the directory last."""
-    directory = output_dir()
-    config = resolve(with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
+    directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
+    own = cfg.images is not None or cfg.cameras is not None
+    config = resolve(cfg if own else with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
     write_config(config, directory)
-    options = output_options(config)
-    device = pick_device(config["device"])
-    renderer = build_renderer(config, device)
-    model = GHGS.from_config(config, empty=STAGES)
-    model.load(config["checkpoint"])
-    model.precision = config["precision"]
-    model.to(device).eval()
+    (predict_photographs if own else predict_subject)(config, directory)
+    announce(directory)
+
+
+def predict_subject(config: dict[str, Any], directory: Path) -> None:
+    """Predict a subject of a data set."""
+    options, (model, renderer, device) = output_options(config), load(config)
     data = build_data(config)
     check_size(data, model)
     data.prepare_data()
@@ -70,6 +80,63 @@ def run(cfg: DictConfig) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize()
     facts = {"checkpoint": config["checkpoint"], "seconds": {"predict": time.perf_counter() - begin}}
-    paths = write_prediction(directory, batch, prediction, renderer, options, facts)
+    write(directory, batch, prediction, renderer, options, facts)
+
+
+def predict_photographs(config: dict[str, Any], directory: Path) -> None:
+    """Predict each instant of a folder of photographs; several get a folder each."""
+    folder, options = capture_folder(config), output_options(config)
+    if config["check_cameras"]:
+        diagnosis = diagnose(folder)
+        require_consistent(diagnosis)
+        print("\n".join(diagnosis.lines), flush=True)
+    size = image_size("size", config["size"] or trained_size(read_checkpoint(config["checkpoint"])["config"]))
+    model, renderer, _ = load(config)
+    multiple = model.side_multiple
+    expected = f"sides divisible by the patch size {multiple}"
+    require(not any(side % multiple for side in size), "size", expected, size)
+    totals: dict[str, float] = {}
+    begin = time.perf_counter()
+    # The next photographs are decoded while the model works.
+    with ThreadPoolExecutor(1) as pool:
+        captures = deque(pool.submit(folder.read, name) for name in folder.instants[:1])
+        for number, name in enumerate(folder.instants, 1):
+            start = time.perf_counter()
+            capture = captures.popleft().result()
+            waited = time.perf_counter() - start
+            if number < len(folder.instants):
+                captures.append(pool.submit(folder.read, folder.instants[number]))
+            result = predict(capture, model, size)
+            seconds = {"read": waited, **result.seconds}
+            scene = result.normalization
+            facts = {
+                "checkpoint": config["checkpoint"],
+                "seconds": seconds,
+                "subject_size": scene.size,
+                "scaled_inside_by": scene.scale,
+            }
+            start = time.perf_counter()
+            place = directory / name if len(folder.instants) > 1 else directory
+            write(place, result.batch, result.prediction, renderer, options, facts)
+            for stage, value in (seconds | {"write": time.perf_counter() - start}).items():
+                totals[stage] = totals.get(stage, 0.0) + value
+    if len(folder.instants) > 1:
+        count, total = len(folder.instants), time.perf_counter() - begin
+        stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
+        print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
+
+
+def load(config: dict[str, Any]) -> tuple[GHGS, Renderer, torch.device]:
+    """The model of a checkpoint and the renderer, on the device of a configuration."""
+    device = pick_device(config["device"])
+    renderer = build_renderer(config, device)
+    model = GHGS.from_config(config, empty=STAGES)
+    model.load(config["checkpoint"])
+    model.precision = config["precision"]
+    return model.to(device).eval(), renderer, device
+
+
+def write(directory: Path, *prediction: Any) -> None:
+    """Write a prediction (arguments of :func:`write_prediction`); print the files that are in no folder."""
+    paths = write_prediction(directory, *prediction)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
-    announce(directory)

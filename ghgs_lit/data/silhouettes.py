@@ -84,7 +84,7 @@ def implausible(mask: np.ndarray) -> str | None:
 
 def supports(silhouettes: Sequence[Silhouette]) -> list[float]:
     """For each silhouette the share of its cells whose rays meet the visual hull of the others."""
-    focus, radius = _subject(silhouettes)
+    focus, radius = subject_place(silhouettes)
     return [
         _support(s, [o for o in _some(silhouettes, _OTHERS + 1) if o is not s], focus, radius)
         for s in silhouettes
@@ -93,8 +93,8 @@ def supports(silhouettes: Sequence[Silhouette]) -> list[float]:
 
 def height(silhouettes: Sequence[Silhouette]) -> float:
     """Median height of the subject in world units, as the silhouettes show it."""
-    focus, _ = _subject(silhouettes)
-    return float(np.median([_extent(s, focus)[0] for s in silhouettes]))
+    focus, _ = subject_place(silhouettes)
+    return float(np.median([extent(s, focus)[0] for s in silhouettes]))
 
 
 def twins(silhouettes: Mapping[int, Silhouette]) -> tuple[int, int] | None:
@@ -122,7 +122,7 @@ def _support(own: Silhouette, others: Sequence[Silhouette], focus: np.ndarray, r
     return float((votes >= needed).any(1).mean()) if len(depths) else 0.0
 
 
-def _subject(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
+def subject_place(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     """Where the subject is [3], and how far its parts may lie from there."""
     rays, centers = [], np.stack([s.center for s in silhouettes])
     for s in silhouettes:
@@ -133,11 +133,11 @@ def _subject(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     # The point nearest to all rays: sum (I - r r^T) (x - c) = 0.
     across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
     focus = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
-    return focus, float(max(np.linalg.norm(_extent(s, focus)) for s in silhouettes))
+    return focus, float(max(np.linalg.norm(extent(s, focus)) for s in silhouettes))
 
 
-def _extent(s: Silhouette, focus: np.ndarray) -> np.ndarray:
-    """Height and width of a silhouette at the depth of ``focus``, in world units."""
+def extent(s: Silhouette, focus: np.ndarray) -> np.ndarray:
+    """Height and width [2] of a silhouette at the depth of ``focus``, in world units."""
     rows, columns = np.nonzero(s.mask)
     cells = np.array([np.ptp(rows) + 1, np.ptp(columns) + 1]) if len(rows) else np.zeros(2)
     depth = abs((s.extrinsics[:3, :3] @ focus + s.extrinsics[:3, 3])[2])

@@ -49,6 +49,11 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
     return np.where(known, np.clip(inverse, 1, 65535), 0).astype(np.uint16)
 
 
+def half_centers(intrinsics: np.ndarray) -> np.ndarray:
+    """Intrinsics [3, 3] of pixel centres at integers for centres at +0.5."""
+    return intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
 def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> View:
     """A view from an OpenCV calibration: background to black, pixel centres from integers to +0.5.
 
@@ -58,10 +63,8 @@ def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, ext
         intrinsics: [3, 3] in pixels, pixel centres at integers.
         extrinsics: [4, 4], world to camera, metres.
     """
-    intrinsics = np.array(intrinsics)
-    intrinsics[:2, 2] += 0.5
     image = np.where(mask[..., None], image, 0)
-    return View(image, mask, None, intrinsics.astype(np.float32), extrinsics.astype(np.float32))
+    return View(image, mask, None, half_centers(intrinsics).astype(np.float32), extrinsics.astype(np.float32))
 
 
 def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS
-from ghgs_lit.data.view import resize_view
+from ghgs_lit.data.view import half_centers, resize_view
 from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.reader import Split, ZJUMoCapReader
-from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 from ghgs_lit.synthesis.miniatures import zju_mocap
 from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
 
@@ -106,7 +106,7 @@ def test_the_background_is_black(root):
 def test_undistortion_is_that_of_opencv():
     """The published calibrations are OpenCV's; our undistortion agrees with stored results of it."""
     height, width = OPENCV["image"].shape[:2]
-    grid = undistorting_grid(OPENCV["intrinsics"], OPENCV["distortion"].ravel(), height, width)
+    grid = undistorting_grid(half_centers(OPENCV["intrinsics"]), OPENCV["distortion"].ravel(), height, width)
     image, mask = undistort(OPENCV["image"], np.ones((height, width), bool), grid)
     error = np.abs(image.astype(int) - OPENCV["undistorted"])
     assert error.mean() < 0.3
@@ -128,7 +128,7 @@ def test_undistortion_comes_before_the_resize(root):
 
 def test_a_lens_without_distortion_leaves_photographs_alone(root):
     """The resampling itself shifts nothing."""
-    grid = undistorting_grid(OPENCV["intrinsics"], np.zeros(5), *OPENCV["image"].shape[:2])
+    grid = undistorting_grid(half_centers(OPENCV["intrinsics"]), np.zeros(5), *OPENCV["image"].shape[:2])
     image, mask = undistort(OPENCV["image"], np.ones(OPENCV["image"].shape[:2], bool), grid)
     assert np.abs(image.astype(int) - OPENCV["image"]).max() <= 1
     assert mask[1:-1, 1:-1].all()

@@ -41,7 +41,7 @@ def read_colmap(path: Path) -> CameraFile:
         import pycolmap
     except ImportError:
         raise InputError(
-            f"{path}: expected the extra colmap for COLMAP's models (pip install 'ghgs-lit[colmap]'); found none"
+            f"{path}: expected pycolmap to read COLMAP's models (pip install 'ghgs-lit[colmap]'); found none"
         ) from None
     try:
         model = pycolmap.Reconstruction(str(folder))

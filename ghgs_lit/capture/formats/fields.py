@@ -67,10 +67,10 @@ def camera_from_fields(name: str, place: str, fields: Mapping[str, Any]) -> Stor
     no_distortion = find(fields, "distortion") is None
     distortion = np.zeros(0) if no_distortion else array("distortion", (None,), (None, 1), (1, None)).ravel()
     intrinsics, fisheye = array("intrinsics", (3, 3)), bool(find(fields, "fisheye"))
-    return StoredCamera(name, place, intrinsics, pose, _size(place, fields), distortion, fisheye)
+    return StoredCamera(name, place, intrinsics, pose, size_from_fields(place, fields), distortion, fisheye)
 
 
-def _size(place: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:
+def size_from_fields(place: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:
     """(height, width) where they are given, as two numbers or as a list (width, height)."""
     width, height = find(fields, "width"), find(fields, "height")
     if (both := find(fields, "size")) is not None:

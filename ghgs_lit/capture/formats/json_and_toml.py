@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ghgs_lit.capture.calibration import Calibration, Convention, StoredCamera
 from ghgs_lit.capture.formats.camera_file import CameraFile, by_name
-from ghgs_lit.capture.formats.fields import OPENCV, camera_from_fields, is_camera
+from ghgs_lit.capture.formats.fields import OPENCV, camera_from_fields, is_camera, size_from_fields
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
@@ -33,7 +31,7 @@ def read_json_file(path: Path) -> dict[str, Any]:
 def read_json(path: Path) -> CameraFile:
     """``{"cameras": {<name>: {...}}}``, or that mapping alone, with the keys of one of two kinds.
 
-    ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``size`` (height, width), ``distortion`` and
+    ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion`` and
     ``fisheye``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there.
     ``K``, ``R``, ``T``, ``D``: OpenCV's.
 
@@ -72,35 +70,27 @@ def _of_opencv(path: Path, named: Mapping[str, Any], name_of_format: str) -> Cam
 
 
 def _own(name: str, place: str, camera: Mapping[str, Any]) -> StoredCamera:
-    known = {"intrinsics", "extrinsics", "size", "distortion", "fisheye"}
-    require(
-        set(camera) <= known, place, f"keys among {', '.join(sorted(known))}", sorted(set(camera) - known)
-    )
+    known = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
+    unknown = sorted(set(camera) - set(known))
+    require(not unknown, place, f"keys among {', '.join(known)}", unknown)
     require("intrinsics" in camera, place, "intrinsics", sorted(camera))
     pose = check_array(f"{place}: extrinsics", camera["extrinsics"], [(4, 4), (3, 4)])
-    size = camera.get("size")
-    if size is not None:
-        height, width = check_array(f"{place}: size", size, [(2,)])
-        require(min(height, width) >= 1, f"{place}: size", "height and width above 0", size)
-        size = int(height), int(width)
     distortion = check_array(f"{place}: distortion", camera.get("distortion", []), [(None,)])
+    fisheye = bool(camera.get("fisheye", False))
     return StoredCamera(
-        name, place, camera["intrinsics"], pose, size, distortion, bool(camera.get("fisheye", False))
+        name, place, camera["intrinsics"], pose, size_from_fields(place, camera), distortion, fisheye
     )
 
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
     """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
-
-    def plain(array: np.ndarray) -> list:
-        return array.tolist()
-
     content = {
         name: {
-            "intrinsics": plain(camera.intrinsics),
-            "extrinsics": plain(camera.extrinsics),
-            "size": list(size),
-            "distortion": plain(camera.distortion),
+            "intrinsics": camera.intrinsics.tolist(),
+            "extrinsics": camera.extrinsics.tolist(),
+            "width": size[1],
+            "height": size[0],
+            "distortion": camera.distortion.tolist(),
             "fisheye": camera.fisheye,
         }
         for name, (camera, size) in cameras.items()

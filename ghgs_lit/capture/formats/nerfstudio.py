@@ -13,6 +13,8 @@ from ghgs_lit.capture.formats.json_and_toml import read_json_file
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, choice, require
 
+_FOCAL = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
+_KEYS = (*_FOCAL, "k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 
@@ -49,24 +51,6 @@ def _camera(path: Path, place: str, shared: Mapping[str, Any], frame: Any) -> St
     return StoredCamera(str(frame["file_path"]), place, intrinsics, pose, size, distortion, fisheye, mask)
 
 
-_KEYS = [
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "w",
-    "h",
-    "camera_angle_x",
-    "camera_angle_y",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-]
-
-
 def _number(place: str, key: str, value: Any) -> float:
     try:
         number = float(value)
@@ -88,7 +72,7 @@ def _intrinsics(place: str, numbers: Mapping[str, float], size: tuple[int, int] 
             focal[axis] = side / 2 / math.tan(angle / 2)
     if not focal or (size is None and not {"cx", "cy"} <= set(numbers)):
         raise InputError(
-            f"{place}: expected fl_x, cx and cy, or w, h and camera_angle_x; found {', '.join(numbers) or None}"
+            f"{place}: expected fl_x, cx and cy, or w, h and camera_angle_x; found {sorted(numbers)}"
         )
     # Square pixels where one focal length is given.
     fx, fy = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))

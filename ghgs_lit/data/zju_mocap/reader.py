@@ -16,10 +16,10 @@ import numpy as np
 from ghgs_lit.config.settings import set_fields
 from ghgs_lit.data.decoding import check_center, check_name, read_array, read_map, read_photograph
 from ghgs_lit.data.reader import FrameReader
-from ghgs_lit.data.view import View, opencv_view
+from ghgs_lit.data.view import View, half_centers, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
-from ghgs_lit.data.zju_mocap.undistort import undistort, undistorting_grid
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 
 log = logging.getLogger(__name__)
 
@@ -127,7 +127,8 @@ class ZJUMoCapReader(FrameReader):
         intrinsics = frame.annotations.intrinsics[position]
         check_center(path, intrinsics, *image.shape[:2])
         if self.undistorted:
-            grid = undistorting_grid(intrinsics, frame.annotations.distortions[position], *image.shape[:2])
+            distortion = frame.annotations.distortions[position]
+            grid = undistorting_grid(half_centers(intrinsics), distortion, *image.shape[:2])
             image, mask = undistort(image, mask, grid)
         return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[position])
 

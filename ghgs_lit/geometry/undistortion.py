@@ -1,38 +1,47 @@
-"""Removes lens distortion from photographs and masks, as OpenCV's ``undistort`` does.
+"""Removes lens distortion from photographs and masks, as OpenCV's ``undistort`` and ``fisheye`` module do.
 
-Pixel centres are at integers in this file, as in the calibration. OpenCV itself is not a dependency; kornia
-has its camera model.
+OpenCV itself is not a dependency; kornia has its camera models.
 """
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.geometry.calibration import distort_points
+from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
 
 # Pixels between evaluations of the model; it is interpolated linearly, with errors below 0.01 px.
 _STEP = 8
 
 
 def undistorting_grid(
-    intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int
+    intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int, fisheye: bool = False
 ) -> torch.Tensor:
     """Where each pixel of the undistorted image lies in the photograph.
 
     Args:
-        intrinsics: [3, 3] in pixels; the undistorted image keeps them.
-        distortion: k1 k2 p1 p2, or k1 k2 p1 p2 k3.
+        intrinsics: [3, 3] in pixels, pixel centres at +0.5; the undistorted image keeps them.
+        distortion: k1 k2 p1 p2 and up to ten more of OpenCV's model.
         height, width: size of the photograph in pixels.
+        fisheye: ``distortion`` is k1 to k4 of the model of Kannala and Brandt.
 
     Returns:
-        [1, h, w, 2] for ``grid_sample``.
+        [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``.
     """
     counts = [max(2, -(-side // _STEP) + 1) for side in (height, width)]
-    knots = [torch.linspace(0, side - 1, n) for side, n in zip((height, width), counts, strict=True)]
+    knots = [
+        torch.linspace(0.5, side - 0.5, n, dtype=torch.float64)
+        for side, n in zip((height, width), counts, strict=True)
+    ]
     rows, columns = torch.meshgrid(*knots, indexing="ij")
-    matrix, coefficients = (torch.from_numpy(a).float()[None] for a in (intrinsics, distortion))
-    places = distort_points(torch.stack((columns, rows), -1).reshape(1, -1, 2), matrix, coefficients)
-    # Pixel j, centred at integer j, is at (2 j + 1) / w - 1 with align_corners=False.
-    grid = ((2 * places + 1) / torch.tensor([width, height]) - 1).reshape(1, *counts, 2)
+    pixels = torch.stack((columns, rows), -1).reshape(-1, 2)
+    matrix, coefficients = (torch.from_numpy(np.asarray(a, np.float64)) for a in (intrinsics, distortion))
+    if fisheye:
+        scale, middle = matrix[[0, 1], [0, 1]], matrix[:2, 2]
+        params = torch.cat((scale, middle, coefficients))
+        places = distort_points_kannala_brandt((pixels - middle) / scale, params)
+    else:
+        places = distort_points(pixels[None], matrix[None], coefficients[None])[0]
+    grid = (2 * places / places.new_tensor([width, height]) - 1).reshape(1, *counts, 2).float()
     dense = F.interpolate(grid.permute(0, 3, 1, 2), (height, width), mode="bilinear", align_corners=True)
     return dense.permute(0, 2, 3, 1)
 

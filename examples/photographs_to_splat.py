@@ -1,0 +1,17 @@
+"""Photographs of a person to a splat.
+
+    python photographs_to_splat.py photographs cameras.json model.ckpt splat.ply
+
+Masks lie beside the photographs (``front_mask.png`` of ``front.jpg``), or are their alpha channels.
+"""
+
+import sys
+
+from ghgs_lit import Capture, predict
+from ghgs_lit.export.ply import write_ply
+
+images, cameras, checkpoint, splat = sys.argv[1:]
+capture = Capture.read(images, cameras)
+prediction = predict(capture, checkpoint)
+write_ply(prediction.gaussians, splat)
+print(f"{splat}: {len(prediction.gaussians)} Gaussians")

@@ -1,0 +1,136 @@
+"""A user's photographs of one instant, and the batch that a model sees of them."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ghgs_lit.capture.normalization import Normalization, normalization_of
+from ghgs_lit.data.resampling import area_image, area_mask
+from ghgs_lit.errors import require
+from ghgs_lit.types import Batch, Cameras
+
+#: How much of a crop's height or width the subject takes, as in the photographs of training data.
+_SHARE = 0.8
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph without lens distortion, upright.
+
+    Attributes:
+        name: of its camera.
+        image: [h, w, 3] uint8, RGB.
+        mask: [h, w] bool, true on the subject.
+        intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
+        extrinsics: [4, 4] float64, world to camera, OpenCV axes, in the user's unit.
+    """
+
+    name: str
+    image: np.ndarray
+    mask: np.ndarray
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Photographs of one instant. :meth:`read` makes it from files.
+
+    Attributes:
+        name: of the instant.
+        photographs: two or more.
+    """
+
+    name: str
+    photographs: tuple[Photograph, ...]
+
+    @classmethod
+    def read(cls, images: str | Path, cameras: str | Path, **options: Any) -> "Capture":
+        """The photographs of a folder with their cameras.
+
+        Args:
+            images: the folder.
+            cameras: the calibration, in one of :data:`ghgs_lit.capture.formats.FORMATS`.
+            options: as for :class:`ghgs_lit.capture.folder.CaptureFolder`, such as ``masks``.
+
+        Raises:
+            InputError: a file is missing or wrong, or the folder holds several instants.
+        """
+        from ghgs_lit.capture.folder import CaptureFolder
+
+        folder = CaptureFolder(images, cameras, **options)
+        found = folder.instants
+        require(len(found) == 1, str(images), "one instant (CaptureFolder reads several)", len(found))
+        return folder.read(found[0])
+
+    def batch(self, size: tuple[int, int]) -> tuple[Batch, Normalization]:
+        """What a model sees: crops around the subject, of a person's size, about the origin.
+
+        Args:
+            size: (height, width) of the crops in pixels.
+
+        Returns:
+            A batch of one element on a black background, and how it lies in the user's world.
+        """
+        crops = [crop_to_subject(photograph, size) for photograph in self.photographs]
+        normalization = normalization_of(crops)
+        images = torch.from_numpy(np.stack([crop.image * crop.mask[..., None] for crop in crops]))
+        extrinsics = np.stack([normalization.extrinsics(crop.extrinsics) for crop in crops])
+        intrinsics = np.stack([crop.intrinsics for crop in crops])
+        cameras = (torch.from_numpy(matrices).float()[None] for matrices in (intrinsics, extrinsics))
+        batch = Batch(
+            images=images.permute(0, 3, 1, 2)[None].float() / 255,
+            masks=torch.from_numpy(np.stack([crop.mask for crop in crops]))[None],
+            cameras=Cameras(*cameras, *size),
+            subjects=(self.name,),
+            views=(tuple(crop.name for crop in crops),),
+        )
+        return batch, normalization
+
+
+def crop_to_subject(photograph: Photograph, size: tuple[int, int]) -> Photograph:
+    """The subject in the middle of an image of ``size`` (height, width); its camera is that of the crop.
+
+    Beyond the photograph the crop is black. Where the subject is cut by the photograph's border the crop ends
+    there, too: black beside it would say that the subject ends.
+    """
+    rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
+    extents = [(int(found[0]), int(found[-1]) + 1) for found in (rows, columns)]
+    scale = max((end - first) / (_SHARE * side) for (first, end), side in zip(extents, size, strict=True))
+    spans = [
+        _span(first, end, max(round(scale * side), 1), whole)
+        for (first, end), side, whole in zip(extents, size, photograph.mask.shape, strict=True)
+    ]
+    (top, bottom), (left, right) = spans
+    factors = np.array([size[1] / (right - left), size[0] / (bottom - top)])
+    intrinsics = photograph.intrinsics.copy()
+    intrinsics[:2, 2] -= [left, top]
+    intrinsics[:2] *= factors[:, None]
+    return replace(
+        photograph,
+        image=area_image(_cut(photograph.image, spans), *size),
+        mask=area_mask(_cut(photograph.mask, spans), *size),
+        intrinsics=intrinsics,
+    )
+
+
+def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
+    """``length`` pixels around those from ``first`` to ``end`` of ``whole``; see :func:`crop_to_subject`."""
+    if first == 0 and end == whole:
+        return 0, whole
+    start = (first + end - length) // 2
+    if first == 0:
+        start = 0
+    elif end == whole:
+        start = whole - length
+    return start, start + length
+
+
+def _cut(image: np.ndarray, spans: list[tuple[int, int]]) -> np.ndarray:
+    """The pixels of ``spans``, 0 beyond the image."""
+    inside = tuple(slice(max(a, 0), min(b, side)) for (a, b), side in zip(spans, image.shape, strict=False))
+    pads = [(max(-a, 0), max(b - side, 0)) for (a, b), side in zip(spans, image.shape, strict=False)]
+    return np.pad(image[inside], pads + [(0, 0)] * (image.ndim - 2))

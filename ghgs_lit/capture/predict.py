@@ -1,0 +1,83 @@
+"""Photographs in, Gaussians out, in the user's world."""
+
+import functools
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ghgs_lit.capture.capture import Capture
+from ghgs_lit.capture.normalization import Normalization
+from ghgs_lit.config.settings import image_size
+from ghgs_lit.errors import require
+from ghgs_lit.model import GHGS
+from ghgs_lit.types import Batch, Gaussians, Prediction
+from ghgs_lit.weights.checkpoint import read_checkpoint
+
+
+@dataclass(frozen=True)
+class CapturePrediction:
+    """What a model makes of a capture, in the user's world and unit.
+
+    Attributes:
+        batch: what the model saw: crops around the subject, with their cameras.
+        prediction: of this batch.
+        normalization: what the model saw it in.
+        seconds: run time by stage.
+    """
+
+    batch: Batch
+    prediction: Prediction
+    normalization: Normalization
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return self.prediction.gaussians
+
+
+@torch.no_grad()
+def predict(
+    capture: Capture, model: GHGS | str | Path, size: int | tuple[int, int] | None = None
+) -> CapturePrediction:
+    """The Gaussians of a capture.
+
+    Args:
+        capture: the photographs.
+        model: a model in evaluation mode, or the path of a checkpoint (kept in memory for further calls).
+        size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
+            (checkpoints only).
+
+    Raises:
+        InputError: the checkpoint cannot be used, or the size does not fit the model.
+    """
+    if not isinstance(model, GHGS):
+        path = Path(model).expanduser()
+        size = size or trained_size(read_checkpoint(path)["config"])
+        model = _model(path, path.stat().st_mtime_ns)
+    require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
+    begin = time.perf_counter()
+    batch, normalization = capture.batch(image_size("size", size))
+    cropped = time.perf_counter()
+    batch = batch.to(next(model.parameters()).device)
+    batch, prediction = normalization.to_user(batch, model(batch))
+    if batch.images.device.type == "cuda":
+        torch.cuda.synchronize()
+    seconds = {"crop": cropped - begin, "predict": time.perf_counter() - cropped}
+    return CapturePrediction(batch, prediction, normalization, seconds)
+
+
+def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
+    """Side or (height, width) of the photographs that a checkpoint's model was trained with.
+
+    Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
+    """
+    return config.get("data", {}).get("size") or config["encoder"].get("image_size", 518)
+
+
+@functools.lru_cache(maxsize=1)
+def _model(path: Path, changed: int) -> GHGS:
+    return GHGS.from_checkpoint(path)

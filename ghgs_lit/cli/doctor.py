@@ -1,0 +1,16 @@
+"""``ghgs doctor``: what is wrong, and what would mend it; one module for each task."""
+
+from collections.abc import Callable
+
+from omegaconf import DictConfig
+
+from ghgs_lit.cli import doctor_cameras
+from ghgs_lit.errors import choice
+
+TASKS: dict[str, Callable[[DictConfig], None]] = {"cameras": doctor_cameras.run}
+
+
+def run(cfg: DictConfig) -> None:
+    """The verb: one of :data:`TASKS`."""
+    choice("task", cfg.task, tuple(TASKS))
+    TASKS[cfg.task](cfg)

@@ -1,0 +1,65 @@
+"""``ghgs doctor task=cameras``: whether photographs, masks and calibration fit together."""
+
+import rich
+from omegaconf import DictConfig
+from rich.table import Table
+
+from ghgs_lit.capture.calibration import calibrate
+from ghgs_lit.capture.doctor import Diagnosis, Ranked, diagnose, silhouettes_of
+from ghgs_lit.capture.drawing import camera_sheet
+from ghgs_lit.capture.folder import CaptureFolder
+from ghgs_lit.capture.formats.json_and_toml import write_json
+from ghgs_lit.cli.photographs import capture_folder
+from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.errors import InputError
+from ghgs_lit.visualization.pictures import save_png
+
+#: How many meanings are listed.
+_LISTED = 6
+
+
+def run(cfg: DictConfig) -> None:
+    """Print what was found; write ``cameras.png``, and ``cameras.json`` of a meaning that fits.
+
+    Raises:
+        InputError: the cameras do not fit as they are.
+    """
+    directory = output_dir()
+    folder = capture_folder(save_config(cfg, directory))
+    diagnosis = diagnose(folder)
+    _show(diagnosis)
+    best = diagnosis.ranking[0]
+    if best.score > 0:
+        path = directory / "cameras.png"
+        save_png(_sheet(folder, best), path)
+        announce(path)
+    if diagnosis.option:
+        # A calibration that needs no option any more.
+        path = directory / "cameras.json"
+        views = {
+            v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size)
+            for v in best.hypothesis.views
+        }
+        write_json(path, views)
+        announce(path)
+    if not diagnosis.consistent:
+        raise InputError(
+            f"{cfg.cameras}: expected cameras that fit the masks; found {'; '.join(diagnosis.lines)}"
+        )
+
+
+def _show(diagnosis: Diagnosis) -> None:
+    """The meanings that were tried, the best first, and what follows."""
+    table = Table("meaning", "worst agreement", *diagnosis.ranking[0].shares)
+    for ranked in diagnosis.ranking[:_LISTED]:
+        shares = (f"{share:.0%}" for share in ranked.shares.values())
+        table.add_row(ranked.hypothesis.says, f"{ranked.score:.0%}", *shares)
+    rich.print(table)
+    print("\n".join(diagnosis.lines), flush=True)
+
+
+def _sheet(folder: CaptureFolder, ranked: Ranked):
+    """The picture of a meaning."""
+    views = ranked.hypothesis.views
+    images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
+    return camera_sheet([v.name for v in views], images, silhouettes_of(folder, views))

@@ -1,0 +1,168 @@
+"""Captures that cannot be read: one line that names the place, what was expected and what was found."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ghgs_lit import Capture
+from ghgs_lit.errors import InputError
+from tests.helpers.captures import truncate
+from tests.helpers.figures import Figure
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A right capture in ``images``."""
+    Figure().write(tmp_path / "images")
+    return tmp_path
+
+
+def image(place, name, array, **options):
+    Image.fromarray(array).save(place / "images" / f"{name}.png", **options)
+
+
+def camera(place, **changes):
+    """Change or (with ...) delete keys of the camera cam1."""
+    path = place / "images" / "cameras.json"
+    content = json.loads(path.read_text())
+    one = content["cameras"]["cam1"] | changes
+    content["cameras"]["cam1"] = {key: value for key, value in one.items() if value is not ...}
+    path.write_text(json.dumps(content))
+
+
+def remove(place, *names):
+    for name in names:
+        (place / "images" / name).unlink()
+
+
+def write(place, name, text):
+    (place / name).write_text(text)
+    return {"cameras": place / name}
+
+
+def only(place, *names):
+    for path in (place / "images").glob("*.png"):
+        if path.stem.removesuffix("_mask") not in names:
+            path.unlink()
+
+
+def mirrored(place):
+    exif = Image.Exif()
+    exif[0x0112] = 2
+    image(place, "cam1", Figure().images[1], exif=exif)
+
+
+def other_suffix(place):
+    Image.fromarray(Figure().images[0]).save(place / "images" / "cam0.jpg")
+
+
+def missing_mask(place):
+    (place / "masks").mkdir()
+    Image.fromarray(Figure().masks[0]).save(place / "masks" / "cam0.png")
+    return {"masks": place / "masks"}
+
+
+def folders(place, *names):
+    for name in names:
+        (place / "images" / name).mkdir()
+        Image.fromarray(Figure().images[0]).save(place / "images" / name / f"{name}.png")
+    only(place)
+
+
+SKEWED = (np.array(Figure().cameras["cam1"]["extrinsics"]) * 1.1).tolist()
+WIDE = np.zeros((128, 128, 3), np.uint8)
+
+# What is wrong with the folder (a function that may return options), and parts of the line.
+BAD = {
+    "no folder": (
+        lambda p: {"images": p / "none"},
+        "none: expected a folder of photographs",
+        "no such folder",
+    ),
+    "a file": (
+        lambda p: {"images": p / "images" / "cam0.png"},
+        "expected a folder of photographs; found 'a file'",
+    ),
+    "no photographs": (lambda p: only(p), "images: expected photographs", "found 'none'"),
+    "one photograph": (lambda p: only(p, "cam1"), "images: expected 2 photographs or more; found 1"),
+    "no camera": (lambda p: image(p, "back", WIDE), "cam0, cam1", "calibration.names", "found back"),
+    "two files": (other_suffix, "cam0.png: expected one file for each photograph", "cam0.jpg"),
+    "truncated": (lambda p: truncate(p / "images" / "cam1.png"), "cam1.png: expected a readable image"),
+    "16 bits": (lambda p: image(p, "cam1", np.zeros((128, 96), np.uint16)), "cam1.png", "8 bits", "I;16"),
+    "mirrored": (mirrored, "cam1.png: expected a photograph that is not mirrored", "orientation 2"),
+    "another ratio": (lambda p: image(p, "cam1", WIDE), "size of its photograph", "(128, 128)", "(128, 96)"),
+    "no masks": (lambda p: remove(p, "cam1_mask.png"), "cam1.png: expected a mask", "segment=rembg"),
+    "missing mask": (missing_mask, "masks: expected a mask cam1.png", "found 'none'"),
+    "no mask folder": (lambda p: {"masks": p / "nowhere"}, "masks: expected a folder", "nowhere"),
+    "mask size": (
+        lambda p: image(p, "cam1_mask", WIDE[:64, :, 0]),
+        "cam1_mask.png: expected the size",
+        "(64, 128)",
+    ),
+    "inverted mask": (
+        lambda p: image(p, "cam1_mask", ~Figure().masks[1]),
+        "cam1.png",
+        "not of the background",
+    ),
+    "empty mask": (lambda p: image(p, "cam1_mask", WIDE[:, :96, 0]), "cam1.png", "found 0 pixels"),
+    "no calibration": (
+        lambda p: {"cameras": p / "none.json"},
+        "none.json: expected a file or folder",
+        "no such",
+    ),
+    "unknown kind": (lambda p: write(p, "cams.csv", ""), "cams.csv: expected JSON", "found '.csv'"),
+    "broken JSON": (lambda p: write(p, "c.json", "{"), "c.json: expected JSON; found"),
+    "broken YAML": (lambda p: write(p, "c.yml", "a: [1"), "c.yml: expected YAML of OpenCV; found"),
+    "broken TOML": (lambda p: write(p, "c.toml", "[a"), "c.toml: expected TOML; found"),
+    "no cameras": (
+        lambda p: write(p, "c.json", "{}"),
+        "c.json: expected cameras with intrinsics",
+        "found []",
+    ),
+    "no frames": (
+        lambda p: write(p, "c.json", '{"frames": []}'),
+        "c.json: frames: expected a list of frames",
+    ),
+    "no intrinsics": (lambda p: camera(p, intrinsics=...), "cameras.json: cam1: expected intrinsics"),
+    "infinite": (
+        lambda p: camera(p, intrinsics=[[1e999, 0, 1], [0, 1, 1], [0, 0, 1]]),
+        "cam1",
+        "finite numbers",
+    ),
+    "no rotation": (lambda p: camera(p, extrinsics=SKEWED), "cam1: rotation: expected", "found"),
+    "three coefficients": (lambda p: camera(p, distortion=[1, 2, 3]), "cam1: expected 0, 4, 5", "found 3"),
+    "unknown key": (lambda p: camera(p, focal=3), "cam1: expected keys among", "focal"),
+    "calibrated size": (lambda p: camera(p, width=500), "cam1: expected a photograph of 128x500", "128x96"),
+    "unknown axes": (
+        lambda p: {"calibration": {"axes": "maya"}},
+        "calibration.axes: expected one of opencv, opengl",
+    ),
+    "no such option": (lambda p: {"calibration": {"axis": "y"}}, "calibration: expected keys among", "axis"),
+    "no segmenter": (
+        lambda p: (remove(p, "cam1_mask.png"), {"segment": "sam"})[1],
+        "segment: expected one of rembg",
+    ),
+    "two instants": (lambda p: folders(p, "a", "b"), "calibration.names", "found a"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_one_line_says_what_is_wrong(place, name):
+    spoil, *parts = BAD[name]
+    options = {"images": place / "images", "cameras": place / "images" / "cameras.json"} | (
+        spoil(place) or {}
+    )
+    with pytest.raises(InputError) as caught:
+        Capture.read(**options)
+    line = " ".join(str(caught.value).split())
+    for part in parts:
+        assert part in line
+    assert re.search(r": .*expected .*; found ", line)
+
+
+def test_the_right_capture_is_read(place):
+    """What the rows spoil is right before."""
+    assert len(Capture.read(place / "images", place / "images" / "cameras.json").photographs) == 4

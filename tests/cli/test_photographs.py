@@ -1,0 +1,98 @@
+"""``ghgs predict images=...`` and ``ghgs doctor`` from files to files, and the example."""
+
+import json
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.figures import PARTS, Figure
+from tests.helpers.models import config, make_model
+from tests.helpers.verbs import ghgs
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "model.ckpt"
+    trained = {**config("model=hull"), "data": {"size": 56}}
+    write_checkpoint(path, make_model("model=hull").state_dict(), trained)
+    return path
+
+
+@pytest.fixture
+def here(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def inside_the_figure(path: Path, scale: float = 1.0) -> float:
+    """The share of a splat's Gaussians that lie near the figure, in its world."""
+    vertices = PlyData.read(str(path))["vertex"]
+    points = np.stack([vertices[axis] for axis in "xyz"], -1) / scale
+    boxes = [(np.abs(points - center) <= np.array(radii) + 0.25).all(-1) for center, radii in PARTS]
+    return float(np.any(boxes, 0).mean())
+
+
+def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsys):
+    """In the user's world and unit, with what was done in the report."""
+    cameras = Figure(scale=1000.0).write(here / "images")
+    common = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu")
+    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", *common) == 0
+    out = capsys.readouterr().out
+    assert "calibration.unit=0.001" in out
+    assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95
+    report = json.loads((here / "splat" / "report.json").read_text())
+    assert report["views"] == ["cam0", "cam1", "cam2", "cam3"]
+    assert report["subject_size"] == pytest.approx(1730, rel=0.06)
+    assert set(report["seconds"]) == {"read", "crop", "predict"}
+
+
+def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
+    cameras = Figure().write(here / "images" / "000")
+    shutil.copytree(here / "images" / "000", here / "images" / "001")
+    common = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu")
+    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splats", *common) == 0
+    assert "2 instants" in capsys.readouterr().out
+    one, two = ((here / "splats" / name / "gaussians.ply").read_bytes() for name in ("000", "001"))
+    assert one == two
+
+
+def test_wrong_cameras_are_refused_and_the_doctor_mends_them(here, checkpoint, capsys):
+    """The doctor's picture and a calibration that fits without the option."""
+    figure = Figure()
+    inverse = {
+        name: {**c, "extrinsics": np.linalg.inv(c["extrinsics"]).tolist()}
+        for name, c in figure.cameras.items()
+    }
+    cameras = figure.write(here / "images", cameras=inverse)
+    common = ("images=images", f"cameras={cameras}")
+    assert ghgs("predict", *common, f"checkpoint={checkpoint}", "out=splat") == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "calibration.extrinsics=camera_to_world" in error
+    assert ghgs("doctor", "task=cameras", *common, "hydra.run.dir=found") == 1
+    assert (here / "found" / "cameras.png").exists()
+    again = ("images=images", "cameras=found/cameras.json", "hydra.run.dir=again")
+    assert ghgs("doctor", "task=cameras", *again) == 0
+    assert "cameras and masks agree" in capsys.readouterr().out
+
+
+def test_photographs_without_cameras_are_refused(here, checkpoint, capsys):
+    assert ghgs("predict", "images=images", f"checkpoint={checkpoint}") == 1
+    assert "cameras: expected cameras=<calibration>; found None" in capsys.readouterr().err
+
+
+def test_the_example_runs(here, checkpoint, monkeypatch, capsys):
+    cameras = Figure().write(here / "images")
+    arguments = [here / "images", cameras, checkpoint, here / "splat.ply"]
+    monkeypatch.setattr(sys, "argv", ["photographs_to_splat.py", *map(str, arguments)])
+    runpy.run_path(str(EXAMPLES / "photographs_to_splat.py"), run_name="__main__")
+    assert "splat.ply: " in capsys.readouterr().out
+    assert inside_the_figure(here / "splat.ply") > 0.95

@@ -1,0 +1,91 @@
+"""A figure of ellipsoids before cameras, as photographs, masks and a calibration on disk."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ghgs_lit.types import Cameras
+from tests.helpers.cameras import camera_ring
+from tests.helpers.scenes import ellipsoid
+
+# Center and radii in metres: trunk, head, a raised and a hanging arm, two legs of different stance.
+PARTS = (
+    ((0.0, 1.05, 0.0), (0.2, 0.36, 0.14)),
+    ((0.03, 1.58, 0.02), (0.1, 0.14, 0.11)),
+    ((0.42, 1.36, 0.05), (0.27, 0.06, 0.06)),
+    ((-0.27, 1.05, 0.1), (0.06, 0.3, 0.07)),
+    ((0.12, 0.4, 0.1), (0.08, 0.4, 0.09)),
+    ((-0.13, 0.42, -0.12), (0.08, 0.42, 0.09)),
+)
+
+
+class Figure:
+    """Photographs [v][h, w, 3] uint8, masks [v][h, w] bool and calibration of cameras around the figure."""
+
+    def __init__(
+        self, views=4, height=128, width=96, seed=0, jitter=0.0, focal=1.1, scale=1.0, origin=(0, 0, 0)
+    ):
+        rng = np.random.default_rng(seed)
+        ring = camera_ring(
+            views,
+            height,
+            width,
+            1,
+            (focal * height,) * 2,
+            center=(0, 0.9, 0),
+            raised=0.4,
+            radius=2.4,
+            start=15.0,
+        )
+        extrinsics = ring.extrinsics.double().numpy()[0]
+        for pose in extrinsics:
+            pose[:3] = _turned(rng.normal(0, jitter, 3)) @ pose[:3]
+        cameras = Cameras(ring.intrinsics.double(), torch.from_numpy(extrinsics)[None], height, width)
+        found = [ellipsoid(cameras, torch.tensor(c).double(), torch.tensor(r).double()) for c, r in PARTS]
+        self.masks = np.stack([mask[0].numpy() for mask, _ in found]).any(0)
+        background = rng.integers(90, 110, (views, height, width, 3))
+        self.images = background.astype(np.uint8)
+        for n, (mask, _) in enumerate(found):
+            self.images[mask[0].numpy()] = [40 * n, 255 - 40 * n, 60 if n % 2 else 200]
+        self.backgrounds = background.astype(np.uint8)
+        self.names = [f"cam{v}" for v in range(views)]
+        self.cameras = {}
+        for name, intrinsics, pose in zip(
+            self.names, ring.intrinsics[0].double().numpy(), extrinsics, strict=True
+        ):
+            world = pose.copy()
+            world[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ np.array(origin)
+            self.cameras[name] = {
+                "intrinsics": intrinsics.tolist(),
+                "extrinsics": world.tolist(),
+                "width": width,
+                "height": height,
+            }
+
+    def write(self, folder: Path, masks: bool = True, cameras: Mapping[str, Any] | None = None) -> Path:
+        """Write ``cam0.png``, ``cam0_mask.png`` and so on, and ``cameras.json``, whose path is returned."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, image, mask in zip(self.names, self.images, self.masks, strict=False):
+            Image.fromarray(image).save(folder / f"{name}.png")
+            if masks:
+                Image.fromarray(mask).save(folder / f"{name}_mask.png")
+        path = folder / "cameras.json"
+        path.write_text(json.dumps({"cameras": self.cameras if cameras is None else cameras}))
+        return path
+
+
+def _turned(angles: np.ndarray) -> np.ndarray:
+    """A rotation about x by the first angle, y by the second, z by the third, radians."""
+    rotation = np.eye(3)
+    for axis, angle in enumerate(angles):
+        step, (i, j) = np.eye(3), [k for k in range(3) if k != axis]
+        step[i, i] = step[j, j] = math.cos(angle)
+        step[i, j], step[j, i] = -math.sin(angle), math.sin(angle)
+        rotation = step @ rotation
+    return rotation
