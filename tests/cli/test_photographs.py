@@ -51,7 +51,7 @@ def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsy
     report = json.loads((here / "splat" / "report.json").read_text())
     assert report["views"] == ["cam0", "cam1", "cam2", "cam3"]
     assert report["subject_size"] == pytest.approx(1730, rel=0.06)
-    assert set(report["seconds"]) == {"read", "crop", "predict"}
+    assert {"read", "crop", "predict"} <= set(report["seconds"])
 
 
 def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
