@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
 from ghgs_lit.encoder import FeatureCache, VGGTEncoder
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.crop import crops_to_subject, pad_to_patches
 from ghgs_lit.geometry.groups import Group, join_groups, select_elements
 from ghgs_lit.geometry.unprojection import Unprojection
@@ -21,7 +21,8 @@ from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
+from ghgs_lit.skipping import AutoSkip, auto_skip, seeing
+from ghgs_lit.types import Batch, Decision, DepthBounds, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, require_fit
 from ghgs_lit.weights.reading import cast
 
@@ -51,6 +52,7 @@ class GHGS(nn.Module):
         pad: ``multiple`` gives photographs of any size a black border up to the next multiple of the patch
             size; ``none`` refuses them.
         check_inputs: refuse values that are not finite or out of range (:func:`check_batch`).
+        auto: chooses what the stages see of each subject (``skip=auto``); None: ``crop`` and the encoder do.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class GHGS(nn.Module):
         crop: bool = False,
         pad: str = "none",
         check_inputs: bool = True,
+        auto: AutoSkip | None = None,
     ):
         super().__init__()
         choice("model.pad", pad, ("none", "multiple"))
@@ -79,7 +82,7 @@ class GHGS(nn.Module):
         self.unprojection = unprojection
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
-        self.crop, self.pad, self.check_inputs = crop, pad, check_inputs
+        self.crop, self.pad, self.check_inputs, self.auto = crop, pad, check_inputs, auto
         #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | None = None
         self.precision = "inherit"
@@ -111,9 +114,12 @@ class GHGS(nn.Module):
         padding = pad_to_patches(batch.masks, self.encoder.patch_size) if self.pad == "multiple" else None
         if padding is not None:
             batch, bounds = padding.cut_batch(batch), padding.cut_bounds(bounds)
+        decisions = () if self.auto is None else self.auto.decide(self, batch.masks)
         with precision_of(self.precision, batch.images.device):
-            prediction = self._cropped_stages(batch, bounds) if self.crop else self._stages(batch, bounds)[0]
-        return prediction if padding is None else padding.paste_prediction(prediction)
+            groups = self._chosen(batch, bounds, decisions) if decisions else self._groups(batch, bounds)
+            prediction = join_groups(groups)
+        prediction = prediction if padding is None else padding.paste_prediction(prediction)
+        return dataclasses.replace(prediction, decisions=decisions)
 
     def _stages(self, batch: Batch, bounds: DepthBounds | None) -> tuple[Prediction, Tokens]:
         tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache)
@@ -124,14 +130,31 @@ class GHGS(nn.Module):
         gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
         return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps), tokens
 
-    def _cropped_stages(self, batch: Batch, bounds: DepthBounds | None) -> Prediction:
-        """The stages on crops around the subject; elements whose crops have one size run together."""
+    def _groups(self, batch: Batch, bounds: DepthBounds | None) -> list[Group]:
+        """The stages on whole photographs, or on crops: elements whose crops have one size run together."""
+        if not self.crop:
+            prediction, tokens = self._stages(batch, bounds)
+            everyone = torch.arange(len(batch.masks), device=batch.masks.device)
+            return [Group(everyone, prediction, tokens.image)]
         groups = []
         for elements, crop in crops_to_subject(batch.masks, self.encoder.patch_size):
             part, own = select_elements(batch, bounds, elements)
             prediction, tokens = self._stages(crop.cut_batch(part), crop.cut_bounds(own))
             groups.append(Group(elements, crop.paste_prediction(prediction), tokens.image))
-        return groups[0].prediction if len(groups) == 1 else join_groups(groups)
+        return groups
+
+    def _chosen(self, batch: Batch, bounds: DepthBounds | None, decisions: Sequence[Decision]) -> list[Group]:
+        """The stages with the preset of each element; elements of one preset run together."""
+        groups = []
+        for name, preset in self.auto.presets.items():
+            chosen = [b for b, decision in enumerate(decisions) if decision.preset == name]
+            if not chosen:
+                continue
+            elements = torch.tensor(chosen, device=batch.masks.device)
+            with seeing(self, preset.view):
+                for group in self._groups(*select_elements(batch, bounds, elements)):
+                    groups.append(dataclasses.replace(group, elements=elements[group.elements]))
+        return groups
 
     def _in_heads_precision(self, tokens: Tokens) -> Tokens:
         """Tokens of an encoder whose weights are in half precision, for heads whose weights are not."""
@@ -146,8 +169,8 @@ class GHGS(nn.Module):
         """The model that a configuration describes.
 
         Args:
-            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.crop``, ``model.pad`` and
-                ``model.check_inputs``; other keys are ignored.
+            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.crop``, ``skip.choices``,
+                ``model.pad`` and ``model.check_inputs``; other keys are ignored.
             empty: stages that are built without storage (on the meta device), for weights to be assigned to.
 
         Raises:
@@ -155,7 +178,7 @@ class GHGS(nn.Module):
         """
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
-        options = config.get("model") or {}
+        options, skip = config.get("model") or {}, config.get("skip") or {}
 
         def stage(name: str, **extra: Any) -> Any:
             with torch.device("meta") if name in empty else nullcontext():
@@ -167,9 +190,10 @@ class GHGS(nn.Module):
             encoder,
             unprojection=stage("unprojection"),
             **{name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS},
-            crop=bool((config.get("skip") or {}).get("crop", False)),
+            crop=bool(skip.get("crop", False)),
             pad=options.get("pad", "none"),
             check_inputs=options.get("check_inputs", True),
+            auto=auto_skip(skip),
         )
 
     @classmethod
@@ -198,12 +222,7 @@ class GHGS(nn.Module):
         """Take the weights of a checkpoint; arguments and errors as in :meth:`from_checkpoint`."""
         checkpoint = read_checkpoint(path)
         require_fit(self, model_state(checkpoint), path)
-        if self.crop and "release" in (checkpoint.get("imported") or {}):
-            warnings.warn(
-                f"{path}: expected skip=none or skip=exact; found crops, whose error is not known for the"
-                " authors' weights (scales moved by 17 % in a trial)",
-                stacklevel=2,
-            )
+        self.check_preset(checkpoint, path)
 
         def precision(name: str, stored: torch.dtype) -> torch.dtype:
             if name.startswith("encoder."):
@@ -213,6 +232,25 @@ class GHGS(nn.Module):
         state = cast(lambda: model_state(read_checkpoint(path)), precision)
         require_finite(state, path)
         self.load_state_dict(state, assign=True)
+
+    def check_preset(self, checkpoint: Mapping[str, Any], path: str | Path) -> None:
+        """Compare what the stages see with what the weights of a checkpoint have seen.
+
+        ``skip=auto`` leaves out presets that the training did not show; crops with the authors' weights give
+        a warning.
+
+        Raises:
+            InputError: ``skip=auto`` with the authors' weights.
+        """
+        if "release" in (checkpoint.get("imported") or {}):
+            expected = "skip=none or skip=exact"
+            unknown = "whose error is not known for the authors' weights (scales moved by 17 % in a trial)"
+            if self.auto is not None:
+                raise InputError(f"{path}: expected {expected}; found auto, which takes crops, {unknown}")
+            if self.crop:
+                warnings.warn(f"{path}: expected {expected}; found crops, {unknown}", stacklevel=3)
+        elif self.auto is not None:
+            self.auto = self.auto.trained_by(checkpoint["config"])
 
 
 #: A field, what was expected of it, and which elements [B] or views [B, V] are not so.

@@ -267,14 +267,27 @@ class Gaussians(_TensorStruct):
 
 
 @dataclass(frozen=True)
+class Decision:
+    """The preset that ``skip=auto`` gave a subject; FLOPs of the encoder's blocks, those of the most accurate
+    preset being 1."""
+
+    preset: str
+    products: float
+
+
+@dataclass(frozen=True)
 class Prediction(_TensorStruct):
-    """The result of ``model(batch)``; ``depth`` in metres, meaningful where ``depth_valid``."""
+    """The result of ``model(batch)``; ``depth`` in metres, meaningful where ``depth_valid``.
+
+    ``decisions`` has one of each element with ``skip=auto``, none otherwise.
+    """
 
     gaussians: Gaussians
     depth: Float[Tensor, "B V H W"]
     depth_valid: Bool[Tensor, "B V H W"]
     points: Points
     depth_maps: DepthMaps
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass(frozen=True)

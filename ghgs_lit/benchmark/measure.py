@@ -211,6 +211,8 @@ def _metrics(
     device: torch.device,
 ) -> list[Row]:
     """The error against the truth, by the measurement of ``ghgs evaluate``; its time does not count."""
-    estimate = Estimate(rendering.image, prediction.depth, prediction.depth_valid)
+    estimate = Estimate(
+        rendering.image, prediction.depth, prediction.depth_valid, decisions=prediction.decisions
+    )
     rows = measure(lambda _: estimate, case.label, [batch], metrics, device)
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]

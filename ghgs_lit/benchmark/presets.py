@@ -208,4 +208,6 @@ def _model(source: Source, config: dict[str, Any], state: dict[str, Tensor], see
         return model
     require_fit(model, state, "knobs")
     model.load_state_dict(state, assign=True)
+    if source.checkpoint is not None:
+        model.check_preset(read_checkpoint(source.checkpoint), source.checkpoint)
     return model

@@ -64,6 +64,7 @@ class Normalization:
             gaussians=self.gaussians(prediction.gaussians),
             depth=prediction.depth / self.scale,
             depth_valid=prediction.depth_valid,
+            decisions=prediction.decisions,
             points=points,
             depth_maps=maps,
         )

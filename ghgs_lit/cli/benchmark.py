@@ -24,6 +24,7 @@ from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.training.loggers import hyperparameters
@@ -122,6 +123,11 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
         "random_weights": config["checkpoint"] is None,
         "rows": rows,
         "broken": report.broken_budgets(rows),
+        "decisions": [
+            f"{record.case.label}: {record.case.model.auto.report(decisions_of(record.metrics))}"
+            for record in records
+            if record.case.model.auto is not None
+        ],
         "subjects": [row for record in records for row in record.metrics],
     }
 
@@ -160,6 +166,7 @@ def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> 
         fits = content["fits"]
         tables, drawing = scaling.tables_of(rows, fits), draw_scaling(rows, fits, *words)
     report.print_tables(tables)
+    print(*content.get("decisions", []), sep="\n", flush=True)
     png = drawing.png()
     save_png(png, directory / "benchmark.png")
     notes = report.notes_of(content)

@@ -22,9 +22,10 @@ from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.check import check_evaluation
-from ghgs_lit.evaluation.measure import Method, ModelMethod
+from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.runs.results import METHOD, read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
@@ -82,4 +83,7 @@ def run(cfg: DictConfig) -> None:
     path = measure_and_write(methods, data, config, directory, device, **facts)
     if cache is not None:
         print(cache.report(), flush=True)
+    if "model" in methods and (auto := methods["model"].model.auto) is not None:
+        rows = (row for row in read_results(path)["rows"] if row["method"] == METHOD)
+        print(auto.report(decisions_of(rows)), flush=True)
     announce(path)

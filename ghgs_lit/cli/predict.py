@@ -29,7 +29,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.export import output_options, write_prediction
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
@@ -80,6 +80,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize()
     facts = {"checkpoint": config["checkpoint"], "seconds": {"predict": time.perf_counter() - begin}}
+    facts |= chosen_preset(model, prediction)
     write(directory, batch, prediction, renderer, options, facts)
 
 
@@ -114,6 +115,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
                 "seconds": seconds,
                 "subject_size": scene.size,
                 "scaled_inside_by": scene.scale,
+                **chosen_preset(model, result.prediction),
             }
             start = time.perf_counter()
             place = directory / name if len(folder.instants) > 1 else directory
@@ -134,6 +136,15 @@ def load(config: dict[str, Any]) -> tuple[GHGS, Renderer, torch.device]:
     model.load(config["checkpoint"])
     model.precision = config["precision"]
     return model.to(device).eval(), renderer, device
+
+
+def chosen_preset(model: GHGS, prediction: Prediction) -> dict[str, str]:
+    """For the report: which preset ``skip=auto`` chose and why, which is printed too; nothing without it."""
+    if model.auto is None:
+        return {}
+    line = model.auto.report(prediction.decisions)
+    print(line, flush=True)
+    return {"skip": line}
 
 
 def write(directory: Path, *prediction: Any) -> None:

@@ -15,7 +15,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
-from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
+from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Rendering
 from ghgs_lit.visualization.pictures import save_png, sheet
 
 Renderer = Callable[[Gaussians, Cameras], Rendering]
@@ -30,12 +30,14 @@ class Estimate:
         depth: depths of the inputs [B, V, H, W], metres.
         depth_valid: where they are defined [B, V, H, W].
         gaussians: number of Gaussians of each element [B].
+        decisions: what ``skip=auto`` chose for each element [B].
     """
 
     image: Tensor
     depth: Tensor | None = None
     depth_valid: Tensor | None = None
     gaussians: tuple[int, ...] | None = None
+    decisions: tuple[Decision, ...] = ()
 
 
 Method = Callable[[Batch], Estimate]
@@ -52,7 +54,11 @@ class ModelMethod:
         prediction = self.model(batch)
         rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
         return Estimate(
-            rendering.image, prediction.depth, prediction.depth_valid, prediction.gaussians.splits
+            rendering.image,
+            prediction.depth,
+            prediction.depth_valid,
+            prediction.gaussians.splits,
+            prediction.decisions,
         )
 
 
@@ -75,11 +81,20 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
         shared = {"depth_error_mm": _depth_error(batch, estimate, element)}
         if estimate.gaussians is not None:
             shared["gaussians"] = estimate.gaussians[element]
+        if estimate.decisions:
+            about["skip"] = estimate.decisions[element].preset
+            shared["encoder_products"] = estimate.decisions[element].products
         names = targets.names[element] if targets.names else [str(k) for k in range(t)]
         for k in range(t):
             about |= {"targets": targets.protocols[k], "target": names[k]}
             rows.append({**about, **{name: value[element][k] for name, value in values.items()}, **shared})
     return rows
+
+
+def decisions_of(rows: Iterable[Row]) -> list[Decision]:
+    """What ``skip=auto`` chose for each subject and number of views of the rows; nothing without it."""
+    chosen = {(row["method"], row["subject"], row["views"]): row for row in rows if "skip" in row}
+    return [Decision(row["skip"], row["encoder_products"]) for row in chosen.values()]
 
 
 def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:

@@ -45,6 +45,8 @@ def select_elements(
 
 def join_groups(groups: Sequence[Group]) -> Prediction:
     """The prediction for the whole batch, in the order of its elements; maps of all groups have one size."""
+    if len(groups) == 1:
+        return groups[0].prediction
     order = torch.cat([group.elements for group in groups]).argsort()
     predictions = [group.prediction for group in groups]
 

@@ -25,8 +25,10 @@ def check_config(config: Mapping[str, Any]) -> None:
     """Refuse a run that cannot give what it is started for.
 
     Raises:
-        InputError: a frozen encoder without weights, or a feature cache that cannot pay.
+        InputError: ``skip=auto``, a frozen encoder without weights, or a feature cache that cannot pay.
     """
+    one_preset = not lookup(config, "skip.choices")
+    require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     _require_weights(config)
     _require_useful_cache(config)
 

@@ -18,7 +18,7 @@ FORMAT_VERSION = 3
 """The version that is written; earlier ones are read too."""
 METHOD = "model"
 """The method of the rows of a trained model; others are baselines."""
-KEYS = ("method", "subject", "views", "targets", "target", "inputs")
+KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
 """What a row describes; all other entries of a row are metrics."""
 
 #: Types of JSON, in words for messages.
@@ -92,7 +92,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
         "seed": provenance.get("seed"),
         "config_hash": provenance.get("config_hash"),
     }
-    columns = [*KEYS, *metric_names(rows), *origin]
+    columns = [*(key for key in KEYS if any(key in row for row in rows)), *metric_names(rows), *origin]
     table = io.StringIO()
     writer = csv.DictWriter(table, columns, restval="", lineterminator="\n")
     writer.writeheader()

@@ -1,13 +1,14 @@
 """Random budgets of tokens: weights that have seen every budget serve every preset of ``conf/skip``."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.model import GHGS
+from ghgs_lit.skipping import seeing, view_of
 
 KEY = "token_budgets"
 #: Budgets with a name; all others are a margin.
@@ -44,17 +45,6 @@ class TokenBudgets:
         return self.choices[int(generator.integers(len(self.choices)))]
 
 
-@contextmanager
-def token_budget(model: GHGS, budget: str | int | None) -> Iterator[None]:
+def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
     """``model`` with one of the choices of :class:`TokenBudgets` while the context lasts; None: as it is."""
-    if budget is None:
-        yield
-        return
-    encoder = model.encoder
-    before = (model.crop, encoder.tokens, encoder.margin)
-    model.crop = budget == "window"
-    encoder.tokens, encoder.margin = ("all", 0) if budget in NAMED else ("subject", budget)
-    try:
-        yield
-    finally:
-        model.crop, encoder.tokens, encoder.margin = before
+    return nullcontext() if budget is None else seeing(model, view_of(budget))

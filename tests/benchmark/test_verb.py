@@ -39,7 +39,7 @@ def totals(content):
 def measured(data, tmp_path_factory):
     directory = tmp_path_factory.mktemp("benchmark") / "run"
     code = ghgs(
-        "benchmark", *data, *TINY, *QUICK, "presets=[exact,balanced]", "subjects=2",
+        "benchmark", *data, *TINY, *QUICK, "presets=[exact,balanced,auto]", "subjects=2",
         f"hydra.run.dir={directory}",
     )  # fmt: skip
     assert code == 0
@@ -57,7 +57,7 @@ def test_the_json_has_one_row_for_each_preset_and_stage(measured):
         "gaussian_head", "render", "other", "total",
     ]  # fmt: skip
     whole = totals(content)
-    assert list(whole) == ["none", "exact", "balanced"]
+    assert list(whole) == ["none", "exact", "balanced", "auto"]
     assert whole["none"]["max_rel_diff"] == whole["none"]["psnr_loss_db"] == 0
     assert whole["exact"]["budget_db"] is not None
     assert whole["balanced"]["tokens"] < whole["exact"]["tokens"] == 27
@@ -65,8 +65,20 @@ def test_the_json_has_one_row_for_each_preset_and_stage(measured):
     assert whole["balanced"]["flops"] < whole["exact"]["flops"] < whole["none"]["flops"]
     assert content["random_weights"]
     assert content["broken"] == []
-    assert len(content["subjects"]) == 3 * 2
+    assert len(content["subjects"]) == 4 * 2
     assert content["provenance"]["verb"] == "benchmark"
+
+
+def test_what_auto_chose_and_why_is_said(measured):
+    """Its row is that of the presets that ran, so a reader must learn which these were."""
+    content = json.loads((measured / "benchmark.json").read_text())
+    chosen = {row["subject"]: row["skip"] for row in content["subjects"] if row["method"] == "auto"}
+    whole, [line] = totals(content), content["decisions"]
+    assert set(chosen.values()) == {"balanced"}
+    assert line.startswith("auto: skip=auto: balanced for 2 of 2")
+    assert line in (measured / "benchmark.md").read_text()
+    for name in ("tokens", "psnr", "flops"):
+        assert whole["auto"][name] == whole["balanced"][name]
 
 
 def test_exact_is_exact(measured):
@@ -79,7 +91,7 @@ def test_exact_is_exact(measured):
 def test_the_stages_add_up_to_the_total(measured):
     """With one round the seconds of the stages without a dot are those of the whole pass."""
     rows = json.loads((measured / "benchmark.json").read_text())["rows"]
-    for preset in ("none", "exact", "balanced"):
+    for preset in ("none", "exact", "balanced", "auto"):
         own = {row["stage"]: row["seconds"] for row in rows if row["preset"] == preset}
         total = own.pop("total")
         assert sum(v for stage, v in own.items() if "." not in stage) == pytest.approx(total)
@@ -88,13 +100,13 @@ def test_the_stages_add_up_to_the_total(measured):
 def test_all_files_of_a_benchmark_are_written(measured):
     """The page needs no other file and has a hint for each preset; TensorBoard has a run for each."""
     with open(measured / "benchmark.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 3 * 10
+        assert len(list(csv.DictReader(file))) == 4 * 10
     text = (measured / "benchmark.md").read_text()
     assert "| balanced |" in text
     assert "Machine: " in text
     page = (measured / "benchmark.html").read_text()
     assert not re.search(r'(src|href)="http', page)
-    for preset in ("none", "exact", "balanced"):
+    for preset in ("none", "exact", "balanced", "auto"):
         assert re.search(rf"<title>{preset}: [\d.]+ s", page)
         assert list((measured / "tensorboard" / preset).glob("events*"))
     assert list((measured / "tensorboard" / "figure").glob("events*"))

@@ -65,6 +65,12 @@ def test_a_feature_cache_that_cannot_pay_is_refused():
         check_config(config("feature_cache.directory=features"))
 
 
+def test_training_needs_a_preset():
+    """What ``skip=auto`` chooses depends on what the training has shown."""
+    with pytest.raises(InputError, match=r"skip: expected the preset to train with.*token_budgets.*auto"):
+        check_config(config("skip=auto"))
+
+
 @pytest.mark.parametrize("file", ["checkpoints/best.ckpt", "csv/metrics.csv", "metrics.json"])
 def test_a_directory_with_a_run_is_not_used_again(verb, tmp_path, file):
     """The same ``hydra.run.dir`` a second time deleted the logs and replaced the checkpoint."""

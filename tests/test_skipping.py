@@ -1,0 +1,112 @@
+"""``skip=auto``: the cheapest preset within a budget, for each subject by its masks alone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ghgs_lit.benchmark.flops import FlopsProbe
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from ghgs_lit.skipping import encoder_products
+from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.models import close, config, make_model
+from tests.helpers.scenes import hard_subjects, make_batch, stack
+
+
+def people():
+    """Subjects for which different presets are the cheapest: in front of much and of little background."""
+    masks = torch.zeros(3, 3, 84, 84, dtype=torch.bool)
+    masks[0] = True  # exact: there is no background
+    masks[1, :, 20:78, 20:78] = True  # balanced: a margin of patches is more than a crop's
+    masks[2, :, 15:25, 15:25] = masks[2, :, 60:68, 60:68] = True  # fast: two people, far from each other
+    return [replace(make_batch(1, 3, 84, 84), masks=mask[None]) for mask in masks]
+
+
+@pytest.mark.parametrize("skip", ["exact", "balanced", "fast"])
+def test_the_cost_is_what_the_blocks_compute(skip):
+    """A preset must not be chosen for products that it does not save; against PyTorch's own counter."""
+    model, batch = make_model(f"skip={skip}").eval(), stack(list(hard_subjects().values()))
+    aggregator = model.encoder.aggregator
+    with torch.no_grad(), FlopsProbe() as probe:
+        for name, module in (("all", aggregator), ("patches", aggregator.patch_embed)):
+            module.register_forward_pre_hook(lambda *_, n=name: probe.begin(n))
+            module.register_forward_hook(lambda *_, n=name: probe.end(n))
+        model(batch)
+    counted = probe.flops["all"] - probe.flops["patches"]
+    expected = len(aggregator.global_blocks) * encoder_products(model, batch.masks).sum().item()
+    assert counted == pytest.approx(expected, rel=1e-9)
+
+
+def test_each_subject_gets_the_cheapest_preset_and_it_is_what_runs():
+    """The choice is a subject's own, and the prediction that of the preset itself."""
+    batches, model = people(), make_model("skip=auto", "skip.budget_db=0.2").eval()
+    with torch.no_grad():
+        together = model(stack(batches))
+        names = [decision.preset for decision in together.decisions]
+        assert names == ["exact", "balanced", "fast"]
+        for b, (name, batch) in enumerate(zip(names, batches, strict=True)):
+            close(together.gaussians[b], make_model(f"skip={name}").eval()(batch).gaussians)
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        (["skip.budget_db=0.1"], ("exact", "balanced", "balanced")),
+        (["skip.budget_db=0.01"], ("exact",) * 3),
+        # Equal cost goes to the more exact preset: here fast keeps a crop's patches of the second subject.
+        (["skip.budget_db=0.2", "skip.margin=0"], ("exact", "balanced", "fast")),
+    ],
+)
+def test_budget_and_margin_count(said, expected):
+    """A preset beyond the budget must not run, and the line says why not."""
+    model, masks = make_model("skip=auto", *said), stack(people()).masks
+    decisions = model.auto.decide(model, masks)
+    assert tuple(decision.preset for decision in decisions) == expected
+    line = model.auto.report(decisions)
+    assert "\n" not in line
+    assert ("not fast: may lose 0.2 dB" in line) == ("skip.budget_db=0.2" not in said)
+    own = make_model(f"skip={expected[2]}", *said[1:])
+    share = encoder_products(own, masks[2:]) / encoder_products(model, masks[2:])
+    assert decisions[2].products == pytest.approx(share.item())
+
+
+@pytest.mark.parametrize(
+    ("trained", "left"),
+    [
+        ("skip=exact", ["exact"]),
+        ("skip=balanced", ["exact", "balanced"]),
+        (["all", "window", 0, 1], ["exact", "balanced", "fast"]),
+        (["all", 2], ["exact"]),
+        ("skip=fast", ["exact", "fast"]),
+    ],
+)
+def test_presets_that_the_training_did_not_show_are_left_out(tmp_path, trained, left):
+    """What a preset loses is known only for weights that have seen what it sees."""
+    settings = config(trained) if isinstance(trained, str) else {**config(), "token_budgets": trained}
+    path = tmp_path / "a.ckpt"
+    write_checkpoint(path, make_model().state_dict(), settings)
+    model = GHGS.from_config(config("skip=auto", "skip.budget_db=0.2"))
+    model.load(path)
+    assert list(model.auto.presets) == left
+    decisions = model.auto.decide(model, people()[2].masks)
+    assert {decision.preset for decision in decisions} == {left[-1]}
+    assert model.auto.report(decisions).count("not shown in training") == 3 - len(left)
+
+
+def test_where_it_cannot_decide_it_says_so(tmp_path):
+    """A choice that nothing is known about, or a key that would be ignored, must not pass."""
+    path = tmp_path / "release.ckpt"
+    write_checkpoint(path, make_model().state_dict(), config(), imported={"release": "x"})
+    with pytest.raises(InputError, match=r"release\.ckpt: expected skip=none or skip=exact; found auto"):
+        make_model("skip=auto").load(path)
+    for said, message in (
+        ("skip.budget_db=0", r"skip\.budget_db: expected 0\.001 or more with skip=auto; found 0"),
+        ("skip.budget_db=null", r"skip\.budget_db: expected 0\.001 or more"),
+        ("skip.crop=true", r"skip\.crop: expected False with skip=auto"),
+        ("skip.tokens=subject", r"skip\.tokens: expected all with skip=auto"),
+        ("skip.choices.fast.margin=3", r"skip\.choices\.fast\.margin: expected 1, as skip\.margin"),
+        ("skip.pixels=all", r"skip\.choices\.exact\.pixels: expected all"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_model("skip=auto", said)
