@@ -1,0 +1,92 @@
+"""Each photograph of a capture held out and predicted from the others.
+
+    python benchmarks/held_out.py photographs cameras.json model.ckpt [model.ckpt ...] --out held_out
+
+Prints PSNR of each held-out photograph, whole and in the subject's box, for the checkpoints, the nearest input
+photograph and the visual hull (splats where the rays of the inputs meet it), and writes a sheet of pictures.
+The crops and the frame of the world are those of all photographs.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ghgs_lit import GHGS, Capture
+from ghgs_lit.bounds import VisualHull
+from ghgs_lit.capture.predict import trained_size
+from ghgs_lit.cli.inputs import build_renderer, pick_device
+from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config.settings import image_size
+from ghgs_lit.evaluation.baselines import nearest_view, splatted
+from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
+from ghgs_lit.types import Batch, Targets
+from ghgs_lit.visualization.pictures import save_png, to_uint8
+from ghgs_lit.weights.checkpoint import read_checkpoint
+
+
+def held_out(batch: Batch) -> Iterator[Batch]:
+    """A batch for each photograph, which is its target; the others are its inputs."""
+    count = batch.masks.shape[1]
+    for i in range(count):
+        others = [j for j in range(count) if j != i]
+        name = ((batch.views[0][i],),)
+        targets = Targets(
+            batch.images[:, [i]], batch.masks[:, [i]], batch.cameras[:, [i]], name, protocols=("held_out",)
+        )
+        yield dataclasses.replace(
+            batch,
+            images=batch.images[:, others],
+            masks=batch.masks[:, others],
+            cameras=batch.cameras[:, others],
+            views=(tuple(batch.views[0][j] for j in others),),
+            targets=targets,
+        )
+
+
+def hull_depth(batch: Batch, hull: VisualHull) -> Tensor:
+    """Where the rays of the inputs enter the visual hull, metres; 0 outside the subject."""
+    return hull(batch).near * batch.masks
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("images", type=Path)
+    parser.add_argument("cameras", type=Path)
+    parser.add_argument("checkpoints", type=Path, nargs="+")
+    parser.add_argument("--size", type=int, help="side of the crops in pixels; none: the first checkpoint's")
+    parser.add_argument("--out", type=Path, default=Path("held_out"))
+    options = parser.parse_args()
+    config = resolve(compose("evaluate", ["data=synthetic"]))
+    device = pick_device(config["device"])
+    renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
+    size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
+    batch, _ = Capture.read(options.images, options.cameras).batch(image_size("size", size))
+    hull = partial(hull_depth, hull=VisualHull())
+    methods: dict[str, Method] = {
+        "nearest view": nearest_view,
+        "visual hull": partial(splatted, depth_of=hull, renderer=renderer),
+    }
+    for path in options.checkpoints:
+        methods[str(path)] = ModelMethod(GHGS.from_checkpoint(path, device), renderer)
+    rows = []
+    with torch.no_grad():
+        for one in held_out(batch.to(device)):
+            images = [one.targets.images[0, 0]]
+            for name, method in methods.items():
+                rows += measure(method, name, [one], metrics, device)
+                images.append(method(one).image[0, 0])
+            save_png(to_uint8(torch.cat(images, -1)), options.out / f"{one.targets.names[0][0]}.png")
+    print("| held out | " + " | ".join(methods) + " |\n|---" + "|---" * len(methods) + "|")
+    for name in batch.views[0]:
+        own = [row for row in rows if row["target"] == name]
+        print(f"| {name} | " + " | ".join(f"{row['psnr']:.2f} / {row['psnr_box']:.2f}" for row in own) + " |")
+    print(f"PSNR in dB, whole / in the box; pictures (truth, then these columns): {options.out}")
+
+
+if __name__ == "__main__":
+    main()
