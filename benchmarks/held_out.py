@@ -3,7 +3,7 @@
     python benchmarks/held_out.py photographs cameras.json model.ckpt [model.ckpt ...] --out held_out
 
 Prints PSNR of each held-out photograph, whole and in the subject's box, for the checkpoints, the nearest
-input photograph and the visual hull (splats where rays of the inputs meet it), and writes a sheet of pictures.
+input photograph and the visual hull (splats where rays meet it), and writes pictures.
 The crops and the frame of the world are those of all photographs.
 """
 
