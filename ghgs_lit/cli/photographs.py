@@ -3,9 +3,16 @@
 from collections.abc import Mapping
 from typing import Any
 
+import torch
+
+from ghgs_lit.capture.capture import Capture
 from ghgs_lit.capture.doctor import Diagnosis
 from ghgs_lit.capture.folder import CaptureFolder
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.types import Cameras
+
+#: Longer side of the pictures of a video of instants, in pixels.
+_VIDEO_SIDE = 720
 
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration")
 
@@ -32,3 +39,13 @@ def require_consistent(diagnosis: Diagnosis) -> None:
             "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"
             f" check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
         )
+
+
+def fixed_camera(capture: Capture) -> Cameras:
+    """The first camera of a capture with all that its photograph shows, [1, 1]: a video stays at it."""
+    photograph = capture.photographs[0]
+    height, width = photograph.mask.shape
+    matrices = (photograph.intrinsics, photograph.extrinsics)
+    camera = Cameras(*(torch.from_numpy(matrix).float()[None, None] for matrix in matrices), height, width)
+    share = min(_VIDEO_SIDE / max(height, width), 1.0)
+    return camera.resized(round(height * share), round(width * share))

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -20,16 +21,18 @@ from ghgs_lit.cli.inputs import (
     pick_device,
     with_trained_data,
 )
-from ghgs_lit.cli.photographs import capture_folder, require_consistent
+from ghgs_lit.cli.photographs import capture_folder, fixed_camera, require_consistent
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.export import output_options, write_prediction
+from ghgs_lit.export.video import write_mp4
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
@@ -85,18 +88,20 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 
 
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
-    """Predict each instant of a folder of photographs; several get a folder each."""
+    """Predict each instant of a folder of photographs; several get a folder each, and one video."""
     folder, options = capture_folder(config), output_options(config)
     if config["check_cameras"]:
         diagnosis = diagnose(folder)
         require_consistent(diagnosis)
         print("\n".join(diagnosis.lines), flush=True)
     size = image_size("size", config["size"] or trained_size(read_checkpoint(config["checkpoint"])["config"]))
-    model, renderer, _ = load(config)
+    model, renderer, device = load(config)
     multiple = model.side_multiple
     expected = f"sides divisible by the patch size {multiple}"
     require(not any(side % multiple for side in size), "size", expected, size)
     totals: dict[str, float] = {}
+    several = len(folder.instants) > 1
+    pictures: list[np.ndarray] = []
     begin = time.perf_counter()
     # The next photographs are decoded while the model works.
     with ThreadPoolExecutor(1) as pool:
@@ -118,11 +123,16 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
                 **chosen_preset(model, result.prediction),
             }
             start = time.perf_counter()
-            place = directory / name if len(folder.instants) > 1 else directory
+            place = directory / name if several else directory
             write(place, result.batch, result.prediction, renderer, options, facts)
+            if several and "mp4" in options.formats:
+                camera = fixed_camera(capture).to(device) if number == 1 else camera
+                pictures.append(to_uint8(renderer(result.gaussians, camera).image[0, 0]))
             for stage, value in (seconds | {"write": time.perf_counter() - start}).items():
                 totals[stage] = totals.get(stage, 0.0) + value
-    if len(folder.instants) > 1:
+    if pictures:
+        write_mp4(pictures, directory / "instants.mp4", options.fps)
+    if several:
         count, total = len(folder.instants), time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imageio_ffmpeg import read_frames
 from plyfile import PlyData
 
 from ghgs_lit.weights.checkpoint import write_checkpoint
@@ -57,9 +58,13 @@ def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsy
 def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
     cameras = Figure().write(here / "images" / "000")
     shutil.copytree(here / "images" / "000", here / "images" / "001")
-    common = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu")
+    common = (f"checkpoint={checkpoint}", "formats=[ply,mp4]", "turntable.frames=1", "device=cpu")
     assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splats", *common) == 0
     assert "2 instants" in capsys.readouterr().out
+    _, first, second = read_frames(str(here / "splats" / "instants.mp4"))
+    first, second = (np.frombuffer(frame, np.uint8) for frame in (first, second))
+    assert first.max() > 60  # the person is in the picture
+    assert np.abs(first.astype(int) - second).max() < 8
     one, two = ((here / "splats" / name / "gaussians.ply").read_bytes() for name in ("000", "001"))
     assert one == two
 
