@@ -85,7 +85,8 @@ def write_inputs(scene: Scene, directory: Path) -> list[Path]:
         path.stem: {
             "intrinsics": camera.intrinsics.tolist(),
             "extrinsics": camera.extrinsics.tolist(),
-            "size": [camera.height, camera.width],
+            "width": camera.width,
+            "height": camera.height,
         }
         for path, camera in zip(paths, (scene.cameras[i] for i in range(len(paths))), strict=True)
     }

@@ -94,6 +94,11 @@ class _Renderings(torch.utils.data.Dataset):
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
 def test_training_in_four_workers_of_a_data_loader():
     """Rendering with gradients works in worker processes."""
+    # In a process of its own: where a backward pass ran on another device, PyTorch refuses one after a fork.
+    run_python("from tests.rendering.test_processes import train_in_workers; train_in_workers()")
+
+
+def train_in_workers():
     torch.set_num_threads(2)
     wanted = [_Renderings()[index] for index in range(8)]
     loader = torch.utils.data.DataLoader(
