@@ -5,11 +5,11 @@ from torch import Generator, Tensor
 
 from ghgs_lit.bounds import SubjectBox, VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
-from ghgs_lit.data.zju_mocap.undistort import undistorting_grid
 from ghgs_lit.geometry.crop import crops_to_subject, pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
+from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.stress import inputs
 from ghgs_lit.stress.stage import Stage, Values
@@ -210,7 +210,7 @@ def _lens(v: Values) -> Values:
 
 def _lens_slowly(v: Values) -> Values:
     """OpenCV's model written out at the same knots."""
-    knots = torch.linspace(0, 15, 3, dtype=torch.float64)
+    knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
     rows, columns = torch.meshgrid(knots, knots, indexing="ij")
     fx, fy, cx, cy = (value[:, None, None] for value in v["lens"].unbind(-1))
     k1, k2, p1, p2, k3 = (v["distortion"][:, i, None, None] for i in range(5))
@@ -219,7 +219,7 @@ def _lens_slowly(v: Values) -> Values:
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     w = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    grid = (2 * torch.stack((u * fx + cx, w * fy + cy), 1) + 1) / 16 - 1
+    grid = 2 * torch.stack((u * fx + cx, w * fy + cy), 1) / 16 - 1
     dense = torch.nn.functional.interpolate(grid, (16, 16), mode="bilinear", align_corners=True)
     return {"grid": dense.permute(0, 2, 3, 1)}
 
