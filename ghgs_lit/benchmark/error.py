@@ -12,12 +12,18 @@ from ghgs_lit.types import Gaussians, Prediction, Rendering
 ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 
 
-def relative_difference(found: Tensor, expected: Tensor) -> float:
-    """``max|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected``
-    is 0 and ``found`` is not; 0 where there are no values."""
+def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf) -> float:
+    """``|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected``
+    is 0 and ``found`` is not; 0 where there are no values.
+
+    Args:
+        found, expected: of one shape.
+        norm: of the difference: the largest of all values, or 2 for their root mean square.
+    """
     if found.numel() == 0:
         return 0.0
-    difference = (found - expected).abs().max().item()
+    difference = (found - expected).double().abs()
+    difference = (difference.max() if norm == math.inf else difference.square().mean().sqrt()).item()
     if not math.isfinite(difference):
         return math.inf
     largest = expected.abs().max().item()
@@ -53,8 +59,8 @@ def differences(
         masks: of the inputs [B, V, H, W].
 
     Returns:
-        :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` and of the
-        ``depth`` of the subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the
+        :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` (root mean square)
+        and of the ``depth`` of the subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the
         renders; and ``unmatched``, the part of the yardstick's Gaussians that have no partner, or more than
         the preset's own that have none.
     """
@@ -64,7 +70,8 @@ def differences(
     result = {
         name: relative_difference(getattr(ours, name)[a], getattr(theirs, name)[b]) for name in ATTRIBUTES
     }
-    result["render"] = relative_difference(rendering.image, reference.image)
+    # Not the largest: a Gaussian that covers 1/255 of a pixel up to rounding is drawn there or not.
+    result["render"] = relative_difference(rendering.image, reference.image, norm=2)
     valid = prediction.depth_valid & yardstick.depth_valid & masks
     result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid])
     error = squared_error(rendering.image.flatten(0, 1), reference.image.flatten(0, 1)).mean()
