@@ -40,7 +40,7 @@ def test_the_cost_is_what_the_blocks_compute(skip):
 
 def test_each_subject_gets_the_cheapest_preset_and_it_is_what_runs():
     """The choice is a subject's own, and the prediction that of the preset itself."""
-    batches, model = people(), make_model("skip=auto", "skip.budget_db=0.2").eval()
+    batches, model = people(), make_model("skip=auto", "skip.budget_db=0.3").eval()
     with torch.no_grad():
         together = model(stack(batches))
         names = [decision.preset for decision in together.decisions]
@@ -52,10 +52,10 @@ def test_each_subject_gets_the_cheapest_preset_and_it_is_what_runs():
 @pytest.mark.parametrize(
     ("said", "expected"),
     [
-        (["skip.budget_db=0.1"], ("exact", "balanced", "balanced")),
+        (["skip.budget_db=0.1"], ("exact", "exact", "fast")),
         (["skip.budget_db=0.01"], ("exact",) * 3),
         # Equal cost goes to the more exact preset: here fast keeps a crop's patches of the second subject.
-        (["skip.budget_db=0.2", "skip.margin=0"], ("exact", "balanced", "fast")),
+        (["skip.budget_db=0.3", "skip.margin=0"], ("exact", "fast", "fast")),
     ],
 )
 def test_budget_and_margin_count(said, expected):
@@ -65,7 +65,7 @@ def test_budget_and_margin_count(said, expected):
     assert tuple(decision.preset for decision in decisions) == expected
     line = model.auto.report(decisions)
     assert "\n" not in line
-    assert ("not fast: may lose 0.2 dB" in line) == ("skip.budget_db=0.2" not in said)
+    assert ("not balanced: may lose 0.25 dB" in line) == ("skip.budget_db=0.3" not in said)
     own = make_model(f"skip={expected[2]}", *said[1:])
     share = encoder_products(own, masks[2:]) / encoder_products(model, masks[2:])
     assert decisions[2].products == pytest.approx(share.item())
@@ -76,7 +76,7 @@ def test_budget_and_margin_count(said, expected):
     [
         ("skip=exact", ["exact"]),
         ("skip=balanced", ["exact", "balanced"]),
-        (["all", "window", 0, 1], ["exact", "balanced", "fast"]),
+        (["all", "window", 0, 1], ["exact", "fast", "balanced"]),
         (["all", 2], ["exact"]),
         ("skip=fast", ["exact", "fast"]),
     ],
@@ -86,11 +86,11 @@ def test_presets_that_the_training_did_not_show_are_left_out(tmp_path, trained, 
     settings = config(trained) if isinstance(trained, str) else {**config(), "token_budgets": trained}
     path = tmp_path / "a.ckpt"
     write_checkpoint(path, make_model().state_dict(), settings)
-    model = GHGS.from_config(config("skip=auto", "skip.budget_db=0.2"))
+    model = GHGS.from_config(config("skip=auto", "skip.budget_db=0.3"))
     model.load(path)
     assert list(model.auto.presets) == left
     decisions = model.auto.decide(model, people()[2].masks)
-    assert {decision.preset for decision in decisions} == {left[-1]}
+    assert {decision.preset for decision in decisions} == {"fast" if "fast" in left else left[-1]}
     assert model.auto.report(decisions).count("not shown in training") == 3 - len(left)
 
 
