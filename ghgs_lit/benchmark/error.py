@@ -60,9 +60,9 @@ def differences(
 
     Returns:
         :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` (root mean square)
-        and of the ``depth`` of the subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the
-        renders; and ``unmatched``, the part of the yardstick's Gaussians that have no partner, or more than
-        the preset's own that have none.
+        and of the ``depth`` of the subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in
+        dB of the renders; and ``unmatched``, the part of the yardstick's Gaussians that have no partner, or
+        more than the preset's own that have none.
     """
     (prediction, rendering), (yardstick, reference) = found, expected
     ours, theirs = prediction.gaussians, yardstick.gaussians
