@@ -77,4 +77,5 @@ class PeakProbe:
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
+            return_free_memory()  # what an earlier stage freed is not this one's
             reset_peak()
