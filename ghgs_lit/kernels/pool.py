@@ -6,6 +6,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
+from torch import Tensor
 
 # Number of splats or entries that justifies one more thread: about a millisecond of work.
 GRAIN = 8192
@@ -33,6 +34,11 @@ def _workers(count: int) -> ThreadPoolExecutor:
             _pool = ThreadPoolExecutor(count, thread_name_prefix="ghgs")
             _owner = (os.getpid(), count)
         return _pool
+
+
+def is_supported(*tensors: Tensor) -> bool:
+    """Whether kernels in single precision, which see tensors as NumPy arrays, can work on these."""
+    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
 def run(tasks: list, work: int) -> None:

@@ -4,7 +4,6 @@ import json
 import multiprocessing
 import os
 import signal
-import socket
 import sys
 import time
 
@@ -13,13 +12,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 
 from ghgs_lit.cli import train as train_verb
-from ghgs_lit.config import compose, legacy
+from ghgs_lit.config import compose
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs import job, plan
 from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
-from ghgs_lit.runs.run import RunDirectory, State
+from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
@@ -175,96 +174,6 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     assert code == 1
     assert "trainer.devices: expected 1 in a sweep whose jobs share a process; found 2" in err
     assert not executed(sweep.directory)
-
-
-def test_results_that_are_not_whole_are_no_results(tmp_path):
-    """A torn ``metrics.json`` must not mark a run as done."""
-    run = RunDirectory(tmp_path / "run")
-    assert run.state == State.MISSING
-    run.path.mkdir()
-    (run.path / "metrics.json").write_text('{"format_version": 1, "summ')
-    assert run.state == State.MISSING
-    write_finished_run(run.path, {"seed": 1})
-    assert run.state == State.DONE
-    assert run.metric == 20.0
-
-
-def test_results_whose_configuration_was_changed_are_refused(tmp_path):
-    """A changed seed in ``metrics.json`` would move the run to another row of a table."""
-    write_finished_run(tmp_path, {"seed": 1})
-    path = tmp_path / "metrics.json"
-    content = json.loads(path.read_text())
-    content["provenance"]["config"]["seed"] = 2
-    path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"metrics\.json: provenance\.config: expected .* config_hash"):
-        read_results(path)
-
-
-def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):
-    """The half-written file of a killed process is removed by the next one, and is no result."""
-    child = SPAWN.Process(target=os.getpid)
-    child.start()
-    child.join()
-    half = tmp_path / f".metrics.json.{socket.gethostname()}.{child.pid}.tmp"
-    half.write_text("{")
-    assert not RunDirectory(tmp_path).done
-    write_finished_run(tmp_path, {"seed": 1})
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.csv", "metrics.json"]
-
-
-def test_results_of_an_earlier_version_are_read_in_todays_names(tmp_path, monkeypatch):
-    """Tables must put runs from before and after a renaming into the same row."""
-    monkeypatch.setitem(legacy.KEYS, "optim.rate", "optimizer.lr")
-    old = {"seed": 1, "optim": {"rate": 0.1}}
-    source = {"config": old, "checkpoint_config": old, "choices": {"optimizer": "pilot", "data": "scans"}}
-    path = tmp_path / "metrics.json"
-    path.write_text(json.dumps({"format_version": 1, "provenance": source, "summary": [], "rows": []}))
-    found = read_results(path)["provenance"]
-    assert found["config"]["optimizer"] == found["checkpoint_config"]["optimizer"] == {"lr": 0.1}
-    assert found["choices"] == {"optimizer": "from_scratch", "data": "scans"}
-
-
-def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
-    """A torn line of ``sessions.jsonl`` must not hide the sessions around it."""
-    run = RunDirectory(tmp_path)
-    with run.session():
-        pass
-    with open(tmp_path / "sessions.jsonl", "a") as file:
-        file.write('{"started": "2026-')
-    with run.session(resumed="x") as stats:
-        stats["steps"] = 3
-    first, second = run.sessions()
-    assert first["outcome"] == second["outcome"] == "done"
-    assert (second["resumed"], second["steps"]) == ("x", 3)
-
-
-def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
-    """A killed process must not block its run, nor may a forked child that outlives it."""
-    ready = SPAWN.Event()
-    holder = SPAWN.Process(target=hold_run, args=(tmp_path, ready))
-    holder.start()
-    assert ready.wait(30)
-    run = RunDirectory(tmp_path)
-    assert run.state == State.RUNNING
-    assert str(holder.pid) in run.owner
-    with run.claim() as mine:
-        assert not mine
-    os.kill(holder.pid, signal.SIGKILL)
-    with run.claim(wait=True) as mine:
-        assert mine
-        assert run.state == State.RUNNING
-        with RunDirectory(tmp_path).claim() as again:
-            assert not again
-        child = os.fork()
-        if child == 0:  # like a data worker that outlives its killed parent
-            time.sleep(30)
-            os._exit(0)
-    try:
-        assert run.state == State.MISSING
-    finally:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-    holder.join()
 
 
 def test_two_processes_share_a_sweep_and_both_see_all_of_it(tmp_path):

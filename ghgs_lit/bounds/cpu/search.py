@@ -13,13 +13,6 @@ from ghgs_lit.kernels.parts import even_parts
 _SLICES, _ROWS = 8, 16
 
 
-def is_supported(*tensors: Tensor) -> bool:
-    """Whether the kernels can work on these: on a CPU, floats in float32."""
-    return all(
-        x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in tensors
-    )
-
-
 def carve(
     outside: UInt8[Tensor, "B V h w"],
     matrices: Float[Tensor, "B V 3 4"],

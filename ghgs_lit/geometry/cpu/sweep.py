@@ -14,11 +14,6 @@ from ghgs_lit.kernels.parts import even_parts
 _ROWS = 16
 
 
-def is_supported(*tensors: Tensor) -> bool:
-    """Whether the kernel can work on these."""
-    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
-
-
 def sweep(
     colors: Float[Tensor, "B V 4 H W"],
     masks: Bool[Tensor, "B V H W"],

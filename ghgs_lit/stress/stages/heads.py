@@ -112,7 +112,7 @@ def _dpt(v: Values) -> Values:
     return {"maps": _HEADS[layers[0].dtype](tokens)}
 
 
-_BOUNDED = "a value between bounds is finite whatever the raw value; the training guard names the head"
+_BOUNDED = "a value between bounds is finite whatever the raw value"
 
 STAGES = (
     Stage(

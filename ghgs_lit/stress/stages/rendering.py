@@ -68,7 +68,7 @@ def _render(backend: str, v: Values) -> Values:
 
 
 _TAKES = ("cameras", "points", "quaternions", "scales", "opacities")
-_NOT_DRAWN = "a splat that is not finite is not drawn, and counted by the model's report"
+_NOT_DRAWN = "a splat that is not finite is not drawn; the report of ghgs predict counts it"
 
 STAGES = (
     Stage(

@@ -1,0 +1,93 @@
+"""Batches that the model refuses, and what it says of them."""
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+
+from ghgs_lit.batch_checks import check_batch
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from ghgs_lit.types import Batch
+from tests.helpers.models import config, make_model
+from tests.helpers.scenes import make_batch
+
+
+@functools.cache
+def bad_batches():
+    batch = make_batch(2, 3)
+    cameras = batch.cameras
+
+    def with_cameras(**changes):
+        return dataclasses.replace(batch, cameras=dataclasses.replace(cameras, **changes))
+
+    def changed(tensor, index, value):
+        tensor = tensor.clone()
+        tensor[index] = value
+        return tensor
+
+    one = Batch(batch.images[:, :1], batch.masks[:, :1], cameras[:, :1])
+    odd = make_batch(1, 2, 56, 50)
+    return {
+        "2 views": one,
+        "divisible by the patch size 14": odd,
+        "the images' size": with_cameras(height=28),
+        r"batch.cameras.extrinsics: expected finite values; found .*\[1, 2\]": with_cameras(
+            extrinsics=changed(cameras.extrinsics, (1, 2, 0, 3), float("nan"))
+        ),
+        r"focal lengths above 0; found .*\[0, 1\]": with_cameras(
+            intrinsics=changed(cameras.intrinsics, (0, 1, 1, 1), -3.0)
+        ),
+        r"batch.masks: expected the subject in one view.*\[1\]": dataclasses.replace(
+            batch, masks=changed(batch.masks, 1, False)
+        ),
+    }
+
+
+def spoiled(name, index, value):
+    tensor = getattr(make_batch(1, 2), name).clone()
+    tensor[index] = value
+    return {name: tensor}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (spoiled("images", (0, 1, 2, 0, 0), torch.nan), r"batch.images: expected finite .*\[\[0, 1\]\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), torch.inf), r"batch.images: .*\[\[0, 0\]\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), 255.0), r"batch.images: .*within \[0, 1\]"),
+        (spoiled("images", (0, 0, 0, 0, 0), -0.5), r"batch.images: .*within \[0, 1\]"),
+        (spoiled("depths", (0, 1, 3, 3), torch.nan), r"batch.depths: .*\[\[0, 1\]\]"),
+        (spoiled("depths", (0, 1, 3, 3), -1.0), r"batch.depths: expected finite depths"),
+        ({"body_vertices": [torch.tensor([[0.0, torch.nan, 0.0]])]}, r"batch.body_vertices: .*\[\[0\]\]"),
+        ({"images": torch.zeros(1, 2, 3, 56, 56, dtype=torch.uint8)}, r"batch.images: .*torch.uint8"),
+        ({"masks": torch.ones(1, 2, 56, 56, dtype=torch.uint8)}, r"batch.masks: .*torch.uint8"),
+    ],
+)  # fmt: skip
+def test_broken_values_are_refused_where_they_are(changes, message):
+    """One NaN in the background left no Gaussian, in silence; photographs as uint8 gave colours of 254."""
+    batch = make_batch(1, 2)
+    for name, value in changes.items():
+        object.__setattr__(batch, name, value)  # the types' own checks run in tests only
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match=message):
+        model(batch)
+
+
+def test_checks_of_values_can_be_left_out():
+    """Somebody who checked the values already pays nothing; others are refused by the model."""
+    bad = dataclasses.replace(make_batch(1, 2), **spoiled("images", (0, 1, 2, 0, 0), torch.nan))
+    model = make_model("model=paper")
+    with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
+        model(bad)
+    model.check_inputs = False
+    model(bad)
+    assert not GHGS.from_config(config("model.check_inputs=false")).check_inputs
+
+
+@pytest.mark.parametrize("message", list(bad_batches()))
+def test_a_bad_batch_is_refused_by_name(message):
+    """Bad input must be refused with the name of the field."""
+    with pytest.raises(InputError, match=message):
+        check_batch(bad_batches()[message], 14)
