@@ -1,0 +1,62 @@
+"""Mistakes of a calibration: functions of a camera in the package's own JSON."""
+
+import numpy as np
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+def pose(change):
+    """A mistake in the pose of a camera."""
+    return lambda c: {**c, "extrinsics": change(np.array(c["extrinsics"])).tolist()}
+
+
+def lens(change):
+    """A mistake in the intrinsics of a camera."""
+    return lambda c: {**c, "intrinsics": change(np.array(c["intrinsics"]), c).tolist()}
+
+
+def longer(factor):
+    return pose(lambda e: np.block([[e[:3, :3], e[:3, 3:] * factor], [e[3:]]]))
+
+
+def scaled(factor):
+    return lens(lambda k, c: k * [[factor], [factor], [1]])
+
+
+def turned(degrees):
+    a = np.radians(degrees)
+    turn = np.array([[np.cos(a), 0, np.sin(a), 0], [0, 1, 0, 0], [-np.sin(a), 0, np.cos(a), 0], [0, 0, 0, 1]])
+    return pose(lambda e: turn @ e)
+
+
+NORMALIZED = lens(lambda k, c: k / [[c["width"]], [c["height"]], [1]])
+PRINCIPAL = lens(lambda k, c: k / [[1, 1, c["width"]], [1, 1, c["height"]], [1, 1, 1]])
+SHIFTED = lens(lambda k, c: k + np.array([[0, 0, 0.1 * c["width"]], [0, 0, 0.05 * c["height"]], [0, 0, 0]]))
+INVERSE, OPENGL = pose(np.linalg.inv), pose(lambda e: FLIP @ e)
+
+# What all cameras have wrong, and the option that mends it.
+ALL = {
+    "inverse": (INVERSE, "calibration.extrinsics=camera_to_world"),
+    "axes": (OPENGL, "calibration.axes=opengl"),
+    "blender": (
+        pose(lambda e: np.linalg.inv(e) @ FLIP),
+        "calibration.extrinsics=camera_to_world calibration.axes=opengl",
+    ),
+    "normalized": (NORMALIZED, "calibration.intrinsics=normalized"),
+    "normalized principal point": (PRINCIPAL, "calibration.intrinsics=normalized_principal"),
+    "photographs halved": (scaled(2), "calibration.resized=0.5"),
+    "inverse and photographs doubled": (
+        lambda c: INVERSE(scaled(0.5)(c)),
+        "calibration.extrinsics=camera_to_world calibration.resized=2",
+    ),
+}
+# What one camera of four has wrong, and words that explain it.
+ONE = {
+    "inverse": (INVERSE, "camera_to_world"),
+    "axes": (OPENGL, "opengl"),
+    "millimetres": (longer(1000), "translation is 1000 times too long"),
+    "principal point": (SHIFTED, "principal point"),
+    "size": (scaled(2), "photographs 2 times as large"),
+    "turned by 6 degrees": (turned(6), "disagrees with the others"),
+    "other lens": (scaled(1.3), "disagrees with the others"),
+}
