@@ -156,6 +156,11 @@ def _run(verb: str, argv: list[str]) -> int:
         check_deletions(sys.argv[1:])
         with interruptible():
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader, such as `head`, has seen enough; Python must not write the rest when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
     except BadUsage as error:
         print(f"ghgs {verb}: {error}", file=sys.stderr)
         return 2

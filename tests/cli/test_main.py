@@ -1,6 +1,7 @@
 """The command line: verbs, one-line errors, exit codes, completion."""
 
 import importlib
+import subprocess
 import sys
 
 import pytest
@@ -102,6 +103,13 @@ def test_verb_help_and_cfg_are_hydras(monkeypatch, capsys):
     code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", "seed=7")
     assert code == 0
     assert "seed: 7" in out
+
+
+def test_a_reader_that_closes_the_pipe_gets_no_traceback():
+    command = [sys.executable, "-m", "ghgs_lit", "prepare", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0) as process:
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait()) == (b"", 141)
 
 
 def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
