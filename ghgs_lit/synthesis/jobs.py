@@ -33,7 +33,7 @@ from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.progress import Progress
-from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.synthesis.rig import Rig, Variation
 from ghgs_lit.synthesis.writing import write_body, write_view
 
 _GUARD = 'if __name__ == "__main__":'
@@ -113,7 +113,12 @@ def identity(rig: Rig, settings: RenderSettings, seed: int) -> dict:
     """Everything that photographs of a given person depend on, as plain data."""
     render = asdict(settings)
     render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
-    return {"version": RENDER_VERSION, "seed": seed, "rig": asdict(rig), "render": render}
+    cameras, still = asdict(rig), asdict(Variation())
+    # The name of a cache does not depend on what does not vary.
+    varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
+    if varied:
+        cameras["variation"] = varied
+    return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render}
 
 
 def render_subject(job: _Job) -> _Job:
@@ -121,11 +126,15 @@ def render_subject(job: _Job) -> _Job:
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
     yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), job.settings.lights.draw(rng)
+    height, width = job.settings.size
+    # Random numbers of their own: heights, yaws and lights do not depend on what is varied.
+    rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
     studio = Studio(person, lights, job.settings.samples)
     numbers = job.settings.views
     positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions
     for position in positions:
-        cameras = job.rig.cameras(yaws[position, list(numbers)], *job.settings.size)
+        index = (position, list(numbers))
+        cameras = rig.cameras(yaws[index], height, width, poses[index])
         photographs = studio.shoot(cameras)
         for n, number in enumerate(numbers):
             view = View(

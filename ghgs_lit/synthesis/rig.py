@@ -3,17 +3,75 @@
 ``positions`` cameras stand evenly around the subject. The views at each position are numbered: 0 is the
 ring camera itself, 1 the next ring camera, 3 the exact middle between the two, 2 and 4 are random in the
 first and the second half of the step. Yaw 0 looks at a subject that faces +z from the front.
+A :class:`Variation` gives each subject a ring of its own and moves single cameras.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
-from ghgs_lit.config.settings import set_fields
+from ghgs_lit.config.settings import from_config, set_fields
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.types import Cameras
+
+# Share of the image's sides that a varied rig leaves free around a subject.
+_MARGIN = 0.01
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How rigs differ between subjects and single cameras from their ring; None and 0: not at all.
+
+    Attributes:
+        radius: least and greatest radius of a subject's ring, metres.
+        pitch: least and greatest pitch of a subject's ring, degrees. The cameras look at ``look_at``: a ring
+            that looks down stands higher.
+        fill: least and greatest share of the image's height that a subject takes up in the camera that sees
+            it tallest; it decides the focal length. A subject that would not fit into every image of the ring
+            takes up less.
+        camera_pitch, camera_roll: greatest deviation of single cameras, degrees.
+        camera_look_at: greatest shift of single cameras, with the point that they look at, along each axis,
+            metres.
+    """
+
+    radius: tuple[float, float] | None = None
+    pitch: tuple[float, float] | None = None
+    fill: tuple[float, float] | None = None
+    camera_pitch: float = 0.0
+    camera_roll: float = 0.0
+    camera_look_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("radius", 0, np.inf), ("pitch", -89, 89), ("fill", 0, 1)):
+            limits = getattr(self, name)
+            if limits is not None:
+                ordered = len(limits) == 2 and low < limits[0] <= limits[1] < high
+                expected = f"[least, greatest] between {low} and {high}"
+                require(ordered, f"data.rig.variation.{name}", expected, list(limits))
+                set_fields(self, **{name: tuple(limits)})
+        for name in ("camera_pitch", "camera_roll", "camera_look_at"):
+            value = getattr(self, name)
+            require(value >= 0, f"data.rig.variation.{name}", "at least 0", value)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """How cameras [...] deviate from their ring.
+
+    Attributes:
+        pitch, roll: degrees [...].
+        shift: metres [..., 3].
+    """
+
+    pitch: np.ndarray | float = 0.0
+    roll: np.ndarray | float = 0.0
+    shift: np.ndarray | float = 0.0
+
+    def __getitem__(self, index) -> "Poses":
+        return Poses(self.pitch[index], self.roll[index], self.shift[index])
 
 
 @dataclass(frozen=True)
@@ -30,6 +88,7 @@ class Rig:
         yaw_jitter: the ring of each subject is turned by up to this angle, degrees.
         height: height that subjects are scaled to, metres (null: they keep their own).
         height_jitter: greatest deviation from ``height``, metres.
+        variation: :class:`Variation` or its mapping; :meth:`drawn` applies it.
     """
 
     positions: int = 16
@@ -41,6 +100,7 @@ class Rig:
     yaw_jitter: float = 11.0
     height: float | None = 1.80
     height_jitter: float = 0.05
+    variation: Variation = field(default_factory=Variation)
 
     def __post_init__(self) -> None:
         require(self.positions >= 2, "rig.positions", "at least 2", self.positions)
@@ -49,7 +109,8 @@ class Rig:
         require(-89 < self.pitch < 89, "rig.pitch", "between -89 and 89 degrees", self.pitch)
         require(self.focal > 0, "rig.focal", "more than 0", self.focal)
         require(self.height is None or self.height > 0, "rig.height", "more than 0 or null", self.height)
-        set_fields(self, look_at=tuple(self.look_at))
+        variation = from_config(Variation, "data.rig.variation", self.variation)
+        set_fields(self, look_at=tuple(self.look_at), variation=variation)
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
         """Yaws [positions, 5] in degrees of all views of one subject."""
@@ -59,21 +120,28 @@ class Rig:
         offsets = np.stack((0 * first, 0 * first + 1, first, 0 * first + 0.5, 0.5 + second), -1)
         return start[:, None] + step * offsets
 
-    def cameras(self, yaws: np.ndarray, height: int, width: int) -> Cameras:
+    def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
         """Cameras of the ring, float32.
 
         Args:
             yaws: degrees, any shape.
             height, width: image size in pixels.
+            poses: deviations of the cameras (None: none).
         """
-        yaw, pitch = np.radians(yaws)[..., None], np.radians(self.pitch)
-        zero = np.zeros_like(yaw)
-        backward = np.concatenate(
-            (np.cos(pitch) * np.sin(yaw), zero - np.sin(pitch), np.cos(pitch) * np.cos(yaw)), -1
+        poses = poses or Poses()
+        yaw, pitch, roll = (
+            np.broadcast_to(np.radians(angle), np.shape(yaws))[..., None]
+            for angle in (yaws, self.pitch + poses.pitch, poses.roll)
         )
-        right = np.concatenate((np.cos(yaw), zero, -np.sin(yaw)), -1)
-        rotation = np.stack((right, -np.cross(backward, right), -backward), -2)
-        center = np.asarray(self.look_at) + self.radius * backward
+        backward = np.concatenate(
+            (np.cos(pitch) * np.sin(yaw), -np.sin(pitch), np.cos(pitch) * np.cos(yaw)), -1
+        )
+        level = np.concatenate((np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)), -1)
+        down = -np.cross(backward, level)
+        right = np.cos(roll) * level + np.sin(roll) * down
+        down = np.cos(roll) * down - np.sin(roll) * level
+        rotation = np.stack((right, down, -backward), -2)
+        center = np.asarray(self.look_at) + poses.shift + self.radius * backward
         extrinsics = np.zeros((*np.shape(yaws), 4, 4))
         extrinsics[..., :3, :3] = rotation
         extrinsics[..., :3, 3] = -(rotation @ center[..., None])[..., 0]
@@ -83,6 +151,45 @@ class Rig:
         intrinsics[...] = [[focal, 0, width / 2], [0, focal, height / 2 + self.shift_y * height], [0, 0, 1]]
         intrinsics, extrinsics = intrinsics.astype(np.float32), extrinsics.astype(np.float32)
         return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(extrinsics), height, width)
+
+    def drawn(
+        self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
+    ) -> tuple["Rig", Poses]:
+        """The rig of one subject by ``variation``, and how its cameras deviate from it.
+
+        Args:
+            person: the subject, placed.
+            yaws: degrees [positions, 5] of all its views (:meth:`yaws`).
+            aspect: width of the images over their height.
+            rng: random numbers of the rig alone; all are drawn whatever varies.
+        """
+        v, share = self.variation, rng.uniform(size=3)
+        deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
+        deviations[:, 1] = np.roll(deviations[:, 0], -1, 0)  # view 1 is the next ring camera
+        pitch, roll, shift = deviations[..., 0], deviations[..., 1], deviations[..., 2:]
+        poses = Poses(v.camera_pitch * pitch, v.camera_roll * roll, v.camera_look_at * shift)
+        radius, ring_pitch = _within(v.radius, share[0], self.radius), _within(v.pitch, share[1], self.pitch)
+        rig = replace(self, radius=radius, pitch=ring_pitch, variation=Variation())
+        if v.fill is None:
+            return rig, poses
+        low, high = rig._extents(person, yaws, poses)
+        room, middle = np.array([aspect, 1]) / 2 - _MARGIN, np.array([0, self.shift_y])
+        reach = np.maximum(-low / (room + middle), high / (room - middle)).max()  # 1: to the image's margin
+        tallest = (high - low)[:, 1].max()
+        return replace(rig, focal=float(min(_within(v.fill, share[2], 0.0) / tallest, 1 / reach))), poses
+
+    def _extents(self, person: Person, yaws: np.ndarray, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+        """Least and greatest (x/z, y/z) [n, 2] of a subject in each camera."""
+        vertices = np.concatenate([part.vertices for part in person.parts])
+        low, high = [], []
+        for pose in self.cameras(yaws, 1, 1, poses).extrinsics.flatten(0, 1).numpy():
+            points = vertices @ pose[:3, :3].T + pose[:3, 3]
+            near = f"a ring farther from {person.name}: its points in front of all cameras"
+            require(points[:, 2].min() > 1e-3, "data.rig.radius", near, self.radius)
+            places = points[:, :2] / points[:, 2:]
+            low.append(places.min(0))
+            high.append(places.max(0))
+        return np.stack(low), np.stack(high)
 
     def place(self, person: Person, rng: np.random.Generator) -> Person:
         """Scale a person, put the feet on y = 0 and centre it; the body vertices move along."""
@@ -94,3 +201,8 @@ class Rig:
         scale = 1.0 if self.height is None else (self.height + jitter) / tall
         origin = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2], np.float64)
         return person.mapped(lambda vertices: (vertices - origin) * scale)
+
+
+def _within(limits: Sequence[float] | None, share: float, default: float) -> float:
+    """The value at ``share`` of the way between two limits; ``default`` where there are none."""
+    return default if limits is None else float(limits[0] + share * (limits[1] - limits[0]))
