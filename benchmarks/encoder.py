@@ -83,7 +83,7 @@ def forward(model: GHGS, batch: Batch, record: Recorder) -> tuple[Tokens, Points
     with record("unproject"):
         points = model.unprojection(depth_maps, tokens, batch)
     with record("recalibration"):
-        recalibrated = model.recalibration(tokens, points, batch)
+        recalibrated = model.recalibration(tokens, points)
     with record("Gaussian head"):
         model.gaussian_head(recalibrated, batch, points, depth_maps)
     return tokens, points

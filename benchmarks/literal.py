@@ -14,7 +14,7 @@ from ghgs_lit.encoder.rope import Rotary, rotate
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.model import GHGS
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.types import Batch, Points, Tokens
+from ghgs_lit.types import Points, Tokens
 from tests.helpers.literal_recalibration import literal_recalibration
 
 
@@ -48,8 +48,8 @@ def _block(self: Block, x: Tensor, lengths: list[int], rotary: Rotary | None = N
     return x + self.mlp(self.norm2(x)) * self.ls2.gamma
 
 
-def _recalibration(self: Recalibration, tokens: Tokens, points: Points, batch: Batch) -> Tokens:
-    counts = [math.prod(tokens.grid[1:])] * len(batch.images)
+def _recalibration(self: Recalibration, tokens: Tokens, points: Points) -> Tokens:
+    counts = [math.prod(tokens.grid[1:])] * tokens.grid[0]
     parts = list(zip(points.tokens.split(counts), tokens.semantic.split(counts), strict=True))
     layers = [
         torch.cat(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,15 @@ from ghgs_lit.batch_checks import check_batch
 from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
 from ghgs_lit.encoder import FeatureCache, VGGTEncoder
-from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.geometry.crop import crops_to_subject, pad_to_patches
-from ghgs_lit.geometry.groups import Group, join_groups, select_elements
+from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.recalibration import Recalibration
-from ghgs_lit.skipping import AutoSkip, auto_skip, seeing
-from ghgs_lit.types import Batch, Decision, DepthBounds, Prediction, Tokens
+from ghgs_lit.skipping import AutoSkip, auto_skip
+from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, require_fit
 from ghgs_lit.weights.reading import cast
 
@@ -45,11 +44,10 @@ class GHGS(nn.Module):
         unprojection: depths to world points.
         recalibration: tokens to tokens by multi-view semantic consistency.
         gaussian_head: tokens to Gaussians.
-        crop: let the stages see crops around the subject; the prediction is that of whole photographs.
         pad: ``multiple`` gives photographs of any size a black border up to the next multiple of the patch
             size; ``none`` refuses them.
         check_inputs: refuse values that are not finite or out of range (:func:`check_batch`).
-        auto: chooses what the stages see of each subject (``skip=auto``); None: ``crop`` and the encoder do.
+        auto: chooses the tokens of each subject (``skip=auto``); None: the encoder does.
     """
 
     def __init__(
@@ -60,7 +58,6 @@ class GHGS(nn.Module):
         unprojection: Unprojection,
         recalibration: Recalibration,
         gaussian_head: GaussianHead,
-        crop: bool = False,
         pad: str = "none",
         check_inputs: bool = True,
         auto: AutoSkip | None = None,
@@ -79,7 +76,7 @@ class GHGS(nn.Module):
         self.unprojection = unprojection
         self.recalibration = recalibration
         self.gaussian_head = gaussian_head
-        self.crop, self.pad, self.check_inputs, self.auto = crop, pad, check_inputs, auto
+        self.pad, self.check_inputs, self.auto = pad, check_inputs, auto
         #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | None = None
         self.precision = "inherit"
@@ -106,52 +103,21 @@ class GHGS(nn.Module):
             InputError: :func:`check_batch` refuses the batch.
         """
         check_batch(batch, self.side_multiple, self.check_inputs)
-        # From whole photographs: a crop hides what lies at its border, padding invents something there.
+        # From the photographs: padding invents something at their border.
         bounds = self.bounds(batch)
         padding = pad_to_patches(batch.masks, self.encoder.patch_size) if self.pad == "multiple" else None
         if padding is not None:
-            batch, bounds = padding.cut_batch(batch), padding.cut_bounds(bounds)
-        decisions = () if self.auto is None else self.auto.decide(self, batch.masks)
+            batch, bounds = padding.pad_batch(batch), padding.pad_bounds(bounds)
+        decisions, kept = ((), None) if self.auto is None else self.auto.decide(self.encoder, batch.masks)
         with precision_of(self.precision, batch.images.device):
-            groups = self._chosen(batch, bounds, decisions) if decisions else self._groups(batch, bounds)
-            prediction = join_groups(groups)
-        prediction = prediction if padding is None else padding.paste_prediction(prediction)
-        return dataclasses.replace(prediction, decisions=decisions)
-
-    def _stages(self, batch: Batch, bounds: DepthBounds | None) -> tuple[Prediction, Tokens]:
-        tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache)
-        tokens = self._in_heads_precision(tokens)
-        depth_maps = self.depth_head(tokens, batch, bounds)
-        points = self.unprojection(depth_maps, tokens, batch)
-        tokens = self.recalibration(tokens, points, batch)
-        gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
-        return Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps), tokens
-
-    def _groups(self, batch: Batch, bounds: DepthBounds | None) -> list[Group]:
-        """The stages on whole photographs, or on crops: elements whose crops have one size run together."""
-        if not self.crop:
-            prediction, tokens = self._stages(batch, bounds)
-            everyone = torch.arange(len(batch.masks), device=batch.masks.device)
-            return [Group(everyone, prediction, tokens.image)]
-        groups = []
-        for elements, crop in crops_to_subject(batch.masks, self.encoder.patch_size):
-            part, own = select_elements(batch, bounds, elements)
-            prediction, tokens = self._stages(crop.cut_batch(part), crop.cut_bounds(own))
-            groups.append(Group(elements, crop.paste_prediction(prediction), tokens.image))
-        return groups
-
-    def _chosen(self, batch: Batch, bounds: DepthBounds | None, decisions: Sequence[Decision]) -> list[Group]:
-        """The stages with the preset of each element; elements of one preset run together."""
-        groups = []
-        for name, preset in self.auto.presets.items():
-            chosen = [b for b, decision in enumerate(decisions) if decision.preset == name]
-            if not chosen:
-                continue
-            elements = torch.tensor(chosen, device=batch.masks.device)
-            with seeing(self, preset.view):
-                for group in self._groups(*select_elements(batch, bounds, elements)):
-                    groups.append(dataclasses.replace(group, elements=elements[group.elements]))
-        return groups
+            tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache, kept)
+            tokens = self._in_heads_precision(tokens)
+            depth_maps = self.depth_head(tokens, batch, bounds)
+            points = self.unprojection(depth_maps, tokens, batch)
+            tokens = self.recalibration(tokens, points)
+            gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
+        prediction = Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps, decisions)
+        return prediction if padding is None else padding.cut_prediction(prediction)
 
     def _in_heads_precision(self, tokens: Tokens) -> Tokens:
         """Tokens of an encoder whose weights are in half precision, for heads whose weights are not."""
@@ -166,8 +132,8 @@ class GHGS(nn.Module):
         """The model that a configuration describes.
 
         Args:
-            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.crop``, ``skip.choices``,
-                ``model.pad`` and ``model.check_inputs``; other keys are ignored.
+            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.choices``, ``model.pad``
+                and ``model.check_inputs``; other keys are ignored.
             empty: stages that are built without storage (on the meta device), for weights to be assigned to.
 
         Raises:
@@ -175,7 +141,7 @@ class GHGS(nn.Module):
         """
         for name in STAGES:
             require(name in config, name, "a stage of the model", "nothing")
-        options, skip = config.get("model") or {}, config.get("skip") or {}
+        options = config.get("model") or {}
 
         def stage(name: str, **extra: Any) -> Any:
             with torch.device("meta") if name in empty else nullcontext():
@@ -187,10 +153,9 @@ class GHGS(nn.Module):
             encoder,
             unprojection=stage("unprojection"),
             **{name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS},
-            crop=bool(skip.get("crop", False)),
             pad=options.get("pad", "none"),
             check_inputs=options.get("check_inputs", True),
-            auto=auto_skip(skip),
+            auto=auto_skip(config.get("skip") or {}),
         )
 
     @classmethod
@@ -231,20 +196,15 @@ class GHGS(nn.Module):
         self.load_state_dict(state, assign=True)
 
     def check_preset(self, checkpoint: Mapping[str, Any], path: str | Path) -> None:
-        """Compare what the stages see with what the weights of a checkpoint have seen.
+        """Compare the tokens that take part with those that the training of a checkpoint has shown.
 
-        ``skip=auto`` leaves out presets that the training did not show; crops with the authors' weights give
-        a warning.
-
-        Raises:
-            InputError: ``skip=auto`` with the authors' weights.
+        ``skip=auto`` leaves out presets that it did not show. The authors' training showed all tokens: fewer
+        give a warning.
         """
-        if "release" in (checkpoint.get("imported") or {}):
-            expected = "skip=none or skip=exact"
-            unknown = "whose error is not known for the authors' weights (scales moved by 17 % in a trial)"
-            if self.auto is not None:
-                raise InputError(f"{path}: expected {expected}; found auto, which takes crops, {unknown}")
-            if self.crop:
-                warnings.warn(f"{path}: expected {expected}; found crops, {unknown}", stacklevel=3)
-        elif self.auto is not None:
-            self.auto = self.auto.trained_by(checkpoint["config"])
+        is_release = "release" in (checkpoint.get("imported") or {})
+        if self.auto is not None:
+            self.auto = self.auto.trained_by({} if is_release else checkpoint["config"])
+        elif is_release and self.encoder.tokens != "all":
+            expected = "all, as in the training of the authors' weights"
+            found = f"{self.encoder.tokens}, whose error is not known for them"
+            warnings.warn(f"{path}: skip.tokens: expected {expected}; found {found}", stacklevel=3)

@@ -4,37 +4,42 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.crop import crops_to_subject
 from ghgs_lit.types import Decision
 
-#: What the stages see: ``crop`` of the model, ``tokens`` and ``margin`` of its encoder (0 with all tokens).
-View = tuple[bool, str, int]
 
+class View(NamedTuple):
+    """What an encoder sees: its ``tokens`` and ``margin``, which is 0 with all tokens."""
 
-def view_of(budget: str | int) -> View:
-    """What a choice of ``token_budgets`` lets the stages see."""
-    if isinstance(budget, int):
-        return False, "subject", budget
-    return budget == "window", "all", 0
+    tokens: str
+    margin: int = 0
+
+    @classmethod
+    def of_budget(cls, budget: str | int) -> "View":
+        """What a choice of ``token_budgets`` lets the encoder see."""
+        return cls("subject", budget) if isinstance(budget, int) else cls(budget)
+
+    @classmethod
+    def of_preset(cls, skip: Mapping[str, Any]) -> "View":
+        """What a node ``skip`` lets the encoder see."""
+        return cls(skip["tokens"], 0 if skip["tokens"] == "all" else skip["margin"])
 
 
 @contextmanager
-def seeing(model: Any, view: View) -> Iterator[None]:
-    """A :class:`ghgs_lit.model.GHGS` whose stages see ``view`` while the context lasts."""
-    encoder = model.encoder
-    before = (model.crop, encoder.tokens, encoder.margin)
-    model.crop, encoder.tokens, encoder.margin = view
+def seeing(encoder: Any, view: View) -> Iterator[None]:
+    """A :class:`ghgs_lit.encoder.VGGTEncoder` that sees ``view`` while the context lasts."""
+    before = (encoder.tokens, encoder.margin)
+    encoder.tokens, encoder.margin = view
     try:
         yield
     finally:
-        model.crop, encoder.tokens, encoder.margin = before
+        encoder.tokens, encoder.margin = before
 
 
 @dataclass(frozen=True)
@@ -42,20 +47,14 @@ class Preset:
     """A preset of ``conf/skip``.
 
     Args:
-        crop, tokens, margin: as of :class:`GHGS` and its encoder.
+        view: what the encoder sees.
         budget_db: PSNR that it may lose against ``skip=none``.
         is_exact: whether it promises the values of ``skip=none``, so that its loss is known for any weights.
     """
 
-    crop: bool
-    tokens: str
-    margin: int
+    view: View
     budget_db: float
     is_exact: bool
-
-    @property
-    def view(self) -> View:
-        return self.crop, self.tokens, self.margin if self.tokens == "subject" else 0
 
 
 @dataclass(frozen=True)
@@ -78,29 +77,33 @@ class AutoSkip:
 
     def trained_by(self, config: Mapping[str, Any]) -> "AutoSkip":
         """Without the presets that the training of ``config`` never showed: nobody knows what they lose."""
-        skip = config.get("skip") or {}
-        own = Preset(bool(skip.get("crop")), skip.get("tokens", "all"), skip.get("margin", 1), 0.0, False)
-        shown = {own.view, *map(view_of, config.get("token_budgets") or [])}
+        shown = {View.of_preset(config["skip"])} if config.get("skip") else {View("all")}
+        shown |= {View.of_budget(budget) for budget in config.get("token_budgets") or []}
         known = {n: p for n, p in self.presets.items() if p.is_exact or p.view in shown}
         unknown = {name: "not shown in training" for name in self.presets if name not in known}
         return replace(self, presets=known, left_out={**unknown, **self.left_out})
 
-    def decide(self, model: Any, masks: Bool[Tensor, "B V H W"]) -> tuple[Decision, ...]:
+    def decide(
+        self, encoder: Any, masks: Bool[Tensor, "B V H W"]
+    ) -> tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"]]:
         """The preset of each element, which depends on its own masks alone; of equals the most accurate.
 
         Args:
-            model: the :class:`ghgs_lit.model.GHGS` that will see them.
+            encoder: the :class:`ghgs_lit.encoder.VGGTEncoder` that will see them.
             masks: sides are divisible by the patch size.
+
+        Returns:
+            The decisions, and the patches that they keep, on the CPU.
         """
-        costs = []
+        choices = []
         for preset in self.presets.values():
-            with seeing(model, preset.view):
-                costs.append(encoder_products(model, masks))
-        names = list(self.presets)
-        table = torch.stack(costs, dim=-1)
-        best = [min(range(len(names)), key=row.__getitem__) for row in table.tolist()]
-        shares = (table / table[:, :1]).tolist()
-        return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True))
+            with seeing(encoder, preset.view):
+                choices.append(encoder.keeps(masks).cpu())
+        table = torch.stack([encoder_products(encoder, kept) for kept in choices], dim=-1)
+        best = [min(range(len(choices)), key=row.__getitem__) for row in table.tolist()]
+        kept = torch.stack([choices[k][element] for element, k in enumerate(best)])
+        names, shares = list(self.presets), (table / table[:, :1]).tolist()
+        return tuple(Decision(names[k], share[k]) for k, share in zip(best, shares, strict=True)), kept
 
     def report(self, decisions: Sequence[Decision]) -> str:
         """One line: which presets the subjects got, and why."""
@@ -125,8 +128,8 @@ def auto_skip(skip: Mapping[str, Any]) -> AutoSkip | None:
     """
     if not skip.get("choices"):
         return None
-    for key, value in (("tokens", "all"), ("crop", False)):
-        require(skip[key] == value, f"skip.{key}", f"{value} with skip=auto, which chooses it", skip[key])
+    expected = "all with skip=auto, which chooses it"
+    require(skip["tokens"] == "all", "skip.tokens", expected, skip["tokens"])
     presets = {}
     for name, node in skip["choices"].items():
         place = f"skip.choices.{name}"
@@ -134,7 +137,7 @@ def auto_skip(skip: Mapping[str, Any]) -> AutoSkip | None:
             require(node[key] == skip[key], f"{place}.{key}", f"{skip[key]}, as skip.{key}", node[key])
         require(node["budget_db"] is not None, f"{place}.budget_db", "a number", None)
         is_exact = node["max_rel_diff"] is not None
-        presets[name] = Preset(node["crop"], node["tokens"], node["margin"], node["budget_db"], is_exact)
+        presets[name] = Preset(View.of_preset(node), node["budget_db"], is_exact)
     ordered = dict(sorted(presets.items(), key=lambda item: item[1].budget_db))
     limit, least = skip["budget_db"], next(iter(ordered.values())).budget_db
     require(
@@ -145,28 +148,17 @@ def auto_skip(skip: Mapping[str, Any]) -> AutoSkip | None:
     return AutoSkip(within, limit, beyond)
 
 
-def encoder_products(model: Any, masks: Bool[Tensor, "B V H W"]) -> Float[Tensor, " B"]:
-    """FLOPs of a pair of the encoder's blocks for each element, from the tokens that the masks leave.
+def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tensor, " B"]:
+    """FLOPs of a pair of the encoder's blocks for each element, with the patches that are kept.
 
     Products with weights take 24 n C^2 in a block (6 for queries, keys and values, 2 for what leaves the
     attention, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in
     the frame block, among all views in the global block.
 
     Args:
-        model: the :class:`ghgs_lit.model.GHGS` whose crops and tokens count.
-        masks: sides are divisible by the patch size.
+        encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+        kept: patches that take part.
     """
-    tokens = (_kept_patches(model, masks) + model.encoder.aggregator.special).double()
-    width, both = model.encoder.dim_semantic, tokens.sum(1)
+    tokens = (kept.flatten(2).sum(-1) + encoder.aggregator.special).double()
+    width, both = encoder.dim_semantic, tokens.sum(1)
     return 48 * width**2 * both + 4 * width * (tokens.square().sum(1) + both.square())
-
-
-def _kept_patches(model: Any, masks: Bool[Tensor, "B V H W"]) -> Int[Tensor, "B V"]:
-    """Patches of each view that the encoder works on; on the CPU."""
-    if not model.crop:
-        return model.encoder.keeps(masks).flatten(2).sum(-1).cpu()
-    counts = torch.zeros(masks.shape[:2], dtype=torch.long)
-    for elements, crop in crops_to_subject(masks, model.encoder.patch_size):
-        kept = model.encoder.keeps(crop.cut(masks[elements]))
-        counts[elements.cpu()] = kept.flatten(2).sum(-1).cpu()
-    return counts

@@ -85,13 +85,11 @@ class Cameras(_TensorStruct):
         intrinsics[..., 1, :] *= height / self.height
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
-    def cropped(
-        self, top: Int[Tensor, "*batch"] | int, left: Int[Tensor, "*batch"] | int, height: int, width: int
-    ) -> "Cameras":
+    def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
         """The same cameras for a crop of the image.
 
         Args:
-            top: row of the image at which the crop starts, one number or one for each camera; negative pads.
+            top: row of the image at which the crop starts; negative pads.
             left: column of the image at which the crop starts.
             height: rows of the crop in pixels.
             width: columns of the crop in pixels.
@@ -134,7 +132,6 @@ class Batch(_TensorStruct):
 
     ``body_vertices`` are points of the body's surface in metres, ``depths`` true z-depths in metres (0 where
     there is none); both None where the data set has none. ``views`` names the photographs of each subject.
-    ``corners`` is the pixel (row, column) of the photograph at which each image begins; None: (0, 0).
     """
 
     images: Float[Tensor, "B V 3 H W"]
@@ -145,7 +142,6 @@ class Batch(_TensorStruct):
     depths: Float[Tensor, "B V H W"] | None = None
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
-    corners: Int[Tensor, "B V 2"] | None = None
 
 
 @dataclass(frozen=True)

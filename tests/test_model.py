@@ -40,7 +40,7 @@ class GivenTokens(nn.Module):
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         self.tokens = Tokens(latent, inputs["dino"].flatten(0, 1), image, row, column, (1, 3, 5, 5), 14)
 
-    def forward(self, images, masks, bounds, cache):
+    def forward(self, images, masks, bounds, cache, kept):
         return self.tokens
 
 
@@ -95,7 +95,7 @@ def test_the_pipeline_matches_the_release(dtype):
         torch.testing.assert_close(
             value.double(), target, atol=bound, rtol=0, msg=lambda m, k=key: f"{k}: {m}"
         )
-    layers = model.recalibration(model.encoder.tokens, prediction.points, batch).latent
+    layers = model.recalibration(model.encoder.tokens, prediction.points).latent
     for layer, index in zip(layers, (4, 11, 17, 23), strict=True):
         target = fixture(name, "mid", dtype)[f"fused_{index}"][0]
         torch.testing.assert_close(layer, target, atol=bounds[f"fused_{index}"], rtol=0)
@@ -104,7 +104,7 @@ def test_the_pipeline_matches_the_release(dtype):
 @pytest.mark.parametrize("skip", PRESETS)
 @pytest.mark.parametrize("kind", ["model=paper", "model=hull", "compat=release"])
 def test_a_batch_equals_its_elements_one_by_one(kind, skip):
-    """A result must not depend on the other subjects of its batch: one crop for all moved depths by 11 mm."""
+    """A result must not depend on the other subjects of its batch."""
     singles = list(hard_subjects().values())
     model = make_model(kind, f"skip={skip}").eval()
     with torch.no_grad():
@@ -355,10 +355,11 @@ def test_importing_the_package_does_not_import_torch():
 
 
 @pytest.mark.parametrize("size", [(56, 56), (42, 70)])
-def test_windows_give_gaussians_of_the_same_pixels(size):
-    """The network sees less background, the geometry is that of the whole photographs."""
+def test_tokens_of_windows_give_gaussians_of_the_same_pixels(size):
+    """The encoder sees less background, the geometry is that of the whole photographs."""
     batch = make_batch(2, 3, *size, zoom=0.5)
     whole, part = (make_model(f"skip={name}")(batch) for name in ("exact", "balanced"))
+    assert len(part.points.tokens) < len(whole.points.tokens)
     assert part.depth.shape == whole.depth.shape
     assert torch.equal(part.depth_valid, batch.masks)
     for name in ("image", "pixel", "colors"):
@@ -367,7 +368,7 @@ def test_windows_give_gaussians_of_the_same_pixels(size):
     for name in ("near", "far"):
         near = (getattr(prediction.depth_maps.bounds, name)[batch.masks] for prediction in (part, whole))
         assert torch.equal(*near)
-    # Points of the pasted maps lie on the rays of their pixels in the whole photograph.
+    # Points lie on the rays of their pixels in the whole photograph.
     camera = world_to_camera(part.points.pixels, batch.cameras.extrinsics[:, :, None, None])
     uv, _ = project(
         part.points.pixels,

@@ -20,7 +20,7 @@ from ghgs_lit.training.clock import seconds_between, time_mark
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 RENDER, TOTAL = "render", "total"
-#: What lies in no stage: checks, crops, pasting.
+#: What lies in no stage: checks, padding.
 OTHER = "other"
 #: Parts of stages: a name ``<stage>.<part>``, and where the part is in the model.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}

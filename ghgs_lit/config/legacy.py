@@ -111,11 +111,24 @@ def _encoders_keep_all_tokens(config: dict[str, Any]) -> None:
             config[name].setdefault("margin", 1)
 
 
+def _crops_become_windows(config: dict[str, Any]) -> None:
+    """``skip.crop`` let the stages see crops around the subject: about the patches of a window."""
+    skip, encoder = (config.get(name) for name in ("skip", "encoder"))
+    choices = skip.get("choices") if isinstance(skip, dict) else None
+    presets = [skip, *(choices.values() if isinstance(choices, dict) else ())]
+    for preset in presets:
+        if isinstance(preset, dict) and preset.pop("crop", False) and preset.get("tokens", "all") == "all":
+            preset.update(tokens="window", margin=0)
+            if preset is skip and isinstance(encoder, dict):
+                encoder.update(tokens="window", margin=0)
+
+
 #: Changes that no table can express, applied last: each takes the configuration and changes it in place.
 STEPS: list[Callable[[dict[str, Any]], None]] = [
     _ablation_is_what_the_model_does,
     _bounds_become_a_stage,
     _encoders_keep_all_tokens,
+    _crops_become_windows,
     _heads_name_what_they_skip,
     _unprojection_names_its_class,
 ]

@@ -76,6 +76,7 @@ class FeatureCache:
         images: Float[Tensor, "b v c H W"],
         masks: Bool[Tensor, "b v H W"],
         bounds: DepthBounds | None,
+        kept: Bool[Tensor, "b v h w"],
     ) -> Tokens:
         """As ``encoder.encode``, without a gradient."""
         trained = torch.is_grad_enabled() and any(p.requires_grad for p in encoder.parameters())
@@ -84,7 +85,7 @@ class FeatureCache:
         for b in range(len(images)):
             one = slice(b, b + 1)
             own = None if bounds is None else DepthBounds(bounds.near[one], bounds.far[one])
-            parts.append(self._element(encoder, images[one], masks[one], own))
+            parts.append(self._element(encoder, images[one], masks[one], own, kept[one]))
         return parts[0] if len(parts) == 1 else _packed(parts)
 
     def report(self) -> str:
@@ -114,14 +115,14 @@ class FeatureCache:
             self.deleted += 1
 
     def _element(
-        self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None
+        self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
     ) -> Tokens:
-        key = self._key(encoder, images, masks, bounds)
+        key = self._key(encoder, images, masks, bounds, kept)
         path = self.directory / key[:2] / f"{key}.safetensors"
         stored = _read(path)
         if stored is None:
             with torch.no_grad():
-                tokens = encoder.encode(images, masks, bounds)
+                tokens = encoder.encode(images, masks, bounds, kept)
             stored = self._stored(tokens, masks)
             size = _write(path, *stored)
             self.written += size
@@ -148,14 +149,17 @@ class FeatureCache:
             "patch_size": str(tokens.patch_size),
         }
 
-    def _key(self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None) -> str:
+    def _key(
+        self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
+    ) -> str:
         device = images.device.type
         half = torch.is_autocast_enabled(device) and str(torch.get_autocast_dtype(device))
-        kept = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
-        facts = [LAYOUT, encoder.options, self._fingerprint(encoder), kept, device, half]
+        stored = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
+        facts = [LAYOUT, encoder.options, self._fingerprint(encoder), stored, device, half]
         digest = hashlib.sha256(json.dumps(facts, sort_keys=True, default=list).encode())
         _add(digest, images)
-        if encoder.reads_masks or self.tokens == "subject":
+        _add(digest, kept)
+        if encoder.mask_input or encoder.bounds_input or self.tokens == "subject":
             _add(digest, masks)
         if encoder.bounds_input and bounds is not None:
             _add(digest, bounds.near)

@@ -1,5 +1,6 @@
 """The encode stage: photographs and masks to tokens."""
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.masks import patches_around_subject
+from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.types import DepthBounds, Tokens
@@ -22,6 +23,9 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 #: Options of each kind of patch embedding (``encoder.vit``).
 VIT_OPTIONS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
+
+#: Choices of ``encoder.tokens`` that leave patches out.
+KEPT = {"window": patches_in_window, "subject": patches_around_subject}
 
 
 class VGGTEncoder(nn.Module):
@@ -39,9 +43,10 @@ class VGGTEncoder(nn.Module):
         image_size: side of the square image whose patch positions a DINOv2 ViT stores, in pixels.
         mask_input: add the mask to the input channels.
         bounds_input: add two maps of the depth bounds (:func:`relative_bounds`) to the input channels.
-        tokens: ``all``, or ``subject``: patches of the background leave before the first block. The others
+        tokens: ``all``, or patches of the background leave before the first block: ``window`` keeps those of
+            the smallest rectangle that holds the subject, ``subject`` those with a pixel of the subject. They
             keep their place in the photograph; a view with an empty mask keeps its special tokens only.
-        margin: patches around the subject that stay, with ``tokens=subject``.
+        margin: patches around them that stay, too.
         layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
         trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
         checkpointing: recompute activations in the backward pass instead of keeping them.
@@ -69,9 +74,10 @@ class VGGTEncoder(nn.Module):
         weights: str | None = None,
     ):
         super().__init__()
-        choice("encoder.tokens", tokens, ("all", "subject"))
+        choice("encoder.tokens", tokens, ("all", *KEPT))
         require(margin >= 0, "encoder.margin", "0 or more patches", margin)
-        self._options = {
+        #: All that the tokens depend on, the weights and the choice of tokens apart.
+        self.options: dict[str, Any] = {
             "width": width,
             "heads": heads,
             "depth": depth,
@@ -116,23 +122,32 @@ class VGGTEncoder(nn.Module):
         masks: Bool[Tensor, "..."],
         bounds: DepthBounds | None = None,
         cache: Callable[..., Tokens] | None = None,
+        kept: Bool[Tensor, "b v h w"] | None = None,
     ) -> Tokens:
-        """Tokens of all views: of all patches, or of those that ``tokens`` and ``cache`` keep.
+        """Tokens of all views: of all patches, or of those that are kept.
 
         Args:
             images: [B, V, 3, H, W], RGB in [0, 1], sides divisible by the patch size.
-            masks: [B, V, H, W]; read where :attr:`reads_masks`.
+            masks: [B, V, H, W]; read with ``mask_input`` or ``bounds_input``, and where ``tokens`` is not
+                ``all``.
             bounds: read with ``bounds_input``.
             cache: a :class:`ghgs_lit.encoder.FeatureCache` to look the tokens up in; None: compute them.
+            kept: which patches take part; None: those of :meth:`keeps`.
         """
         self._check(images, masks)
-        return self.encode(images, masks, bounds) if cache is None else cache(self, images, masks, bounds)
+        kept = self.keeps(masks) if kept is None else kept
+        encode = self.encode if cache is None else functools.partial(cache, self)
+        return encode(images, masks, bounds, kept)
 
     def encode(
-        self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "..."], bounds: DepthBounds | None
+        self,
+        images: Float[Tensor, "b v c H W"],
+        masks: Bool[Tensor, "..."],
+        bounds: DepthBounds | None,
+        kept: Bool[Tensor, "b v h w"],
     ) -> Tokens:
         """Compute the tokens of the kept patches of all views; arguments as in :meth:`forward`."""
-        kept = KeptPatches(self.keeps(masks), images.device)
+        kept = KeptPatches(kept, images.device)
         pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
         return Tokens(
             latent=tuple(_joined(pairs, kept, self.aggregator.special)),
@@ -144,21 +159,10 @@ class VGGTEncoder(nn.Module):
             patch_size=self.patch_size,
         )
 
-    @property
-    def options(self) -> dict[str, Any]:
-        """All that the tokens depend on, the weights apart."""
-        margin = self.margin if self.tokens == "subject" else 0
-        return {**self._options, "tokens": self.tokens, "margin": margin}
-
-    @property
-    def reads_masks(self) -> bool:
-        """Whether the tokens depend on the masks."""
-        return self.mask_input or self.bounds_input or self.tokens == "subject"
-
     def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
-        """Which patches take part; on the CPU where the masks are not read."""
-        if self.tokens == "subject":
-            return patches_around_subject(masks, self.patch_size, self.margin)
+        """Which patches ``tokens`` and ``margin`` let take part; on the CPU where the masks are not read."""
+        if self.tokens in KEPT:
+            return KEPT[self.tokens](masks, self.patch_size, self.margin)
         b, v, height, width = masks.shape
         grid = (b, v, height // self.patch_size, width // self.patch_size)
         return torch.ones(grid, dtype=torch.bool, device="cpu")

@@ -2,7 +2,7 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -25,5 +25,25 @@ def patches_around_subject(
         patch_size: in pixels.
         margin: in patches.
     """
-    touched = F.max_pool2d(masks.float(), patch_size)
-    return F.max_pool2d(touched, 2 * margin + 1, 1, margin).bool()
+    return _grown(F.max_pool2d(masks.float(), patch_size), margin)
+
+
+def patches_in_window(
+    masks: Bool[Tensor, "b v H W"], patch_size: int, margin: int
+) -> Bool[Tensor, "b v h w"]:
+    """Patches of the smallest rectangle that holds the subject of a view, and of ``margin`` rows and columns
+    around it; arguments as of :func:`patches_around_subject`. A view with an empty mask has none."""
+    touched = F.max_pool2d(masks.float(), patch_size).bool()
+    rows, columns = _between(touched.any(-1)), _between(touched.any(-2))
+    return _grown((rows[..., :, None] & columns[..., None, :]).float(), margin)
+
+
+def _between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
+    """From the first to the last True along the last axis."""
+    first, last = first_and_last(hits)
+    index = torch.arange(hits.shape[-1], device=hits.device)
+    return (index >= first[..., None]) & (index <= last[..., None])
+
+
+def _grown(patches: Float[Tensor, "b v h w"], margin: int) -> Bool[Tensor, "b v h w"]:
+    return F.max_pool2d(patches, 2 * margin + 1, 1, margin).bool()

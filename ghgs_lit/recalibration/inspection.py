@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ghgs_lit.recalibration.neighbors import nearest_neighbors
 from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines
-from ghgs_lit.types import Batch, Points, Tokens
+from ghgs_lit.types import Points, Tokens
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,13 @@ class TokenAttention:
 
 @torch.no_grad()
 def attention_of(
-    recalibration: Recalibration, tokens: Tokens, points: Points, batch: Batch, query: int
+    recalibration: Recalibration, tokens: Tokens, points: Points, query: int
 ) -> TokenAttention | None:
     """Attention weights of each layer and head from one token to its neighbours (Eqs. 3 to 5).
 
     Args:
         recalibration: the stage.
-        tokens, points, batch: as in the stage's forward.
+        tokens, points: as in the stage's forward.
         query: index of a packed token.
 
     Returns:
@@ -40,11 +40,11 @@ def attention_of(
     takes_part = recalibration.takes_part(points)
     if not takes_part[query]:
         return None
-    element = tokens.image // batch.masks.shape[1]
+    element = tokens.image // tokens.grid[1]
     chosen = (takes_part & (element == element[query])).nonzero()[:, 0]
     place = int((chosen == query).nonzero())
-    positions = recalibration.positions(tokens, points, batch)[chosen]
-    places = recalibration.places(tokens, batch)
+    positions = recalibration.positions(tokens, points)[chosen]
+    places = recalibration.places(tokens)
     near = nearest_neighbors(
         positions,
         tokens.image[chosen],

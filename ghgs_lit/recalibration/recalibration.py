@@ -14,13 +14,10 @@ from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
-from ghgs_lit.types import Batch, Points, Tokens
+from ghgs_lit.types import Points, Tokens
 
 #: Number of cosines that are held at once (bounds memory).
 _COSINES = 1 << 21
-
-#: More than the columns of a photograph: numbers its pixels in reading order.
-_ROW = 1 << 15
 
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
@@ -35,7 +32,7 @@ class Recalibration(nn.Module):
         similarity: see :class:`SemanticAttention`.
         s_min: see :class:`SemanticAttention`.
         neighborhood: where distances are measured: ``xyz``, between token points; ``image_plane``, between
-            token centres in pixels of the whole photographs, as if all views were one (the paper without
+            token centres in pixels, as if all views were one (the paper without
             unprojection); ``feature``, between directions of the semantic features.
         neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
         tokens: which tokens take part: ``subject``, those with a valid point, others pass unchanged; ``all``,
@@ -61,15 +58,14 @@ class Recalibration(nn.Module):
         self.k, self.neighborhood, self.neighbors, self.tokens = k, neighborhood, neighbors, tokens
         self.block = SemanticAttention(dim_latent, num_heads, similarity, s_min)
 
-    def forward(self, tokens: Tokens, points: Points, batch: Batch) -> Tokens:
+    def forward(self, tokens: Tokens, points: Points) -> Tokens:
         """Tokens with recalibrated layers; the semantic features and the order stay.
 
         Args:
             tokens: from the encoder.
             points: of the same tokens.
-            batch: the number of elements and views is read, and where images were cut from photographs.
         """
-        batch_size, views = batch.masks.shape[:2]
+        batch_size, views = tokens.grid[:2]
         chosen = self.takes_part(points).nonzero()[:, 0]
 
         def part(values: Tensor) -> Tensor:
@@ -78,11 +74,11 @@ class Recalibration(nn.Module):
         image = part(tokens.image)
         elements = torch.arange(batch_size, device=image.device)[:, None]
         counts = (image // views == elements).sum(1).tolist()
-        places = self.places(tokens, batch)
+        places = self.places(tokens)
         neighbors = [
             nearest_neighbors(positions, views_of, self.k, self.neighbors, places_of)
             for positions, views_of, places_of in zip(
-                part(self.positions(tokens, points, batch)).split(counts),
+                part(self.positions(tokens, points)).split(counts),
                 image.split(counts),
                 [None] * batch_size if places is None else part(places).split(counts),
                 strict=True,
@@ -102,27 +98,21 @@ class Recalibration(nn.Module):
         """Which tokens are recalibrated and can be neighbours."""
         return points.tokens_valid | (self.tokens == "all")
 
-    def positions(self, tokens: Tokens, points: Points, batch: Batch) -> Float[Tensor, "N d"]:
+    def positions(self, tokens: Tokens, points: Points) -> Float[Tensor, "N d"]:
         """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
         if self.neighborhood == "xyz":
             return points.tokens.detach()
         if self.neighborhood == "feature":
             return unit(tokens.semantic)
         # Half pixels are exact in float32, so that equal distances are equal numbers.
-        return token_corners(tokens, batch) + tokens.patch_size / 2
+        return (torch.stack((tokens.row, tokens.column), dim=-1) + 0.5) * tokens.patch_size
 
-    def places(self, tokens: Tokens, batch: Batch) -> Int[Tensor, " N"] | None:
+    def places(self, tokens: Tokens) -> Int[Tensor, " N"] | None:
         """The ``places`` of :func:`nearest_neighbors`; None where equal distances are an accident."""
         if self.neighborhood != "image_plane":
             return None
-        row, column = token_corners(tokens, batch).unbind(-1)
-        return row * _ROW + column
-
-
-def token_corners(tokens: Tokens, batch: Batch) -> Int[Tensor, "N 2"]:
-    """The first pixel (row, column) of each token's patch in the whole photograph."""
-    inside = torch.stack((tokens.row, tokens.column), dim=-1) * tokens.patch_size
-    return inside if batch.corners is None else inside + batch.corners.flatten(0, 1)[tokens.image]
+        # Twice the columns: no two places at equal distances from a third have equal numbers apart from it.
+        return tokens.row * 2 * tokens.grid[3] + tokens.column
 
 
 @torch.no_grad()

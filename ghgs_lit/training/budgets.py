@@ -8,7 +8,7 @@ import numpy as np
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.model import GHGS
-from ghgs_lit.skipping import seeing, view_of
+from ghgs_lit.skipping import View, seeing
 
 KEY = "token_budgets"
 #: Budgets with a name; all others are a margin.
@@ -20,9 +20,9 @@ class TokenBudgets:
     """Draws for each training step how much of the background the encoder sees.
 
     Args:
-        choices: ``all``: whole photographs (``skip=none``, ``exact``); ``window``: crops around the subject
-            (``balanced``); a number: the subject's patches and those at most this many patches away
-            (``fast``). What is listed twice is drawn twice as often.
+        choices: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest rectangle
+            that holds the subject (``balanced``); a number: the subject's patches and those at most this many
+            patches away (``fast``). What is listed twice is drawn twice as often.
 
     Raises:
         InputError: there is no choice, or one of another kind.
@@ -47,4 +47,4 @@ class TokenBudgets:
 
 def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
     """``model`` with one of the choices of :class:`TokenBudgets` while the context lasts; None: as it is."""
-    return nullcontext() if budget is None else seeing(model, view_of(budget))
+    return nullcontext() if budget is None else seeing(model.encoder, View.of_budget(budget))

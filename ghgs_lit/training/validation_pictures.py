@@ -11,6 +11,7 @@ from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.recalibration.inspection import attention_of
 from ghgs_lit.types import Batch
@@ -99,8 +100,8 @@ class Attention(_FirstSubjects):
 
     Args:
         subjects: number of subjects.
-        token: ``[view, row, column]`` on the grid of tokens that the recalibration gets (of the crop, where
-            the model crops); None: the middle of the subject in its first view.
+        token: ``[view, row, column]`` on the grid of tokens (of padded photographs, where the model pads);
+            None: the middle of the subject in its first view.
     """
 
     name = "attention"
@@ -109,7 +110,7 @@ class Attention(_FirstSubjects):
         super().__init__(subjects)
         require(token is None or len(token) == 3, "callbacks.attention.token", "null or 3 numbers", token)
         self.token = None if token is None else tuple(token)
-        self._hook, self._seen = None, []
+        self._hook, self._seen = None, None
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         super().on_validation_epoch_start(trainer, pl_module)
@@ -118,25 +119,22 @@ class Attention(_FirstSubjects):
             self._hook = stage.register_forward_pre_hook(self._see)
 
     def on_validation_batch_start(self, *args: Any) -> None:
-        self._seen = []
+        self._seen = None
 
     def _see(self, stage: Recalibration, inputs: tuple) -> None:
-        self._seen.append((stage, *inputs))
+        self._seen = (stage, *inputs)
 
     def show(
         self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
     ) -> None:
-        # Subjects whose crops differ in size go through the stage apart.
-        calls = [call for call in self._seen if len(self._seen) == 1 or name in call[-1].subjects]
-        if not calls:
+        if self._seen is None:
             return
-        stage, tokens, points, seen_batch = calls[0]
-        if name in seen_batch.subjects:
-            element = seen_batch.subjects.index(name)
+        stage, tokens, points = self._seen
         token = chosen_token(tokens, points, element, self.token)
-        attention = None if token is None else attention_of(stage, tokens, points, seen_batch, token)
+        attention = None if token is None else attention_of(stage, tokens, points, token)
         if attention is not None:
-            picture = attention_sheet(seen_batch, tokens, attention)
+            padding = pad_to_patches(batch.masks, tokens.patch_size)
+            picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
             _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
         if self._left == 1:
             self._forget()
@@ -147,7 +145,7 @@ class Attention(_FirstSubjects):
     def _forget(self) -> None:
         if self._hook is not None:
             self._hook.remove()
-        self._hook, self._seen = None, []
+        self._hook, self._seen = None, None
 
 
 class PointClouds(_FirstSubjects):

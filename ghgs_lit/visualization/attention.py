@@ -53,7 +53,7 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     the share of each view.
 
     Args:
-        batch: gives the photographs, as the recalibration gets them.
+        batch: gives the photographs, padded to whole patches.
         tokens: packed tokens of the batch.
         attention: the query, its neighbours and their weights.
     """

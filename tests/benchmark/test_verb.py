@@ -40,7 +40,7 @@ def measured(data, tmp_path_factory):
     directory = tmp_path_factory.mktemp("benchmark") / "run"
     code = ghgs(
         "benchmark", *data, *TINY, *QUICK, "presets=[exact,balanced,auto]", "subjects=2", "skip=auto",
-        "skip.budget_db=0.3", f"hydra.run.dir={directory}",
+        f"hydra.run.dir={directory}",
     )  # fmt: skip
     assert code == 0
     return directory

@@ -89,7 +89,9 @@ def test_an_old_configuration_builds_the_same_model(name):
     assert shapes[0]
     assert (type(old.bounds), old.unprojection) == (type(new.bounds), new.unprojection)
     assert vars(old.bounds) == vars(new.bounds)
-    assert (old.crop, old.pad, old.depth_head.pixels) == (new.crop, new.pad, new.depth_head.pixels)
+    assert [(m.encoder.tokens, m.encoder.margin, m.pad, m.depth_head.pixels) for m in (old, new)] == [
+        (new.encoder.tokens, new.encoder.margin, new.pad, new.depth_head.pixels)
+    ] * 2
     assert old.gaussian_head.pixels == "subject"
 
 
@@ -197,3 +199,16 @@ def test_encoders_kept_all_tokens():
     }
     fast = {"encoder": {"tokens": "subject", "margin": 0}}
     assert upgrade(fast) == fast
+
+
+def test_crops_became_windows():
+    """A checkpoint that was trained with crops works on the same part of the photographs."""
+    window, every = {"tokens": "window", "margin": 0}, {"tokens": "all", "margin": 1}
+    crops = {"skip": {"name": "balanced", "crop": True}, "encoder": {"width": 8}}
+    assert upgrade(crops) == {"skip": {"name": "balanced"} | window, "encoder": {"width": 8} | window}
+    whole = {"skip": {"crop": False} | every, "encoder": dict(every)}
+    assert upgrade(whole) == {"skip": every, "encoder": every}
+    few = {"tokens": "subject", "margin": 2}
+    assert upgrade({"skip": few | {"crop": True}, "encoder": few}) == {"skip": few, "encoder": few}
+    auto = {"skip": every | {"choices": {"a": every | {"crop": True}, "b": every | {"crop": False}}}}
+    assert upgrade(auto) == {"skip": every | {"choices": {"a": window, "b": every}}}

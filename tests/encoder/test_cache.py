@@ -88,7 +88,7 @@ def test_whatever_changes_the_tokens_misses(tmp_path, change):
     elif change == "bounds":
         bounds.far[0, 1, 2, 3] += 1e-3
     elif change == "option":
-        cache, encoder._options["heads"] = FeatureCache(tmp_path), 4
+        cache, encoder.options["heads"] = FeatureCache(tmp_path), 4
     elif change == "margin":
         cache = FeatureCache(tmp_path, margin=2)
     made = cache.made

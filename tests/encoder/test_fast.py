@@ -1,4 +1,4 @@
-"""Patches of the background that leave before the first block, against masked attention in float64."""
+"""Patches that leave before the first block, against masked attention in float64."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.masks import patches_around_subject
+from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
 
 PATCH, ROWS, COLUMNS = 14, 5, 7
 VITS = [{"kind": "conv"}, {"kind": "stem", "channels": 8}, {"kind": "dinov2", "depth": 2, "heads": 2}]
@@ -38,7 +38,7 @@ def _people() -> tuple[torch.Tensor, torch.Tensor]:
     return torch.rand(2, 4, 3, *masks.shape[2:], generator=generator, dtype=torch.float64), masks
 
 
-def _kept_slowly(mask: torch.Tensor, margin: int) -> torch.Tensor:
+def _kept_slowly(mask: torch.Tensor, margin: int, window: bool = False) -> torch.Tensor:
     """Patches that are kept, one by one."""
     touched = torch.tensor(
         [
@@ -49,6 +49,9 @@ def _kept_slowly(mask: torch.Tensor, margin: int) -> torch.Tensor:
             for r in range(ROWS)
         ]
     )
+    if window and touched.any():
+        (top, left), (bottom, right) = touched.nonzero().amin(0), touched.nonzero().amax(0)
+        touched[top : bottom + 1, left : right + 1] = True
     near = [
         [
             bool(touched[max(0, r - margin) : r + margin + 1, max(0, c - margin) : c + margin + 1].any())
@@ -110,14 +113,16 @@ def _same(a, b):
 
 
 @pytest.mark.parametrize("vit", VITS, ids=lambda vit: vit["kind"])
-@pytest.mark.parametrize("margin", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("tokens", "margin"), [("subject", 0), ("subject", 1), ("subject", 2), ("window", 0)]
+)
 @torch.no_grad()
-def test_background_is_as_if_no_attention_saw_it(vit, margin):
+def test_background_is_as_if_no_attention_saw_it(vit, tokens, margin):
     """Kept tokens have their true positions, and nothing depends on those that left."""
-    encoder = _encoder(vit, margin=margin)
+    encoder = _encoder(vit, tokens=tokens, margin=margin)
     images, masks = _people()
+    kept = torch.stack([_kept_slowly(mask, margin, tokens == "window") for mask in masks.flatten(0, 1)])
     tokens = encoder(images, masks)
-    kept = torch.stack([_kept_slowly(mask, margin) for mask in masks.flatten(0, 1)])
     image, row, column = kept.nonzero(as_tuple=True)
     assert torch.equal(tokens.image, image)
     assert torch.equal(tokens.row, row)
@@ -132,21 +137,47 @@ def test_background_is_as_if_no_attention_saw_it(vit, margin):
 
 
 @pytest.mark.parametrize("vit", VITS, ids=lambda vit: vit["kind"])
+@pytest.mark.parametrize("tokens", ["window", "subject"])
 @torch.no_grad()
-def test_a_full_mask_gives_the_tokens_of_all(vit):
+def test_a_full_mask_gives_the_tokens_of_all(vit, tokens):
     """Where there is no background, nothing changes."""
     images, masks = _people()
     masks = torch.ones_like(masks)
-    found, expected = (_encoder(vit, tokens=tokens)(images, masks) for tokens in ("subject", "all"))
+    found, expected = (_encoder(vit, tokens=kept)(images, masks) for kept in (tokens, "all"))
     assert found.is_dense
     for a, b in zip((*found.latent, found.semantic), (*expected.latent, expected.semantic), strict=True):
         assert torch.equal(a, b)
 
 
+@pytest.mark.parametrize("margin", [0, 1, 3])
+def test_a_window_is_the_smallest_rectangle_and_its_margin(margin):
+    """Two people, a single pixel, an empty view, a subject at the border, a full frame."""
+    _, masks = _people()
+    expected = [_kept_slowly(mask, margin, window=True) for mask in masks.flatten(0, 1)]
+    found = patches_in_window(masks, PATCH, margin).flatten(0, 1)
+    assert torch.equal(found, torch.stack(expected))
+    assert not found[2].any()
+
+
 @torch.no_grad()
-def test_batch_elements_do_not_mix():
+def test_kept_patches_that_are_given_take_part():
+    """``skip=auto`` gives each subject patches of its own: the encoder's choice must not act."""
+    encoder, (images, masks) = _encoder(VITS[2]), _people()
+    kept = torch.stack((patches_in_window(masks, PATCH, 0)[0], patches_around_subject(masks, PATCH, 1)[1]))
+    found = encoder(images, masks, kept=kept)
+    for b, tokens in enumerate(("window", "subject")):
+        own = slice(b, b + 1)
+        expected = _encoder(VITS[2], tokens=tokens, margin=b)(images[own], masks[own])
+        mine = found.image // 4 == b
+        assert torch.equal(found.row[mine], expected.row)
+        _same(found.latent[1][mine], expected.latent[1])
+
+
+@pytest.mark.parametrize("tokens", ["window", "subject"])
+@torch.no_grad()
+def test_batch_elements_do_not_mix(tokens):
     """A batch of two gives what two batches of one give."""
-    encoder = _encoder(VITS[2])
+    encoder = _encoder(VITS[2], tokens=tokens)
     images, masks = _people()
     both = encoder(images, masks)
     first = encoder(images[:1], masks[:1])
@@ -157,10 +188,11 @@ def test_batch_elements_do_not_mix():
     _same(both.semantic, torch.cat((first.semantic, second.semantic)))
 
 
+@pytest.mark.parametrize("tokens", ["window", "subject"])
 @torch.no_grad()
-def test_the_order_of_later_views_does_not_matter():
+def test_the_order_of_later_views_does_not_matter(tokens):
     """Views of different lengths are told apart by their tokens, not by their place."""
-    encoder = _encoder(VITS[2])
+    encoder = _encoder(VITS[2], tokens=tokens)
     images, masks = _people()
     order = [0, 3, 1, 2]
     found, expected = encoder(images[:1, order], masks[:1, order]), encoder(images[:1], masks[:1])
@@ -214,7 +246,7 @@ def test_gradients_are_finite_and_those_of_masked_attention(vit, checkpointing):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tokens": "person"}, "encoder.tokens: expected one of all, subject; found 'person'"),
+        ({"tokens": "person"}, "encoder.tokens: expected one of all, window, subject; found 'person'"),
         ({"margin": -1}, "encoder.margin: expected 0 or more patches; found -1"),
     ],
 )

@@ -162,7 +162,7 @@ def test_what_skip_auto_chose_is_said_and_recorded(trained, tmp_path, capsys):
     assert ghgs("predict", *run, "subject=0", "formats=[ply]", f"hydra.run.dir={tmp_path / 'one'}") == 0
     report = json.loads((tmp_path / "one" / "report.json").read_text())
     assert report["skip"].startswith("skip=auto: exact (100%)")
-    assert "not balanced: may lose 0.25 dB" in report["skip"]
+    assert "not fast: not shown in training" in report["skip"]
     assert report["skip"] in capsys.readouterr().out
 
 

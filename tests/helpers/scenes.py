@@ -69,7 +69,7 @@ def stack(batches):
 
 
 def hard_subjects():
-    """Batches of one whose masks are extreme, by name; their crops differ in size."""
+    """Batches of one whose masks are extreme, by name; their windows differ in size."""
     found = {"small": make_batch(zoom=0.5), "touching_the_border": make_batch(zoom=1.6)}
     for name in ("empty_in_one_view", "full_in_one_view", "single_pixel"):
         batch = make_batch(zoom=0.6)

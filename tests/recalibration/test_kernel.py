@@ -105,17 +105,17 @@ def test_the_same_bits_with_any_number_of_threads():
 @pytest.mark.parametrize("neighbors", MODES)
 def test_the_module_without_a_gradient_is_the_same(monkeypatch, similarity, neighbors):
     """Inference by the kernels equals the module with a gradient, for every option."""
-    tokens, points, batch = scene(dim=128)
+    tokens, points = scene(dim=128)
     tokens = type(tokens)(tokens.latent, torch.randn(96, 32), *list(vars(tokens).values())[2:])
     module = make(dim=128, similarity=similarity, neighbors=neighbors)
-    expected = module(tokens, points, batch)
+    expected = module(tokens, points)
     calls = []
     for name in ("attend", "cosines"):
         kernel = getattr(cpu, name)
         monkeypatch.setattr(cpu, name, lambda *a, kernel=kernel, name=name: calls.append(name) or kernel(*a))
     monkeypatch.setattr("ghgs_lit.recalibration.cpu.attention._LARGE", 0)
     with torch.no_grad():
-        found = module(tokens, points, batch)
+        found = module(tokens, points)
     assert set(calls) == {"attend"} | ({"cosines"} if similarity != "none" else set())
     for mine, own in zip(found.latent, expected.latent, strict=True):
         torch.testing.assert_close(mine, own.detach(), atol=1e-5, rtol=1e-5)

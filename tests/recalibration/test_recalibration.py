@@ -18,7 +18,7 @@ from ghgs_lit.recalibration import (
 )
 from ghgs_lit.recalibration.neighbors import MODES
 from ghgs_lit.recalibration.recalibration import neighbor_cosines
-from ghgs_lit.types import Batch, Cameras, Points, Tokens
+from ghgs_lit.types import Points, Tokens
 from tests.helpers.scenes import CASES, fixture
 
 FIXTURES = ["sc3d_n200", "sc3d_b2_n150", "sc3d_small_variance"]
@@ -67,7 +67,7 @@ def literal_attention(block, x, points, semantic, view, k, mode):
 
 
 def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torch.float32):
-    """Tokens, points and batch; ``counts[b][v]`` tokens are valid in view v of element b."""
+    """Tokens and points; ``counts[b][v]`` tokens are valid in view v of element b."""
     generator = torch.Generator().manual_seed(seed)
     b, v = len(counts), len(counts[0])
     n = b * v * grid[0] * grid[1]
@@ -81,12 +81,10 @@ def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torc
     tokens = Tokens(latent, semantic, image, row, column, (b, v, *grid), 2)
     height, width = 2 * grid[0], 2 * grid[1]
     masks = torch.ones(b, v, height, width, dtype=torch.bool)
-    cameras = Cameras(torch.eye(3).repeat(b, v, 1, 1), torch.eye(4).repeat(b, v, 1, 1), height, width)
-    batch = Batch(torch.zeros(b, v, 3, height, width), masks, cameras)
     points = Points(
         torch.zeros(b, v, height, width, 3), masks, torch.randn(n, 3, generator=generator), valid.flatten()
     )
-    return tokens, points, batch
+    return tokens, points
 
 
 def make(dim=32, k=4, num_heads=2, **options):
@@ -121,10 +119,10 @@ def test_attention_matches_the_release(name, dtype):
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_recalibration_is_the_literal_equations(similarity, neighbors):
     """Every option equals Eqs. 3 to 5 written as loops."""
-    tokens, points, batch = scene()
+    tokens, points = scene()
     module = make(similarity=similarity, neighbors=neighbors).double()
     tokens = dataclasses.replace(tokens, latent=tuple(t.double() for t in tokens.latent))
-    found = module(tokens, points, batch)
+    found = module(tokens, points)
     for layer, before in zip(found.latent, tokens.latent, strict=True):
         expected = before.clone()
         for b in range(2):
@@ -153,8 +151,8 @@ def test_mixed_neighbors_are_never_too_few(k, dtype):
         assert found.valid.all()
         for i, row in enumerate(found.index.tolist()):
             assert row == literal_neighbors(points, view, i, k, "mixed")
-    tokens, points, batch = scene(((1, 0, 0), (1, 2, 0)))
-    found = make(neighbors="mixed", k=k)(tokens, points, batch)
+    tokens, points = scene(((1, 0, 0), (1, 2, 0)))
+    found = make(neighbors="mixed", k=k)(tokens, points)
     assert all(layer.isfinite().all() for layer in found.latent)
 
 
@@ -162,10 +160,10 @@ def test_mixed_neighbors_are_never_too_few(k, dtype):
 @pytest.mark.parametrize("mode", MODES)
 def test_ties_on_the_image_plane_favor_no_view_and_no_side(mode, dtype):
     """Views share their places there, so most distances are equal; lower views had a quarter more."""
-    tokens, points, batch = scene(((144, 144, 144, 144),), grid=(12, 12))
+    tokens, points = scene(((144, 144, 144, 144),), grid=(12, 12))
     module = make(neighborhood="image_plane", k=48, neighbors=mode)
-    position = module.positions(tokens, points, batch).to(dtype)
-    near = nearest_neighbors(position, tokens.image, 48, mode, module.places(tokens, batch))
+    position = module.positions(tokens, points).to(dtype)
+    near = nearest_neighbors(position, tokens.image, 48, mode, module.places(tokens))
     inside = (tokens.row - 5.5).abs().maximum((tokens.column - 5.5).abs()) < 2
     index = near.index[inside]
     turn = (tokens.image[index] - tokens.image[inside, None]) % 4
@@ -186,17 +184,15 @@ def test_ties_on_the_image_plane_favor_no_view_and_no_side(mode, dtype):
 
 
 def test_neighbors_on_the_image_plane_are_those_of_whole_photographs():
-    """A crop around the subject in each view must not align the views for the ablation."""
-    tokens, points, batch = scene(((16, 16, 16),))
+    """Patches that left must not move the others: the ablation would align the views."""
+    tokens, points = scene(((16, 16, 16),))
     module = make(neighborhood="image_plane", k=5)
-    corners = torch.tensor([[[0, 0], [2, 6], [4, 1]]])
-    cut = dataclasses.replace(batch, corners=corners)
-    position = module.positions(tokens, points, cut)
-    place = 2 * torch.stack((tokens.row, tokens.column), -1) + 1 + corners[0][tokens.image]
-    assert torch.equal(position, place.float())
-    assert not torch.equal(module(tokens, points, cut).latent[0], module(tokens, points, batch).latent[0])
-    padded = dataclasses.replace(batch, corners=torch.full((1, 3, 2), -3))
-    assert torch.equal(module(tokens, points, padded).latent[0], module(tokens, points, batch).latent[0])
+    left = tokens.image == 1
+    left |= tokens.row > 2
+    kept = tokens.select(~left)
+    place = 2 * torch.stack((kept.row, kept.column), -1) + 1
+    assert torch.equal(module.positions(kept, points), place.float())
+    assert torch.equal(module.places(kept), module.places(tokens)[~left])
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0])
@@ -239,9 +235,9 @@ def test_fewer_points_than_k_and_none():
     assert found.index.shape == (3, 3)
     assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).index.shape[0] == 0
     for counts in (((0, 0, 0), (3, 0, 0)), ((0, 0, 0), (0, 0, 0))):
-        tokens, points, batch = scene(counts)
+        tokens, points = scene(counts)
         for neighbors in MODES:
-            found = make(neighbors=neighbors, k=64)(tokens, points, batch)
+            found = make(neighbors=neighbors, k=64)(tokens, points)
             assert all(layer.isfinite().all() for layer in found.latent)
 
 
@@ -257,11 +253,11 @@ def test_points_of_all_sizes_have_neighbors():
 
 def test_other_tokens_pass_unchanged_and_all_takes_them_in():
     """Tokens outside the subject change only with ``tokens=all``."""
-    tokens, points, batch = scene()
-    found = make()(tokens, points, batch)
+    tokens, points = scene()
+    found = make()(tokens, points)
     changed = (found.latent[2] != tokens.latent[2]).any(1)
     assert torch.equal(changed, points.tokens_valid)
-    every = make(tokens="all")(tokens, points, batch)
+    every = make(tokens="all")(tokens, points)
     assert (every.latent[2] != tokens.latent[2]).any(1).all()
 
 
@@ -270,27 +266,27 @@ def test_neighbors_are_searched_once_an_element(monkeypatch):
     calls = []
     search = stage.nearest_neighbors
     monkeypatch.setattr(stage, "nearest_neighbors", lambda *args: calls.append(1) or search(*args))
-    tokens, points, batch = scene()
-    make()(tokens, points, batch)
+    tokens, points = scene()
+    make()(tokens, points)
     assert len(calls) == 2
 
 
 def test_elements_of_a_batch_do_not_mix():
     """A result does not depend on other elements of the batch."""
-    tokens, points, batch = scene()
-    together = make()(tokens, points, batch)
+    tokens, points = scene()
+    together = make()(tokens, points)
     moved = dataclasses.replace(points, tokens=points.tokens + 100 * (tokens.image[:, None] < 3))
     other = dataclasses.replace(
         tokens, latent=tuple(torch.where(tokens.image[:, None] < 3, t + 1, t) for t in tokens.latent)
     )
-    found = make()(other, moved, batch)
+    found = make()(other, moved)
     second = tokens.image >= 3
     torch.testing.assert_close(found.latent[0][second], together.latent[0][second])
 
 
 def test_order_of_the_views_does_not_matter():
     """Permuting the views only permutes the tokens."""
-    tokens, points, batch = scene(((5, 6, 4),))
+    tokens, points = scene(((5, 6, 4),))
     order = torch.tensor([2, 0, 1])
     index = (order[:, None] * 16 + torch.arange(16)).flatten()
     swapped = dataclasses.replace(
@@ -298,21 +294,21 @@ def test_order_of_the_views_does_not_matter():
     )
     moved = dataclasses.replace(points, tokens=points.tokens[index], tokens_valid=points.tokens_valid[index])
     for neighbors in MODES:
-        expected = make(neighbors=neighbors)(tokens, points, batch)
-        found = make(neighbors=neighbors)(swapped, moved, batch)
+        expected = make(neighbors=neighbors)(tokens, points)
+        found = make(neighbors=neighbors)(swapped, moved)
         torch.testing.assert_close(found.latent[1], expected.latent[1][index], atol=1e-5, rtol=0)
 
 
 def test_neighborhoods():
     """Only ``xyz`` reads the points; token centres on the image plane are the same in all views."""
-    tokens, points, batch = scene(((16, 16, 16),))
-    outputs = {name: make(neighborhood=name)(tokens, points, batch) for name in stage.NEIGHBORHOODS}
+    tokens, points = scene(((16, 16, 16),))
+    outputs = {name: make(neighborhood=name)(tokens, points) for name in stage.NEIGHBORHOODS}
     far = dataclasses.replace(points, tokens=points.tokens.flip(0))
     for name, before in outputs.items():
-        after = make(neighborhood=name)(tokens, far, batch)
+        after = make(neighborhood=name)(tokens, far)
         assert torch.equal(after.latent[0], before.latent[0]) == (name != "xyz")
     assert not torch.equal(outputs["image_plane"].latent[0], outputs["feature"].latent[0])
-    position = make(neighborhood="image_plane").positions(tokens, points, batch)
+    position = make(neighborhood="image_plane").positions(tokens, points)
     assert torch.equal(position[:16], position[16:32])
     assert position.min() == 1.0  # pixels: half a patch
     assert position.max() == 7.0
@@ -321,7 +317,7 @@ def test_neighborhoods():
 @pytest.mark.parametrize("similarity", SIMILARITIES)
 def test_gradients_are_finite_where_points_coincide(similarity):
     """Coincident points and zero features give finite gradients, and none reach the points."""
-    tokens, points, batch = scene()
+    tokens, points = scene()
     points = dataclasses.replace(points, tokens=torch.zeros_like(points.tokens).requires_grad_())
     tokens = dataclasses.replace(
         tokens,
@@ -329,7 +325,7 @@ def test_gradients_are_finite_where_points_coincide(similarity):
         semantic=torch.zeros_like(tokens.semantic),
     )
     module = make(similarity=similarity)
-    sum(t.square().mean() for t in module(tokens, points, batch).latent).backward()
+    sum(t.square().mean() for t in module(tokens, points).latent).backward()
     gradients = [p.grad for p in module.parameters()] + [t.grad for t in tokens.latent]
     assert all(g.isfinite().all() for g in gradients)
     assert points.tokens.grad is None
@@ -351,21 +347,21 @@ def test_dissimilar_neighbors_lose_their_weight_in_log_only():
 
 def test_blocks_of_queries_change_nothing(monkeypatch):
     """Computing a part of the tokens at a time gives the same result."""
-    tokens, points, batch = scene()
+    tokens, points = scene()
     module = make(neighbors="mixed")
-    expected = module(tokens, points, batch)
+    expected = module(tokens, points)
     monkeypatch.setattr("ghgs_lit.recalibration.attention._ROWS", 5)
     with torch.no_grad():
-        found = module(tokens, points, batch)
+        found = module(tokens, points)
     torch.testing.assert_close(found.latent[3], expected.latent[3], atol=1e-6, rtol=0)
 
 
 def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
     """Autocast changes neither the neighbours nor the dtype of the tokens."""
-    tokens, points, batch = scene()
-    expected = make()(tokens, points, batch)
+    tokens, points = scene()
+    expected = make()(tokens, points)
     with torch.autocast("cpu", torch.bfloat16):
-        found = make()(tokens, points, batch)
+        found = make()(tokens, points)
     assert found.latent[0].dtype == torch.float32
     assert (found.latent[0] - expected.latent[0]).abs().max() < 0.1
 

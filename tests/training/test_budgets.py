@@ -41,7 +41,7 @@ def test_budgets_need_features_of_their_own(tmp_path):
     """A frozen encoder's features of one budget must not be found for another."""
     encoder = make_model("encoder.trainable=none", "encoder.bounds_input=false").encoder
     batch = make_batch(views=2, height=112, width=84)
-    model = SimpleNamespace(encoder=encoder, crop=False)
+    model = SimpleNamespace(encoder=encoder)
     cache = FeatureCache(tmp_path, tokens="all")
     for made, budget in enumerate([1, 0, "all"], start=1):
         with token_budget(model, budget):
@@ -69,11 +69,11 @@ class Watched(Standin):
     def __init__(self):
         super().__init__()
         self.encoder = SimpleNamespace(tokens="subject", margin=7)
-        self.crop, self.trained, self.validated = False, [], []
+        self.trained, self.validated = [], []
 
     def forward(self, batch):
         seen = self.trained if torch.is_grad_enabled() else self.validated
-        seen.append((self.crop, self.encoder.tokens, self.encoder.margin))
+        seen.append((self.encoder.tokens, self.encoder.margin))
         return super().forward(batch)
 
 
@@ -100,7 +100,7 @@ def test_a_resumed_run_draws_as_the_whole_one_and_validates_as_configured(tmp_pa
     rest = fit(tmp_path / "half", 18, resume=tmp_path / "half" / "end.ckpt")
     assert whole.trained == half.trained + rest.trained
     assert len(set(whole.trained)) == 5
-    assert set(whole.validated) == {(False, "subject", 7)}
+    assert set(whole.validated) == {("subject", 7)}
 
 
 def test_without_budgets_the_model_stays_as_it_is_configured():
@@ -108,7 +108,7 @@ def test_without_budgets_the_model_stays_as_it_is_configured():
     model = Watched()
     with token_budget(model, None):
         model(example_batch())
-    assert model.trained == [(False, "subject", 7)]
+    assert model.trained == [("subject", 7)]
 
 
 @pytest.mark.parametrize("choices", [[], ["windows"], [-1], ["all", "1"]])

@@ -1,5 +1,7 @@
 """Attention of one token: the weights are those that the recalibration uses; where they are drawn."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -39,10 +41,10 @@ def seen(model, batch):
 def test_the_weights_are_those_of_the_forward(overrides):
     """The drawn weights reproduce the output of the recalibration."""
     model, batch = make_model("skip=none", *overrides).eval(), make_batch(2, 3)
-    (tokens, points, own), output, _ = seen(model, batch)
+    (tokens, points), output, _ = seen(model, batch)
     block = model.recalibration.block
     for query in [chosen_token(tokens, points, element) for element in range(2)]:
-        attention = attention_of(model.recalibration, tokens, points, own, query)
+        attention = attention_of(model.recalibration, tokens, points, query)
         assert torch.allclose(attention.weights.sum(-1), torch.ones(()), atol=1e-5)
         for layer, weights in enumerate(attention.weights):
             x = tokens.latent[layer]
@@ -55,7 +57,7 @@ def test_the_weights_are_those_of_the_forward(overrides):
 def test_the_chosen_token_is_of_its_element_and_has_a_point():
     """The query belongs to its subject, and a place outside the grid is refused."""
     model, batch = make_model("skip=none").eval(), make_batch(2, 3)
-    (tokens, points, own), _, _ = seen(model, batch)
+    (tokens, points), _, _ = seen(model, batch)
     for element in range(2):
         query = chosen_token(tokens, points, element)
         assert int(tokens.image[query]) == element * 3
@@ -65,15 +67,16 @@ def test_the_chosen_token_is_of_its_element_and_has_a_point():
     with pytest.raises(InputError, match=r"callbacks\.attention\.token"):
         chosen_token(tokens, points, 0, (3, 0, 0))
     background = int((~points.tokens_valid).nonzero()[0])
-    assert attention_of(model.recalibration, tokens, points, own, background) is None
+    assert attention_of(model.recalibration, tokens, points, background) is None
 
 
-def test_attention_is_drawn_on_the_tokens_it_names():
+@pytest.mark.parametrize("skip", ["none", "balanced"])
+def test_attention_is_drawn_on_the_tokens_it_names(skip):
     """Coloured patches are at the rows and columns of the neighbours."""
-    model, batch = make_model("skip=none").eval(), make_batch(1, 3, height=56, width=70)
-    (tokens, points, own), _, _ = seen(model, batch)
-    attention = attention_of(model.recalibration, tokens, points, own, chosen_token(tokens, points, 0))
-    dark = type(own)(**{**vars(own), "images": torch.zeros_like(own.images)})
+    model, batch = make_model(f"skip={skip}").eval(), make_batch(1, 3, height=56, width=70, zoom=0.5)
+    (tokens, points), _, _ = seen(model, batch)
+    attention = attention_of(model.recalibration, tokens, points, chosen_token(tokens, points, 0))
+    dark = dataclasses.replace(batch, images=torch.zeros_like(batch.images))
     picture = attention_sheet(dark, tokens, attention)
     scale, caption, gap = 4, 14, 2
     width, height = 70 * scale, 56 * scale
@@ -88,22 +91,6 @@ def test_attention_is_drawn_on_the_tokens_it_names():
         for t in attention.neighbors.tolist()
     }
     assert drawn == named
-
-
-def test_attention_of_cropped_views_lies_on_the_crop():
-    """With a crop the picture has the size of the crop and shows its neighbours."""
-    model, batch = make_model("skip=balanced").eval(), make_batch(1, 3, height=84, width=112)
-    (tokens, points, own), _, _ = seen(model, batch)
-    attention = attention_of(model.recalibration, tokens, points, own, chosen_token(tokens, points, 0))
-    assert own.images.shape[-2:] == tuple(14 * n for n in tokens.grid[2:])
-    assert own.images.shape[-2:] < batch.images.shape[-2:]
-    picture = attention_sheet(own, tokens, attention)
-    black = type(own)(**{**vars(own), "images": torch.zeros_like(own.images)})
-    dark = attention_sheet(black, tokens, attention)
-    assert picture.dtype == np.uint8
-    assert picture.shape == dark.shape
-    assert picture.shape[1] >= 3 * own.images.shape[-1]
-    assert not np.array_equal(picture, dark)
 
 
 def test_clouds_are_the_subjects_points_and_its_body():

@@ -280,12 +280,13 @@ def test_the_verbs(monkeypatch, capsys, tmp_path, files):
         assert len(err.strip().splitlines()) == 1
 
 
-def test_crops_with_the_authors_weights_give_a_warning(tmp_path):
-    """Their error is not known there: scales moved by 17 % in a trial, without a word."""
+@pytest.mark.parametrize(("skip", "tokens"), [("balanced", "window"), ("fast", "subject")])
+def test_fewer_tokens_with_the_authors_weights_give_a_warning(tmp_path, skip, tokens):
+    """Their training saw whole photographs: what leaving out patches costs is not known."""
     (vggt, release), _ = write_published(tmp_path)
     out = tmp_path / "out.ckpt"
-    import_weights(config("skip=balanced"), out, str(vggt), str(release))
-    with pytest.warns(UserWarning, match=r"out\.ckpt: expected skip=none or skip=exact; found crops"):
+    import_weights(config(f"skip={skip}"), out, str(vggt), str(release))
+    with pytest.warns(UserWarning, match=rf"out\.ckpt: skip\.tokens: expected all, .*; found {tokens}"):
         GHGS.from_checkpoint(out)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

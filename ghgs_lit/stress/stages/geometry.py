@@ -1,11 +1,11 @@
-"""Bounds, projection, unprojection, token points, crops, photo-consistency, undistortion."""
+"""Bounds, projection, unprojection, token points, padding, photo-consistency, undistortion."""
 
 import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.bounds import SubjectBox, VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
-from ghgs_lit.geometry.crop import crops_to_subject, pad_to_patches
+from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
@@ -166,33 +166,23 @@ def _tokens(v: Values) -> Values:
     }
 
 
-def _crop_inputs(family: str, g: Generator) -> Values:
+def _padding_inputs(family: str, g: Generator) -> Values:
     return scene(family, g, 2, 18)
 
 
-def _crop(v: Values) -> Values:
-    """Maps that were cut and pasted, and a point's pixel in the crop's camera, moved back."""
-    padding, batch = pad_to_patches(v["masks"], 4), batch_of(v)
-    there = padding.paste(padding.cut(v["images"].movedim(2, -1)), 0.0)
-    cut = padding.cut_batch(batch)
-    subject = []
-    for i in range(len(v["images"])):
-        one = cut.masks[i : i + 1]
-        crop = crops_to_subject(one, 4)[0][1]
-        image = cut.images[i : i + 1].movedim(2, -1)
-        subject.append(crop.paste(crop.cut(image), 0.0)[0] * one[0, ..., None])
-    point = v["middle"][:, None]
-    moved, _ = project(point, cut.cameras.intrinsics, cut.cameras.extrinsics)
+def _padding(v: Values) -> Values:
+    """Maps that were padded and cut, and a point's pixel in the padded camera, moved back."""
+    padding = pad_to_patches(v["masks"], 4)
+    padded = padding.pad_batch(batch_of(v))
+    cameras, images = padded.cameras, padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
+    moved, _ = project(v["middle"][:, None], cameras.intrinsics, cameras.extrinsics)
     corner = torch.tensor([padding.left, padding.top])
-    return {"padded": there.movedim(-1, 2), "cropped": torch.stack(subject), "pixel": moved + corner}
+    return {"images": images, "masks": padding.cut(padded.masks).to(images), "pixel": moved + corner}
 
 
-def _crop_slowly(v: Values) -> Values:
-    masked = v["images"].movedim(2, -1) * v["masks"][..., None]
-    border = (0, 0, 1, 1, 1, 1)
-    cropped = torch.nn.functional.pad(masked, border)
+def _padding_slowly(v: Values) -> Values:
     pixel, _ = project(v["middle"][:, None], *inputs.matrices(v["lenses"], v["poses"]))
-    return {"padded": v["images"], "cropped": cropped, "pixel": pixel}
+    return {"images": v["images"], "masks": v["masks"].to(v["images"]), "pixel": pixel}
 
 
 def _lens_inputs(family: str, g: Generator) -> Values:
@@ -259,9 +249,9 @@ STAGES = (
         silent="relative depths are read inside the mask only",
     ),
     Stage(
-        "crop and pad", ("cameras", "images", "masks"), _crop_inputs, _crop, 10,
-        "copies, and a principal point that moves by whole pixels", _crop_slowly,
-        gradients=("images",), steady=("truth",), silent="pixels outside the subject are cut off",
+        "padding", ("cameras", "images", "masks"), _padding_inputs, _padding, 10,
+        "copies, and a principal point that moves by whole pixels", _padding_slowly,
+        gradients=("images",), steady=("truth",),
     ),
     Stage(
         "undistortion", ("cameras",), _lens_inputs, _lens, 50,

@@ -1,0 +1,98 @@
+"""A black border around photographs whose sides are not multiples of the patch size.
+
+Predictions are cut back, so that results are in the photograph's own pixels.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch.nn.functional as F
+from jaxtyping import Bool
+from torch import Tensor
+
+from ghgs_lit.types import Batch, DepthBounds, Prediction
+
+
+@dataclass(frozen=True)
+class Padding:
+    """Images of ``height`` x ``width`` with photographs of size ``full`` (height, width) inside.
+
+    The first pixel is pixel (``top``, ``left``) of the photograph: 0 or negative.
+    """
+
+    top: int
+    left: int
+    height: int
+    width: int
+    full: tuple[int, int]
+
+    def pad(self, maps: Tensor, fill: float | bool = 0) -> Tensor:
+        """Maps of the photographs [B, V, H, W, ...] with a border of ``fill``."""
+        return F.pad(maps, self._sides(maps), value=fill)
+
+    def cut(self, maps: Tensor) -> Tensor:
+        """Maps without their border."""
+        return F.pad(maps, [-side for side in self._sides(maps)])
+
+    def pad_bounds(self, bounds: DepthBounds | None) -> DepthBounds | None:
+        """Bounds of the padded images; in the border they are depths without a meaning."""
+        return None if bounds is None else DepthBounds(self.pad(bounds.near, 1.0), self.pad(bounds.far, 1.0))
+
+    def pad_batch(self, batch: Batch) -> Batch:
+        """The batch as if every input had been photographed with the border; targets stay."""
+        return dataclasses.replace(
+            batch,
+            images=self.pad(batch.images.movedim(2, -1)).movedim(-1, 2),
+            masks=self.pad(batch.masks, False),
+            depths=None if batch.depths is None else self.pad(batch.depths),
+            cameras=batch.cameras.cropped(self.top, self.left, self.height, self.width),
+        )
+
+    def cut_prediction(self, prediction: Prediction) -> Prediction:
+        """The prediction of a padded batch on the photographs."""
+        maps, gaussians = prediction.depth_maps, prediction.gaussians
+        bounds = maps.bounds
+        if bounds is not None:
+            bounds = DepthBounds(self.cut(bounds.near), self.cut(bounds.far))
+        whole = dataclasses.replace(
+            maps,
+            depth=self.cut(maps.depth),
+            valid=self.cut(maps.valid),
+            confidence=self.cut(maps.confidence),
+            bounds=bounds,
+        )
+        row, column = gaussians.pixel // self.width + self.top, gaussians.pixel % self.width + self.left
+        pixels = self.cut(prediction.points.pixels)
+        return dataclasses.replace(
+            prediction,
+            gaussians=dataclasses.replace(gaussians, pixel=row * self.full[1] + column),
+            depth=whole.depth,
+            depth_valid=whole.valid,
+            points=dataclasses.replace(prediction.points, pixels=pixels, valid=whole.valid),
+            depth_maps=whole,
+        )
+
+    def _sides(self, maps: Tensor) -> list[int]:
+        """The widths of the border in the order of ``F.pad``: last axis first, each before and after."""
+        below, right = self.height - self.full[0] + self.top, self.width - self.full[1] + self.left
+        return [0, 0] * (maps.dim() - 4) + [-self.left, right, -self.top, below]
+
+
+def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
+    """The smallest border that makes both sides multiples; an odd pixel goes below and to the right.
+
+    512 becomes 518 with 3 pixels on each side, as in the authors' release.
+
+    Args:
+        masks: only their size is read.
+        multiple: the patch size in pixels.
+
+    Returns:
+        None where both sides are multiples already.
+    """
+    height, width = masks.shape[2:]
+    missing = (-height % multiple, -width % multiple)
+    if missing == (0, 0):
+        return None
+    sides = (height + missing[0], width + missing[1])
+    return Padding(-(missing[0] // 2), -(missing[1] // 2), *sides, full=(height, width))
