@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.guide import GuidePyramid
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.heads.window import Window, reach
@@ -29,6 +30,17 @@ def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
 def _pointwise(conv: nn.Conv2d, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n o h w"]:
     """A 1x1 convolution as a linear layer of pixels: no copy, since channels are innermost here."""
     return linear(x.permute(0, 2, 3, 1), conv.weight.flatten(1), conv.bias).permute(0, 3, 1, 2)
+
+
+class _Halving(nn.Conv2d):
+    """The convolution of the coarsest level."""
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h2 w2"]:
+        if x.device.type != "cpu" or x.shape[-1] > 1:
+            return super().forward(x)
+        # Of maps one cell wide in bfloat16, PyTorch 2.13 leaves parts of the weight's gradient unset.
+        with torch.autocast("cpu", enabled=False):
+            return super().forward(at_least_float32(x))
 
 
 class ResidualUnit(nn.Module):
@@ -143,7 +155,7 @@ class DPTHead(nn.Module):
                 nn.ConvTranspose2d(c0, c0, 4, stride=4),
                 nn.ConvTranspose2d(c1, c1, 2, stride=2),
                 nn.Identity(),
-                nn.Conv2d(c3, c3, 3, stride=2, padding=1),
+                _Halving(c3, c3, 3, stride=2, padding=1),
             )
         )
         self.scratch = Scratch(out_channels, features, hidden, output_dim)
