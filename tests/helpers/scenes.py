@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.types import Batch, Cameras, Targets
 from tests.helpers.cameras import camera_ring
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -53,6 +53,19 @@ def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
     masks, depths = ellipsoid(cameras)
     images = torch.rand(batch, views, 3, height, width, generator=torch.Generator().manual_seed(3))
     return Batch(images * masks[:, :, None], masks, cameras, depths=depths)
+
+
+def training_batch(batch=1, size=28, views=3):
+    """As :func:`make_batch`, with a target for each element, the surface's points, and names."""
+    inputs, seen = make_batch(batch, views, size, size), make_batch(batch, 2, size, size, spread=90.0)
+    g = torch.Generator().manual_seed(4)
+    directions = torch.nn.functional.normalize(torch.randn(batch, 40, 3, generator=g), dim=-1)
+    return replace(
+        inputs,
+        targets=Targets(seen.images[:, :1], seen.masks[:, :1], seen.cameras[:, :1]),
+        body_vertices=list(CENTER + RADII * directions),
+        subjects=tuple(f"p{i}" for i in range(batch)),
+    )
 
 
 def stack(batches):
