@@ -45,6 +45,8 @@ NOT_RUN = [
     (r"ghgs train .*hydra/launcher=slurm", "needs a cluster"),
     (r"ghgs train .*hydra/launcher=ray", "needs the extra `ray`"),
     (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
+    (r"ghgs stress$", "takes an hour"),
+    (r"python benchmarks/half_precision", "takes an hour"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
     (r"python benchmarks/(weights|attention)\.py", "measures models of the published size"),
     (r"python benchmarks/encoder\.py (?!--size vggt_small)", "measures models of the published size"),
