@@ -25,17 +25,17 @@ from torch import Tensor
 _T = TypeVar("_T")
 
 
-def _map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
+def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
     """Apply ``fn`` to every tensor inside nested dataclasses, tuples, lists and dicts."""
     if isinstance(value, Tensor):
         return fn(value)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        changes = {f.name: _map_tensors(getattr(value, f.name), fn) for f in dataclasses.fields(value)}
+        changes = {f.name: map_tensors(getattr(value, f.name), fn) for f in dataclasses.fields(value)}
         return dataclasses.replace(value, **changes)
     if isinstance(value, (tuple, list)):
-        return type(value)(_map_tensors(item, fn) for item in value)
+        return type(value)(map_tensors(item, fn) for item in value)
     if isinstance(value, dict):
-        return {key: _map_tensors(item, fn) for key, item in value.items()}
+        return {key: map_tensors(item, fn) for key, item in value.items()}
     return value
 
 
@@ -44,15 +44,15 @@ class _TensorStruct:
 
     def to(self, *args, **kwargs):
         """Move to a device (dtypes are kept: geometry stays float32 or wider, masks stay bool)."""
-        return _map_tensors(self, lambda t: t.to(*args, **kwargs))
+        return map_tensors(self, lambda t: t.to(*args, **kwargs))
 
     def detach(self):
         """The same tensors without their gradient."""
-        return _map_tensors(self, Tensor.detach)
+        return map_tensors(self, Tensor.detach)
 
     def pin_memory(self):
         """The tensors in page-locked memory, for fast copies to a GPU."""
-        return _map_tensors(self, Tensor.pin_memory)
+        return map_tensors(self, Tensor.pin_memory)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""``ghgs stress``: every stage on adversarial inputs, against float64."""
+"""``ghgs stress``: every stage on adversarial inputs, against float64; or one saved training step again."""
 
 import sys
 
@@ -11,12 +11,15 @@ from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.stress import report
 from ghgs_lit.stress.run import processes, run_tasks, tasks_of
+from ghgs_lit.training.replay import replay
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the path of the results last. Exit code 1 where a budget is broken."""
+    """The verb; prints the path of the results last. Exit code 1 where a budget or a step is broken."""
     directory = output_dir()
     config = save_config(cfg, directory)
+    if config["dump"] is not None:
+        return _replay(config["dump"])
     tasks = tasks_of(config["stages"], config["families"], config["dtypes"], config["quick"])
     rows = run_tasks(tasks, directory / "cells.jsonl", processes(config["workers"]))
     _print(rows)
@@ -32,6 +35,15 @@ def run(cfg: DictConfig) -> None:
             file=sys.stderr,
         )
     if failed:
+        raise SystemExit(1)
+
+
+def _replay(path: str) -> None:
+    """Print what is wrong with a saved step; exit code 1 where it still is."""
+    again = replay(path)
+    print(f"step {again.global_step}, when it was saved: {again.recorded}")
+    print(f"step {again.global_step}, now: {again.found or 'all values are finite'}")
+    if again.found is not None:
         raise SystemExit(1)
 
 

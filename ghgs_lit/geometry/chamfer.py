@@ -23,11 +23,12 @@ def nearest(
     the distance is off by a millimetre at two metres).
 
     Args:
-        queries: finite coordinates.
+        queries: a point that is not finite gets any reference; its distance is not finite either.
         references: finite coordinates, one point at least.
         chunk: queries that are compared at once on an accelerator.
     """
     queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
+    queries = queries.nan_to_num(0.0, 0.0, 0.0)
     if queries.device.type == "cpu":
         tree = cKDTree(references.double().numpy(), balanced_tree=False, compact_nodes=False)
         index = tree.query(queries.double().numpy(), workers=torch.get_num_threads())[1]

@@ -15,13 +15,11 @@ from ghgs_lit.metrics import PSNR, depth_error_mm
 from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.training.budgets import TokenBudgets, token_budget
 from ghgs_lit.training.clock import StepClock
+from ghgs_lit.training.faults import Step
+from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
-
-
-class DivergedError(InputError):
-    """A loss or a gradient stopped being a number."""
 
 
 class GHGSModule(L.LightningModule):
@@ -36,6 +34,7 @@ class GHGSModule(L.LightningModule):
         token_budgets: drawn from in each training step; None: the model stays as it is configured.
 
     Attributes:
+        guard: looks for steps whose loss or gradient is not finite.
         clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
         used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
     """
@@ -56,6 +55,7 @@ class GHGSModule(L.LightningModule):
         self.optimization = optimization
         self.config = config
         self.token_budgets = token_budgets
+        self.guard = Guard(optimization.skip_nonfinite)
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
         self.used_budget = 0.0
         self.clock = StepClock()
@@ -84,23 +84,30 @@ class GHGSModule(L.LightningModule):
         numbers = [self.config.get("seed", 0), self.global_step, part]
         return None if self.token_budgets is None else self.token_budgets.draw(numbers)
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        torch.manual_seed(self.step_seed(batch_idx))
-        with token_budget(self.model, self.draw_budget(batch_idx)):
-            prediction, rendering = self(batch)
-        total, values = self.losses(prediction, rendering, batch)
-        if not torch.isfinite(total):
-            broken = ", ".join(f"{name} = {v.item()}" for name, v in values.items() if not torch.isfinite(v))
-            subjects = ", ".join(batch.subjects)
-            raise DivergedError(
-                f"step {self.global_step}: expected finite losses; found {broken} (subjects {subjects})"
-            )
+    def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
+        """The prediction of a step, its loss and the terms of it; random numbers are those of its seed."""
+        torch.manual_seed(step.seed)
+        with token_budget(self.model, step.budget):
+            prediction, rendering = self(step.batch)
+        total, values = self.losses(prediction, rendering, step.batch)
         self.clock.mark("loss")
+        return prediction, total, values
+
+    def _step(self, batch: Batch, batch_idx: int) -> Step:
+        device = self.device.type
+        autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
+        return Step(batch, self.step_seed(batch_idx), self.draw_budget(batch_idx), autocast)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        step = self._step(batch, batch_idx)
+        prediction, total, values = self.forward_losses(step)
+        self.guard.note(step, total)
         size = len(batch.images)
         self.log("loss/total", total.detach(), prog_bar=True, batch_size=size)
         self.log_dict({f"loss/{name}": v.detach() for name, v in values.items()}, batch_size=size)
         rate = self.optimizers().param_groups[0]["lr"]
         self.log_dict({"train/learning_rate": rate, "train/budget": self.used_budget}, batch_size=size)
+        self.log("train/skipped_steps", float(self.guard.skipped), batch_size=size)
         self.log("train/gaussians", float(len(prediction.gaussians)) / size, batch_size=size)
         return total
 
@@ -154,28 +161,22 @@ class GHGSModule(L.LightningModule):
         """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
 
         A scaler of the loss is undone before. Where it overflowed it skips the step and halves its factor;
-        only a gradient that overflows without any factor is an error.
+        only a gradient that overflows without any factor is the guard's.
 
         Raises:
-            DivergedError: the norm is not finite (names a parameter).
+            DivergedError: a loss or the norm is not finite, and the guard does not skip the step.
         """
         self.optimization.drop_frozen_gradients(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
-        if torch.isfinite(norm):
+        loss_holds, norm_holds = self.guard.is_finite(self.trainer, norm)
+        if loss_holds and norm_holds:
             self.log("train/gradient_norm", norm)
-        elif self._scaler is None or self._scaler.get_scale() <= 1:
-            raise self._diverged(norm)
-
-    def _diverged(self, norm: Tensor) -> DivergedError:
-        broken = [
-            name
-            for name, p in self.model.named_parameters()
-            if p.grad is not None and not torch.isfinite(p.grad).all()
-        ]
-        return DivergedError(
-            f"step {self.global_step}: expected a finite gradient; found {norm.item()} in"
-            f" {len(broken)} parameters, first {broken[0] if broken else 'none'}"
-        )
+        else:
+            scale = 1.0 if self._scaler is None else self._scaler.get_scale()
+            if not loss_holds or scale <= 1:
+                self.guard.refuse(self, scale)
+                return
+        self.guard.accept()
 
     def on_train_batch_end(self, *args: Any) -> None:
         # Called after all callbacks: what they did since the step ended is not counted.
@@ -188,3 +189,7 @@ class GHGSModule(L.LightningModule):
         """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = dict(self.config)
+        checkpoint["skipped_steps"] = self.guard.skipped
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.guard.skipped = checkpoint.get("skipped_steps", 0)

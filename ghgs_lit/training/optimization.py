@@ -27,6 +27,8 @@ class Optimization:
         freeze_until: prefix of parameter names to the share of the run in which these parameters stay
             unchanged. Splats whose depth is still wrong reduce the loss most by becoming transparent, and
             do not recover from that.
+        skip_nonfinite: steps in a row whose loss or gradient is not finite that are skipped before the run
+            stops; 0: it stops at the first.
 
     Raises:
         InputError: a value that cannot work (names its key).
@@ -41,6 +43,7 @@ class Optimization:
     end_factor: float = 0.0
     clip: float = 1.0
     freeze_until: Mapping[str, float] = field(default_factory=dict)
+    skip_nonfinite: int = 0
 
     def __post_init__(self):
         require(self.lr > 0, "optimizer.lr", "a positive number", self.lr)
@@ -53,6 +56,7 @@ class Optimization:
             value = getattr(self, name)
             require(0 <= value <= 1, f"optimizer.{name}", "a share in [0, 1]", value)
         require(self.clip > 0, "optimizer.clip", "a positive gradient norm", self.clip)
+        require(self.skip_nonfinite >= 0, "optimizer.skip_nonfinite", "0 or more steps", self.skip_nonfinite)
         for prefix, share in self.freeze_until.items():
             require(0 <= share <= 1, f"optimizer.freeze_until.{prefix}", "a share in [0, 1]", share)
 

@@ -87,6 +87,13 @@ def test_chamfer_is_scipys():
     assert chamfer(a.bfloat16(), b).dtype == torch.float32
 
 
+def test_a_point_that_is_not_finite_is_not_hidden():
+    """The guard of training looks at the loss; an error of one process would leave the others waiting."""
+    points, surface = torch.rand(5, 3), torch.rand(7, 3)
+    points[2, 1] = torch.nan
+    assert chamfer(points, surface).isnan()
+
+
 @pytest.mark.parametrize("kind", ["squared", "huber", "truncated"])
 def test_chamfer_gradient_is_that_of_finite_differences(kind):
     """The gradient of each penalty is that of its value."""

@@ -91,6 +91,7 @@ def test_tags_are_grouped_by_what_they_are(run):
     assert tags == times | {
         "loss/total", "loss/render_l1", "loss/chamfer", "memory_mb/process",
         "train/budget", "train/gaussians", "train/gradient_norm", "train/learning_rate",
+        "train/skipped_steps",
         "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "hparam/psnr",
     }  # fmt: skip
 

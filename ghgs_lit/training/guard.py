@@ -1,0 +1,118 @@
+"""What happens to a training step whose loss or gradient is not finite: it is explained, saved, skipped."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning.pytorch as L
+import torch
+from torch import Tensor
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.files import write_atomically
+from ghgs_lit.training.faults import Fault, Step, first_fault
+
+if TYPE_CHECKING:
+    from ghgs_lit.training.module import GHGSModule
+
+
+class DivergedError(InputError):
+    """A loss or a gradient stopped being a number."""
+
+
+class Guard:
+    """Looks at each step of the optimizer once, and runs the step again only where it is not finite.
+
+    All processes decide alike. A fault is saved as ``<run>/faults/step_<n>.pt`` (once for each stage), which
+    :mod:`ghgs_lit.training.replay` runs again.
+
+    Args:
+        limit: steps in a row that are skipped before the run stops; 0: it stops at the first.
+
+    Attributes:
+        skipped: steps that were skipped, in all sessions of the run.
+    """
+
+    def __init__(self, limit: int):
+        self.limit, self.skipped = limit, 0
+        self._in_a_row = 0
+        self._steps: list[tuple[Step, Tensor]] = []
+        self._saved: set[str] = set()
+
+    def note(self, step: Step, loss: Tensor) -> None:
+        """A forward pass of the optimizer's next step, and its loss; it does not wait for the device."""
+        self._steps.append((step, loss.detach()))
+
+    def is_finite(self, trainer: L.Trainer, norm: Tensor) -> tuple[bool, bool]:
+        """Whether all losses since the last step, and the gradient's ``norm``, are finite in all processes.
+
+        The only place at which a training step waits for the device.
+        """
+        losses = torch.stack([loss for _, loss in self._steps]) if self._steps else norm.new_zeros(1)
+        flags = torch.stack([losses.isfinite().all(), norm.isfinite()]).float()
+        if trainer.world_size > 1:
+            flags = trainer.strategy.reduce(flags, reduce_op="min")
+        return tuple(bool(flag) for flag in flags.tolist())
+
+    def accept(self) -> None:
+        """The step was finite, or a scaler of the loss skips it."""
+        self._steps.clear()
+        self._in_a_row = 0
+
+    def refuse(self, module: "GHGSModule", scale: float) -> None:
+        """Name and save the fault, and drop the gradients, so that the optimizer changes nothing.
+
+        Args:
+            module: whose step it was.
+            scale: that the loss was multiplied by.
+
+        Raises:
+            DivergedError: more than ``limit`` steps in a row were not finite.
+        """
+        trainer = module.trainer
+        own = None
+        for step, _ in self._steps:
+            step = dataclasses.replace(step, scale=scale)
+            if own is None and (fault := first_fault(module, step)) is not None:
+                own = f"{fault}{self._save(module, step, fault)}"
+        self._steps.clear()
+        lines = [own]
+        if trainer.world_size > 1:
+            lines = [None] * trainer.world_size
+            torch.distributed.all_gather_object(lines, own)
+        said = "; ".join(line for line in lines if line is not None)
+        if not said:
+            said = "a value that is finite when the step is run again"
+        said = f"step {module.global_step}: expected a finite loss and gradient; found {said}"
+        if self._in_a_row >= self.limit:
+            raise DivergedError(said)
+        self._in_a_row += 1
+        self.skipped += 1
+        for parameter in module.parameters():
+            parameter.grad = None
+        if trainer.is_global_zero:
+            print(f"{said}; the step is skipped", flush=True)
+
+    def _save(self, module: "GHGSModule", step: Step, fault: Fault) -> str:
+        """Write the dump, the first of its stage; returns the end of a message that names it."""
+        if fault.stage in self._saved:
+            return ""
+        self._saved.add(fault.stage)
+        rank = f"_process_{module.global_rank}" if module.global_rank else ""
+        folder = Path(module.trainer.default_root_dir) / "faults"
+        path = folder / f"step_{module.global_step:06d}{rank}.pt"
+        content = plain_dump(module, step, fault)
+        write_atomically(path, lambda temporary: torch.save(content, temporary))
+        return f"; `ghgs stress dump={path}` runs it again"
+
+
+def plain_dump(module: "GHGSModule", step: Step, fault: Fault) -> dict[str, Any]:
+    """A step with all that it depends on, as plain data and tensors (``weights_only=True`` reads it)."""
+    return {
+        "fault": dataclasses.asdict(fault),
+        "global_step": module.global_step,
+        "step": {**dataclasses.asdict(step), "autocast": str(step.autocast or "").removeprefix("torch.")},
+        "state_dict": module.model.state_dict(),
+        "optimizer_states": [optimizer.state_dict() for optimizer in module.trainer.optimizers],
+        "config": dict(module.config),
+    }

@@ -1,0 +1,66 @@
+"""Running a step again that :class:`ghgs_lit.training.guard.Guard` has saved, on any machine."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ghgs_lit.config import build
+from ghgs_lit.config.legacy import upgrade
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from ghgs_lit.training.faults import Fault, Step, first_fault
+from ghgs_lit.training.module import GHGSModule
+from ghgs_lit.types import Batch, Cameras, Targets
+from ghgs_lit.weights.checkpoint import describe
+from ghgs_lit.weights.reading import open_file
+
+_KEYS = ("fault", "global_step", "step", "state_dict", "config")
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A saved step: what was found when it was saved, and what is found now (None: nothing)."""
+
+    global_step: int
+    recorded: Fault
+    found: Fault | None
+
+
+def replay(path: str | Path) -> Replay:
+    """Run a saved step again, on the CPU.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: the file is not one of a step.
+    """
+    content = open_file(path)
+    if not isinstance(content, Mapping) or any(key not in content for key in _KEYS):
+        raise InputError(f"{path}: expected a step that a training saved; found {describe(content)}")
+    config = upgrade(content["config"])
+    model = GHGS.from_config(config)
+    # Not checked for fit to be finite: the weights may be what is at fault.
+    model.load_state_dict(content["state_dict"], assign=True)
+    module = GHGSModule(
+        model,
+        build(config["renderer"], "renderer"),
+        build(config["loss"], "loss"),
+        build(config["optimizer"], "optimizer"),
+        config,
+    ).train()
+    found = first_fault(module, _step(content["step"]))
+    return Replay(content["global_step"], Fault(**content["fault"]), found)
+
+
+def _step(values: Mapping[str, Any]) -> Step:
+    autocast = getattr(torch, values["autocast"]) if values["autocast"] else None
+    return Step(**{**values, "batch": _batch(values["batch"]), "autocast": autocast})
+
+
+def _batch(values: Mapping[str, Any]) -> Batch:
+    targets = values["targets"]
+    if targets is not None:
+        targets = Targets(**{**targets, "cameras": Cameras(**targets["cameras"])})
+    return Batch(**{**values, "cameras": Cameras(**values["cameras"]), "targets": targets})
