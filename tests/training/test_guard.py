@@ -164,11 +164,20 @@ folder = Path({folder!r})
 class Look(Depths):
     def on_train_end(self, run, pl_module):
         (folder / f"end_{{run.global_rank}}").write_text(repr(self.seen))
-    def on_exception(self, run, pl_module, error):
-        (folder / f"error_{{run.global_rank}}").write_text(str(error))
-        for _ in range(100):  # the first process to end takes the others with it
-            if len(list(folder.glob("error_*"))) < 2:
-                time.sleep(0.1)
+    def on_train_start(self, run, pl_module):
+        refuse = pl_module.guard.refuse
+
+        def noted(*inputs):
+            try:
+                refuse(*inputs)
+            except DivergedError as error:
+                (folder / f"error_{{run.global_rank}}").write_text(str(error))
+                for _ in range(100):  # the first process to end takes the other with it
+                    if len(list(folder.glob("error_*"))) < 2:
+                        time.sleep(0.1)
+                raise
+
+        pl_module.guard.refuse = noted
 
 class Own(torch.utils.data.DataLoader):
     "Step 1 of the second process is not finite."
