@@ -21,6 +21,7 @@ from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.kernels.precision import PRECISIONS, precision_of
 from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.rounds import Rounds, State
 from ghgs_lit.skipping import AutoSkip, auto_skip
 from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, require_fit
@@ -31,6 +32,9 @@ HEADS = ("depth_head", "recalibration", "gaussian_head")
 
 #: The nodes of a configuration that :meth:`GHGS.from_config` builds, in the order of the data flow.
 STAGES = ("bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head")
+
+#: Nodes that a model may have beside them.
+OPTIONS = ("rounds", "skip", "model")
 
 
 class GHGS(nn.Module):
@@ -47,7 +51,8 @@ class GHGS(nn.Module):
         pad: ``multiple`` gives photographs of any size a black border up to the next multiple of the patch
             size; ``none`` refuses them.
         check_inputs: refuse values that are not finite or out of range (:func:`check_batch`).
-        auto: chooses the tokens of each subject (``skip=auto``); None: the encoder does.
+        auto: chooses what the encoder sees of each subject (``skip=auto``); None: it does itself.
+        rounds: correct the Gaussians; None: those of the Gaussian head are the result. They need bounds.
     """
 
     def __init__(
@@ -61,6 +66,7 @@ class GHGS(nn.Module):
         pad: str = "none",
         check_inputs: bool = True,
         auto: AutoSkip | None = None,
+        rounds: Rounds | None = None,
     ):
         super().__init__()
         choice("model.pad", pad, ("none", "multiple"))
@@ -70,11 +76,13 @@ class GHGS(nn.Module):
         require(has_bounds == depth_head.is_bounded, "bounds", expected, found)
         sees_bounds = getattr(encoder, "bounds_input", False)
         require(has_bounds or not sees_bounds, "encoder.bounds_input", "false where bounds is none", True)
+        require(rounds is None or has_bounds, "rounds", "a model with bounds", "bounds=none")
         self.bounds = bounds
         self.encoder = encoder
         self.depth_head = depth_head
         self.unprojection = unprojection
         self.recalibration = recalibration
+        self.rounds = rounds
         self.gaussian_head = gaussian_head
         self.pad, self.check_inputs, self.auto = pad, check_inputs, auto
         #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
@@ -115,8 +123,22 @@ class GHGS(nn.Module):
             depth_maps = self.depth_head(tokens, batch, bounds)
             points = self.unprojection(depth_maps, tokens, batch)
             tokens = self.recalibration(tokens, points)
-            gaussians = self.gaussian_head(tokens, batch, points, depth_maps)
-        prediction = Prediction(gaussians, depth_maps.depth, depth_maps.valid, points, depth_maps, decisions)
+            raw = self.gaussian_head(tokens, batch, points, depth_maps)
+            gaussians = self.gaussian_head.activate(raw, batch, points, depth_maps)
+            states = (State(raw, gaussians, points, depth_maps),)
+            if self.rounds is not None:
+                states = self.rounds(states[0], self.gaussian_head.activate, batch)
+        last = states[-1]
+        prediction = Prediction(
+            last.gaussians,
+            last.depth_maps.depth,
+            last.depth_maps.valid,
+            last.points,
+            last.depth_maps,
+            decisions,
+            rounds=tuple(state.depth_maps for state in states),
+            drafts=tuple(state.gaussians for state in states[:-1]),
+        )
         return prediction if padding is None else padding.cut_prediction(prediction)
 
     def _in_heads_precision(self, tokens: Tokens) -> Tokens:
@@ -156,6 +178,9 @@ class GHGS(nn.Module):
             pad=options.get("pad", "none"),
             check_inputs=options.get("check_inputs", True),
             auto=auto_skip(config.get("skip") or {}),
+            rounds=stage("rounds", channels=config["gaussian_head"]["channels"])
+            if "rounds" in config
+            else None,
         )
 
     @classmethod

@@ -223,7 +223,8 @@ class Gaussians(_TensorStruct):
 
     ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres; ``colors`` may have
     any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index) are the input pixel that
-    a Gaussian belongs to, None where there is none.
+    a Gaussian belongs to, None where there is none. ``low_pass`` (px^2) and ``antialiased`` are constants of
+    the image (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for.
     """
 
     means: Float[Tensor, "N 3"]
@@ -234,6 +235,8 @@ class Gaussians(_TensorStruct):
     splits: tuple[int, ...]
     image: Int[Tensor, " N"] | None = None
     pixel: Int[Tensor, " N"] | None = None
+    low_pass: float = 0.3
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -275,7 +278,8 @@ class Decision:
 class Prediction(_TensorStruct):
     """The result of ``model(batch)``; ``depth`` in metres, meaningful where ``depth_valid``.
 
-    ``decisions`` has one of each element with ``skip=auto``, none otherwise.
+    ``decisions`` has one of each element with ``skip=auto``, none otherwise. ``rounds`` are the depths before
+    the first round and after each (the last is ``depth_maps``), ``drafts`` the Gaussians before each.
     """
 
     gaussians: Gaussians
@@ -284,6 +288,8 @@ class Prediction(_TensorStruct):
     points: Points
     depth_maps: DepthMaps
     decisions: tuple[Decision, ...] = ()
+    rounds: tuple[DepthMaps, ...] = ()
+    drafts: tuple[Gaussians, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from ghgs_lit.weights.checkpoint import read_checkpoint, require_fit
 #: The preset that all others are compared with.
 YARDSTICK = "none"
 #: Nodes of a configuration that a model is built from, beside ``skip``.
-MODEL_NODES = (*STAGES, "model")
+MODEL_NODES = (*STAGES, "rounds", "model")
 #: What knobs can change.
-KNOBS = (*STAGES, "skip", "model", "renderer", "precision")
+KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
 
 
 @dataclass(frozen=True)

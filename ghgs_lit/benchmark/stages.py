@@ -19,13 +19,13 @@ from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.training.clock import seconds_between, time_mark
 from ghgs_lit.types import Batch, Prediction, Rendering
 
-RENDER, TOTAL = "render", "total"
+ROUNDS, RENDER, TOTAL = "rounds", "render", "total"
 #: What lies in no stage: checks, padding.
 OTHER = "other"
 #: Parts of stages: a name ``<stage>.<part>``, and where the part is in the model.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
 #: All that is timed, in the order of the data flow. The stages without a dot add up to ``total``.
-NAMES = (*STAGES[:1], *PARTS, *STAGES[1:], RENDER, OTHER, TOTAL)
+NAMES = (*STAGES[:1], *PARTS, *STAGES[1:], ROUNDS, RENDER, OTHER, TOTAL)
 
 
 class Probe(Protocol):
@@ -82,8 +82,10 @@ def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Probe) -> tupl
 def watched(model: GHGS, probe: Probe) -> Iterator[None]:
     """Let ``probe`` see the stages of ``model`` and their parts."""
     with ExitStack() as stack:
-        for name, path in {**{name: name for name in STAGES}, **PARTS}.items():
+        for name, path in {**{name: name for name in (*STAGES, ROUNDS)}, **PARTS}.items():
             stage = attrgetter(path)(model)
+            if stage is None:  # a model without rounds
+                continue
             if isinstance(stage, nn.Module):
                 stack.enter_context(_hooked(stage, name, probe))
             else:

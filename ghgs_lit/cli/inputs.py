@@ -15,13 +15,13 @@ from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.model import GHGS, OPTIONS, STAGES
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 #: Nodes of the configuration that describe the model; a checkpoint stores these.
-MODEL_NODES = (*STAGES, "skip", "model", "compat")
+MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
 #: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
 FREE = (
@@ -35,6 +35,7 @@ FREE = (
     "recalibration.s_min",
     "recalibration.similarity",
     "recalibration.tokens",
+    "rounds.count",
     "skip",
     "unprojection",
 )

@@ -35,6 +35,8 @@ def write_page(
         "up": up.tolist(),
         "target": look_at_point(cameras).tolist(),
         "pixel": pixel_size(cameras),
+        "low_pass": gaussians.low_pass,
+        "antialiased": gaussians.antialiased,
         "cameras": [
             {"name": view, "intrinsics": k, "extrinsics": e}
             for view, k, e in zip(

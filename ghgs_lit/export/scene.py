@@ -53,6 +53,23 @@ class OutputOptions:
         require(self.frames >= 0, "turntable.frames", "a number of at least 0", self.frames)
 
 
+def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
+    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide.
+
+    These are ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
+    Gaussians, for others the geometric mean of their axes.
+    """
+    variances = gaussians.scales.square()
+    wider = variances + gaussians.low_pass * pixel**2
+    opacities = gaussians.opacities
+    if gaussians.antialiased:
+        ratio = variances / torch.where(wider > 0, wider, 1.0)
+        opacities = opacities * ratio.prod(-1).pow(1 / 3)
+    return dataclasses.replace(
+        gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False
+    )
+
+
 @dataclass(frozen=True)
 class Scene:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
@@ -86,9 +103,7 @@ class Scene:
         """
         if not self.options.smooth:
             return self.gaussians
-        added = self.renderer.settings.low_pass * pixel_size(self.cameras) ** 2
-        scales = (self.gaussians.scales.square() + added).sqrt()
-        return dataclasses.replace(self.gaussians, scales=scales)
+        return smoothed(self.gaussians, pixel_size(self.cameras))
 
     @cached_property
     def turntable(self) -> list[np.ndarray]:

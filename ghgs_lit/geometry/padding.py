@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool
 from torch import Tensor
 
-from ghgs_lit.types import Batch, DepthBounds, Prediction
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Prediction, map_tensors
 
 
 @dataclass(frozen=True)
@@ -50,27 +50,25 @@ class Padding:
 
     def cut_prediction(self, prediction: Prediction) -> Prediction:
         """The prediction of a padded batch on the photographs."""
-        maps, gaussians = prediction.depth_maps, prediction.gaussians
-        bounds = maps.bounds
-        if bounds is not None:
-            bounds = DepthBounds(self.cut(bounds.near), self.cut(bounds.far))
-        whole = dataclasses.replace(
-            maps,
-            depth=self.cut(maps.depth),
-            valid=self.cut(maps.valid),
-            confidence=self.cut(maps.confidence),
-            bounds=bounds,
-        )
-        row, column = gaussians.pixel // self.width + self.top, gaussians.pixel % self.width + self.left
+        whole = self._cut_maps(prediction.depth_maps)
         pixels = self.cut(prediction.points.pixels)
         return dataclasses.replace(
             prediction,
-            gaussians=dataclasses.replace(gaussians, pixel=row * self.full[1] + column),
+            gaussians=self._cut_gaussians(prediction.gaussians),
             depth=whole.depth,
             depth_valid=whole.valid,
             points=dataclasses.replace(prediction.points, pixels=pixels, valid=whole.valid),
             depth_maps=whole,
+            rounds=tuple(self._cut_maps(maps) for maps in prediction.rounds),
+            drafts=tuple(self._cut_gaussians(draft) for draft in prediction.drafts),
         )
+
+    def _cut_maps(self, maps: DepthMaps) -> DepthMaps:
+        return map_tensors(maps, self.cut)
+
+    def _cut_gaussians(self, gaussians: Gaussians) -> Gaussians:
+        row, column = gaussians.pixel // self.width + self.top, gaussians.pixel % self.width + self.left
+        return dataclasses.replace(gaussians, pixel=row * self.full[1] + column)
 
     def _sides(self, maps: Tensor) -> list[int]:
         """The widths of the border in the order of ``F.pad``: last axis first, each before and after."""

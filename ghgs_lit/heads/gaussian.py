@@ -1,12 +1,14 @@
 """The Gaussian stage: one Gaussian for each pixel of the subject (paper, section 3.3)."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from math import log
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
@@ -36,11 +38,42 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
-def _float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
+def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
     """``mlp(x)``, its last projection in float32 under autocast: offsets of millimetres depend on it."""
     hidden, last = mlp[:-1](x), mlp[-1]
     with torch.autocast(x.device.type, enabled=False):
         return at_least_float32(last(hidden.to(last.weight.dtype)))
+
+
+#: Widths of a Gaussian's raw offset, scale, rotation, opacity and color, and their sum.
+_WIDTHS = (3, 3, 4, 1, 3)
+RAW_VALUES = sum(_WIDTHS)
+
+
+@dataclass(frozen=True)
+class RawGaussians:
+    """Attributes before their activations, and the descriptors that they come from."""
+
+    descriptors: Float[Tensor, "N c"]
+    offset: Float[Tensor, "N 3"]
+    scale: Float[Tensor, "N 3"]
+    rotation: Float[Tensor, "N 4"]
+    opacity: Float[Tensor, " N"]
+    color: Float[Tensor, "N 3"] | None
+    image: Int[Tensor, " N"]
+    pixel: Int[Tensor, " N"]
+
+    def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
+        """With :data:`RAW_VALUES` of each added to offset, scale, rotation, opacity and color."""
+        offset, scale, rotation, opacity, color = change.split(_WIDTHS, -1)
+        return dataclasses.replace(
+            self,
+            offset=self.offset + offset,
+            scale=self.scale + scale,
+            rotation=self.rotation + rotation,
+            opacity=self.opacity + opacity[:, 0],
+            color=None if self.color is None else self.color + color,
+        )
 
 
 class FootprintAttributes:
@@ -138,6 +171,7 @@ class GaussianHead(nn.Module):
             off the surface can become transparent.
         color_limit: largest change of a colour from its pixel's, in each channel, which makes up for the blur
             of splats and for dark rims; 0: none (the paper).
+        low_pass, antialiased: of the :class:`ghgs_lit.types.Gaussians`.
     """
 
     def __init__(
@@ -152,6 +186,8 @@ class GaussianHead(nn.Module):
         guide: bool = False,
         photo_consistency: bool = False,
         color_limit: float = 0.0,
+        low_pass: float = 0.3,
+        antialiased: bool = False,
     ):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
@@ -159,8 +195,10 @@ class GaussianHead(nn.Module):
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
         allowed = guide or not photo_consistency
         require(allowed, "gaussian_head.photo_consistency", "false where there is no guide", True)
+        require(low_pass >= 0, "gaussian_head.low_pass", "0 or more", low_pass)
         require(color_limit >= 0, "gaussian_head.color_limit", "0 or more", color_limit)
         self.pixels = pixels
+        self.low_pass, self.antialiased = low_pass, antialiased
         self.photo_consistency, self.color_limit = photo_consistency, color_limit
         guided = PHOTO_CHANNELS + 1 + photo_consistency if guide else 0
         self.decoder = proportioned_dpt(dim_latent, channels, guide_channels=guided, **(dpt or {}))
@@ -174,16 +212,16 @@ class GaussianHead(nn.Module):
             self.color_header = _mlp((channels, *hidden, 3), nn.ReLU)
             headers.append(self.color_header)
             from_zero.append(self.color_header)
-        self.activate = release_attributes
+        self.attributes = release_attributes
         if parameterization == "footprint":
-            self.activate = FootprintAttributes(**(attributes or {}))
+            self.attributes = FootprintAttributes(**(attributes or {}))
             from_zero = headers
         for header in from_zero:
             nn.init.zeros_(header[-1].weight)
             nn.init.zeros_(header[-1].bias)
 
-    def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
-        """Gaussians of the valid pixels in the order of element, view, row, column.
+    def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> RawGaussians:
+        """Raw attributes of the valid pixels in the order of element, view, row, column.
 
         Args:
             tokens: recalibrated.
@@ -194,8 +232,13 @@ class GaussianHead(nn.Module):
         wanted = None if self.pixels == "all" else points.valid
         parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), wanted)
         raw = zip(*(self._of_subject(part, points) for part in parts), strict=True)
-        offset, scale, rotation, opacity, *color = (torch.cat(values) for values in raw)
         image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+        values = [torch.cat(values) for values in raw]
+        return RawGaussians(*values[:5], values[5] if len(values) > 5 else None, image, pixel)
+
+    def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
+        """The Gaussians of raw attributes at the points of their pixels; arguments as of :meth:`forward`."""
+        image, pixel = raw.image, raw.pixel
         focal = (
             at_least_float32(batch.cameras.intrinsics)
             .diagonal(dim1=-2, dim2=-1)[..., :2]
@@ -206,17 +249,21 @@ class GaussianHead(nn.Module):
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
         # Without a gradient: a splat that is too large must not move nearer to become smaller.
         footprint = depth.detach() / focal
-        offset, scales, quaternions, opacities = self.activate(offset, scale, rotation, opacity, footprint)
+        offset, scales, quaternions, opacities = self.attributes(
+            raw.offset, raw.scale, raw.rotation, raw.opacity, footprint
+        )
         colors = at_least_float32(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
         return Gaussians(
             means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
             quaternions=quaternions,
             scales=scales,
             opacities=opacities,
-            colors=colors + self.color_limit * bounded_tanh(color[0]) if color else colors,
+            colors=colors if raw.color is None else colors + self.color_limit * bounded_tanh(raw.color),
             splits=tuple(points.valid.flatten(1).sum(1).tolist()),
             image=image,
             pixel=pixel,
+            low_pass=self.low_pass,
+            antialiased=self.antialiased,
         )
 
     def _guide(
@@ -231,13 +278,14 @@ class GaussianHead(nn.Module):
         return photo_guide(batch, *maps)
 
     def _of_subject(self, part: Part, points: Points) -> Sequence[Tensor]:
-        """The raw values (:meth:`_raw`) of the valid pixels of a part."""
+        """Descriptors and raw values (:meth:`_raw`) of the valid pixels of a part."""
         descriptors, valid = part.maps.permute(0, 2, 3, 1), part.cut(points.valid)
         if self.pixels == "subject":
-            return self._raw(descriptors[valid])
+            chosen = descriptors[valid]
+            return chosen, *self._raw(chosen)
         # One image at a time: the networks' hidden layers are wider than the maps.
         each = [
-            [values[own] for values in self._raw(pixels)]
+            [values[own] for values in (pixels, *self._raw(pixels))]
             for pixels, own in zip(descriptors, valid, strict=True)
         ]
         return [torch.cat(values) for values in zip(*each, strict=True)]
@@ -247,5 +295,5 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.color_limit > 0:
             headers.append(self.color_header)
-        offset, scale, rotation, opacity, *color = (_float32_last(header, descriptors) for header in headers)
+        offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
         return offset, scale, rotation, opacity[..., 0], *color

@@ -74,6 +74,7 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
     used = batch.masks & prediction.depth_valid & (batch.depths > 0)
     truth = batch.depths[used]
-    error = (at_least_float32(prediction.depth)[used] - truth).abs()
-    error = error / truth if relative else error
-    return error.sum() / max(error.numel(), 1)
+    rounds = prediction.rounds or (prediction.depth_maps,)
+    errors = [(at_least_float32(maps.depth)[used] - truth).abs() for maps in rounds]
+    errors = [error / truth if relative else error for error in errors]
+    return sum(error.sum() / max(error.numel(), 1) for error in errors) / len(errors)

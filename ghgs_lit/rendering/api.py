@@ -43,7 +43,7 @@ def render(
             means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
         near, far: metres; only Gaussians whose centre has ``near <= z <= far`` are drawn.
-        settings: constants of the image; None for the defaults.
+        settings: constants of the image; None for the defaults, or what the Gaussians were made for.
         region: the box to draw (top, left, height, width) in pixels, one for all views or one for each.
             Outside it the image is background and has no gradient; the CPU backend skips that work.
 
@@ -55,7 +55,7 @@ def render(
         InputError: inputs that do not fit together.
         BackendUnavailable: gsplat cannot run on this machine.
     """
-    settings = settings or RasterSettings()
+    settings = settings or made_for(gaussians)
     _check_range(near, far)
     _check_inputs(gaussians, cameras)
     backend = resolve_backend(backend, gaussians.means.device)
@@ -74,6 +74,12 @@ def render(
             return rendering
         behind = (1 - rendering.alpha) * _background(background, rendering.image)
         return dataclasses.replace(rendering, image=rendering.image + behind)
+
+
+def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
+    """The constants that Gaussians were made for, but for those that are given."""
+    own = {"low_pass": gaussians.low_pass, "antialiased": gaussians.antialiased}
+    return RasterSettings(**{**own, **settings})
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
@@ -106,7 +112,7 @@ class Renderer:
 
     Args:
         backend, background, near, far: see :func:`render`.
-        settings: fields of :class:`RasterSettings`.
+        settings: fields of :class:`RasterSettings`; None: the default, or what the Gaussians were made for.
     """
 
     def __init__(
@@ -131,7 +137,8 @@ class Renderer:
         self.backend = backend
         self.background = tuple(numbers) if isinstance(background, Sequence) else background
         self.near, self.far = float(near), float(far)
-        self.settings = RasterSettings(**settings)
+        self.settings = {name: value for name, value in settings.items() if value is not None}
+        RasterSettings(**self.settings)  # which checks them
 
     def __call__(
         self,
@@ -142,9 +149,8 @@ class Renderer:
     ) -> Rendering:
         """See :func:`render`; a ``background`` that is given here replaces the configured one."""
         background = self.background if background is None else background
-        return render(
-            gaussians, cameras, self.backend, background, self.near, self.far, self.settings, region
-        )
+        settings = made_for(gaussians, **self.settings)
+        return render(gaussians, cameras, self.backend, background, self.near, self.far, settings, region)
 
 
 def _check_range(near: float, far: float) -> None:

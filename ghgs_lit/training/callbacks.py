@@ -114,6 +114,7 @@ class StepTime(Callback):
         ("depth_head", None, "depth"),
         ("recalibration", "unproject", "recalibrate"),
         ("gaussian_head", None, "gaussians"),
+        ("rounds", None, "rounds"),
     )
 
     def __init__(self):

@@ -15,6 +15,7 @@ PARTS = (
     "unproject",
     "recalibrate",
     "gaussians",
+    "rounds",
     "render",
     "loss",
     "backward",

@@ -12,14 +12,20 @@ from torch import Tensor, nn
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import PSNR, depth_error_mm
-from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.training.budgets import TokenBudgets, token_budget
 from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
+from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+
+
+def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
+    """Millimetres over the subject's pixels that are valid and have a true depth."""
+    valid = batch.masks & maps.valid
+    return depth_error_mm(maps.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1))
 
 
 class GHGSModule(L.LightningModule):
@@ -118,14 +124,24 @@ class GHGSModule(L.LightningModule):
         for name, metric in (("val/psnr", self.val_psnr), ("val/psnr_box", self.val_psnr_box)):
             metric.update(image.clamp(0, 1), target, mask)
             self.log(name, metric, prog_bar=name == "val/psnr", on_epoch=True, batch_size=size)
-        means = {"val/ssim": ssim(image, target).mean()}
+        means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}
         if batch.depths is not None:
-            valid = batch.masks & prediction.depth_valid
-            means["val/depth_error_mm"] = depth_error_mm(
-                prediction.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1)
-            )
+            means["val/depth_error_mm"] = _depth_error(batch, prediction.depth_maps)
         self.log_dict(means, on_epoch=True, batch_size=size, sync_dist=self.trainer.world_size > 1)
         return {"prediction": prediction, "rendering": rendering}
+
+    def _rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
+        """PSNR and depth error before each round, where the model has rounds."""
+        found = {}
+        for number, draft in enumerate(prediction.drafts):
+            image = self.renderer(draft, batch.targets.cameras).image.clamp(0, 1).flatten(0, 1)
+            found[f"val/psnr_before_round_{number + 1}"] = psnr(
+                image, batch.targets.images.flatten(0, 1)
+            ).mean()
+            if batch.depths is not None:
+                error = _depth_error(batch, prediction.rounds[number])
+                found[f"val/depth_error_mm_before_round_{number + 1}"] = error
+        return found
 
     def progress(self) -> float:
         """Share of the budget in [0, 1] that is used: of steps or of time, whichever is larger."""

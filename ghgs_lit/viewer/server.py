@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.export.scene import smoothed
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.viewer.content import Content
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import look_at_point, pixel_size
 
-_LOW_PASS = 0.3  # px^2 of the photographs, which the Gaussians were made for
 PICTURES = ("render", "photograph", "FLIP")
 
 
@@ -61,12 +61,11 @@ class Viewer:
     def _prepare(self) -> None:
         """Covariances of all Gaussians, in the order in which a count takes them."""
         g, order = self.content.gaussians, self.content.order
+        if self.content.batch is not None:
+            # On a screen that is larger than the photographs there would be gaps.
+            g = smoothed(g, pixel_size(self.content.cameras))
         root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
         covariances = (root @ root.mT).numpy()
-        if self.content.batch is not None:
-            # What a renderer adds in pixels of the photographs: on a larger screen there would be gaps.
-            blur = _LOW_PASS * pixel_size(self.content.cameras) ** 2
-            covariances = covariances + np.eye(3, dtype=np.float32) * np.float32(blur)
         self._covariances = covariances
         self._colors = g.colors[order].clamp(0, 1).numpy()
         self._opacities = g.opacities[order][:, None].numpy()

@@ -23,7 +23,8 @@ def make_head(**options):
 def run(head, batch, masks=None):
     maps = DepthMaps(batch.depths, batch.masks if masks is None else masks, batch.depths)
     tokens = make_tokens(batch)
-    return head(tokens, batch, Unprojection()(maps, tokens, batch), maps)
+    points = Unprojection()(maps, tokens, batch)
+    return head.activate(head(tokens, batch, points, maps), batch, points, maps)
 
 
 def shake(head, scale=1.0):
@@ -42,7 +43,7 @@ def test_attributes_match_the_release(dtype):
     assert not unexpected
     assert all(key.startswith("decoder.") for key in missing)
     raw = head._raw(fixture("attribute_heads", "in", dtype)["x"][0])
-    found = dict(zip(("offset", "scale", "rot", "opacity"), head.activate(*raw, raw[3]), strict=True))
+    found = dict(zip(("offset", "scale", "rot", "opacity"), head.attributes(*raw, raw[3]), strict=True))
     expected = fixture("attribute_heads", "out64", torch.float64)
     for name, value in found.items():
         bound = CASES["attribute_heads"]["bounds"][name] if dtype == torch.float32 else 1e-9

@@ -24,6 +24,7 @@ def config(*overrides):
 def _composed(overrides):
     composed = compose("train", [*TINY, *overrides])
     nodes = [*STAGES, "skip", "model", "compat"]
+    nodes += ["rounds"] * ("rounds" in composed)
     return OmegaConf.to_container(OmegaConf.masked_copy(composed, nodes), resolve=True)
 
 

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.config import compose as project_compose
 from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
-from ghgs_lit.rendering import Renderer, render
+from ghgs_lit.rendering import RasterSettings, Renderer, render
 from ghgs_lit.types import Cameras, Gaussians
 from tests.helpers.splats import camera_ring, cloud
 
@@ -61,7 +61,7 @@ def test_the_release_renders_with_its_own_constants(verb):
     ]
     renderers = [Renderer(**{k: v for k, v in node.items() if k != "_target_"}) for node in nodes]
     assert [renderer.near for renderer in renderers] == [0.01, 0.2, 0.05]
-    assert [renderer.settings.alpha_max for renderer in renderers] == [0.999, 0.99, 0.99]
+    assert [renderer.settings.get("alpha_max", 0.999) for renderer in renderers] == [0.999, 0.99, 0.99]
     views = Cameras(torch.tensor([[[[20.0, 0, 5], [0, 20, 5], [0, 0, 1]]]]), torch.eye(4)[None, None], 10, 10)
     splats = Gaussians(
         torch.tensor([[0, 0, 0.1], [0, 0, 1.0]]), torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), 0.5),
@@ -117,3 +117,18 @@ def test_regions_that_do_not_fit(region):
     """A region outside the image or of a wrong form is refused."""
     with pytest.raises(InputError, match="region"):
         render(cloud(5), camera_ring(2, 20, 30), "cpu", region=region)
+
+
+def test_gaussians_are_drawn_with_the_constants_that_they_were_made_for():
+    """Unless a renderer says otherwise."""
+    views = Cameras(torch.tensor([[[[20.0, 0, 5], [0, 20, 5], [0, 0, 1]]]]), torch.eye(4)[None, None], 10, 10)
+    one = Gaussians(
+        torch.tensor([[0, 0, 1.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.02),
+        torch.ones(1), torch.ones(1, 3), (1,), low_pass=0.1, antialiased=True,
+    )  # fmt: skip
+    sharp, plain = RasterSettings(low_pass=0.1, antialiased=True), RasterSettings()
+    assert torch.equal(render(one, views).image, render(one, views, settings=sharp).image)
+    assert torch.equal(Renderer()(one, views).image, render(one, views, settings=sharp).image)
+    forced = Renderer(low_pass=0.3, antialiased=False)(one, views).image
+    assert torch.equal(forced, render(one, views, settings=plain).image)
+    assert not torch.equal(forced, render(one, views).image)

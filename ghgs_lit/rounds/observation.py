@@ -1,0 +1,61 @@
+"""What the photographs say about Gaussians where they are now, without a gradient."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.rendering import render
+from ghgs_lit.types import Batch, Gaussians, Rendering
+
+#: Metres behind the rendered surface at which a Gaussian counts as hidden (tanh of the ratio).
+_BEHIND = 0.05
+
+#: Values of a Gaussian in a view: photograph minus its own colour (3), photograph minus render (3), mask,
+#: alpha, how far it lies behind the rendered surface, whether the view can see it, whether it is from there.
+CHANNELS = 11
+
+
+@torch.no_grad()
+def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
+    """What each input view shows of each Gaussian of its element: :data:`CHANNELS` values.
+
+    Args:
+        gaussians: with the images that they come from.
+        batch: photographs, masks and cameras.
+    """
+    with torch.autocast(gaussians.means.device.type, enabled=False):
+        return _compare(gaussians, batch, render(gaussians, batch.cameras))
+
+
+def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[Tensor, "N V c"]:
+    views, _, height, width = batch.images.shape[1:]
+    element, cameras = gaussians.image // views, batch.cameras
+    means = gaussians.means[:, None].expand(-1, views, -1)
+    pixels, z = project(means, cameras.intrinsics[element], cameras.extrinsics[element])
+    photo, mask = at_least_float32(batch.images), batch.masks[:, :, None]
+    maps = (photo, photo - rendering.image, mask.to(photo), rendering.alpha, rendering.depth)
+    image = element[:, None] * views + torch.arange(views, device=element.device)
+    found = sample(torch.cat(maps, 2).flatten(0, 1), image, pixels)
+    color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
+    inside = (pixels >= 0).all(-1) & (pixels[..., 0] <= width) & (pixels[..., 1] <= height)
+    can_see = ((z > 0) & inside)[..., None]
+    behind = torch.tanh((z[..., None] - depth) / _BEHIND)
+    values = torch.cat((color - gaussians.colors[:, None], error, mask, alpha, behind), -1)
+    is_own = F.one_hot(gaussians.image % views, views)[..., None]
+    return torch.cat((torch.where(can_see, values, 0), can_see.to(values), is_own.to(values)), -1)
+
+
+def sample(
+    maps: Float[Tensor, "m c H W"], image: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]
+) -> Float[Tensor, "*n c"]:
+    """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside."""
+    count, _, height, width = maps.shape
+    grid = pixels * (2 / pixels.new_tensor([width, height])) - 1
+    # The maps are the layers of a volume, and all pixels lie in the middle of a layer. Far outside is brought
+    # near: large numbers are not exact.
+    layer = ((2 * image + 1) / count - 1).to(grid)[..., None]
+    grid = torch.cat((grid.clamp(-3, 3), layer), -1).reshape(1, 1, 1, -1, 3)
+    found = F.grid_sample(maps.transpose(0, 1)[None], grid, align_corners=False)
+    return found[0, :, 0, 0].mT.reshape(*image.shape, -1)

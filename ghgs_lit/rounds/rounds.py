@@ -1,0 +1,164 @@
+"""Rounds that look again: the inputs are rendered, compared with the photographs, the Gaussians corrected.
+
+One forward pass guesses depths and attributes and never checks them, although checking is cheap: the
+rasterizer draws the inputs in milliseconds. Each round shows every Gaussian what the photographs say about it
+where it is now (:mod:`ghgs_lit.rounds.observation`), and a small network, the same in all rounds, moves it
+along its ray and changes its raw attributes. Feeding errors of re-rendered inputs back is the idea of learned
+optimizers of splats (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025).
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.geometry.projection import at_least_float32, unproject_maps
+from ghgs_lit.heads.activations import bounded_tanh
+from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
+from ghgs_lit.rounds.observation import CHANNELS, observe
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points
+
+#: Of :class:`Search`: how far from near to far a Gaussian is, and the distance between them.
+_PLACE = 2
+
+
+@dataclass(frozen=True)
+class Search:
+    """Depths around the current one, of each Gaussian.
+
+    ``matches`` is the photo-consistency at depths from ``down`` metres before to ``up`` metres behind it.
+    """
+
+    matches: Float[Tensor, "N s"]
+    place: Float[Tensor, "N 2"]
+    down: Float[Tensor, " N"]
+    up: Float[Tensor, " N"]
+
+
+@dataclass(frozen=True)
+class State:
+    """What a round starts from, and what it gives; the first state is what the stages found."""
+
+    raw: RawGaussians
+    gaussians: Gaussians
+    points: Points
+    depth_maps: DepthMaps
+
+
+#: Gaussians from raw attributes at points: ``GaussianHead.activate``.
+Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
+
+
+class Rounds(nn.Module):
+    """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
+
+    Each round can change half as much as the one before, depths stay between near and far and attributes
+    within the bounds of their activations: more rounds than were trained do not diverge.
+
+    Args:
+        channels: of the Gaussian head's descriptors.
+        count: number of rounds outside of training.
+        training_counts: numbers of rounds, of which each training step draws one, so that any number works.
+        hidden: width of the network.
+        depths: at how many depths around the current one a round compares the photographs.
+        reach: how far these lie from it in the first round, as a share of the distance from near to far.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        count: int = 2,
+        training_counts: Sequence[int] = (1, 2, 3),
+        hidden: int = 48,
+        depths: int = 8,
+        reach: float = 0.25,
+    ):
+        super().__init__()
+        require(count >= 1, "rounds.count", "1 or more", count)
+        drawn = len(training_counts) > 0 and min(training_counts) >= 1
+        require(drawn, "rounds.training_counts", "numbers of 1 or more", list(training_counts))
+        require(0 < reach <= 1, "rounds.reach", "a share above 0, at most 1", reach)
+        self.count, self.training_counts = count, tuple(training_counts)
+        self.depths, self.reach = depths, reach
+        self.view = nn.Sequential(
+            nn.Linear(CHANNELS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
+        )
+        self.start = nn.Linear(channels, hidden)
+        inputs = 4 * hidden + depths + _PLACE + 3
+        self.update = nn.Sequential(
+            nn.Linear(inputs, 2 * hidden), nn.ReLU(), nn.Linear(2 * hidden, hidden), nn.ReLU()
+        )
+        self.memory = nn.Linear(hidden, hidden)
+        self.change = nn.Sequential(nn.Linear(hidden, 1 + RAW_VALUES))
+        nn.init.zeros_(self.change[-1].weight)
+        nn.init.zeros_(self.change[-1].bias)
+
+    def forward(self, state: State, activate: Activate, batch: Batch) -> tuple[State, ...]:
+        """The state before the first round and after each.
+
+        Args:
+            state: what the stages found; its depths have bounds.
+            activate: of the Gaussian head.
+            batch: photographs, masks and cameras are read.
+        """
+        states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
+        for number in range(self._drawn() if self.training else self.count):
+            change, memory = self._round(states[-1], batch, memory, 0.5**number)
+            states.append(_moved(states[-1], activate, batch, *change))
+        return tuple(states)
+
+    def _drawn(self) -> int:
+        return self.training_counts[int(torch.randint(len(self.training_counts), ()))]
+
+    def _round(
+        self, state: State, batch: Batch, memory: Tensor, size: float
+    ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """New depths and changes of raw attributes, and what the next round remembers."""
+        gaussians = state.gaussians.detach()
+        each = observe(gaussians, batch)
+        search = self._search(state, batch, size * self.reach)
+        views, is_own = self.view(each), each[..., -1:]
+        others = views * (1 - is_own)
+        seen = ((views * is_own).sum(1), others.sum(1) / max(1, views.shape[1] - 1), others.amax(1))
+        known = (search.matches, search.place, gaussians.colors)
+        memory = torch.tanh(memory + self.memory(self.update(torch.cat((*seen, *known, memory), -1))))
+        change = float32_last(self.change, memory)
+        step = bounded_tanh(change[:, 0])
+        moved = torch.where(step > 0, search.up, search.down) * step
+        return (moved, size * change[:, 1:]), memory
+
+    @torch.no_grad()
+    def _search(self, state: State, batch: Batch, reach: float) -> Search:
+        maps, raw = state.depth_maps, state.raw
+        depth, near, far = (
+            at_least_float32(z).detach() for z in (maps.depth, maps.bounds.near, maps.bounds.far)
+        )
+        half = reach * (far - near)
+        # Rounding may have put a depth a little outside its bounds.
+        low, high = torch.minimum(torch.maximum(depth - half, near), depth), torch.minimum(depth + half, far)
+        high = torch.maximum(high, depth)
+
+        def at(values: Float[Tensor, "B V *s H W"]) -> Float[Tensor, "N *s"]:
+            return values.flatten(0, 1).flatten(-2)[raw.image, ..., raw.pixel]
+
+        thickness = at(far - near)
+        share = at(depth - near) / torch.where(thickness > 0, thickness, 1)
+        matches = at(photo_consistency(batch, DepthBounds(low, high), self.depths))
+        return Search(matches, torch.stack((share, thickness), -1), at(depth - low), at(high - depth))
+
+
+def _moved(
+    state: State, activate: Activate, batch: Batch, moved: Float[Tensor, " N"], change: Float[Tensor, "N c"]
+) -> State:
+    """The state with Gaussians moved by metres along their rays and raw attributes changed."""
+    raw, maps = state.raw.changed(change), state.depth_maps
+    depth, place = maps.depth.flatten(0, 1).flatten(1), (raw.image, raw.pixel)
+    depth = depth.index_put(place, depth[place] + moved).view_as(maps.depth)
+    maps = dataclasses.replace(maps, depth=depth)
+    points = dataclasses.replace(state.points, pixels=unproject_maps(depth, batch.cameras))
+    return State(raw, activate(raw, batch, points, maps), points, maps)

@@ -1,0 +1,106 @@
+"""What photographs show of Gaussians, against slow loops and SciPy."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import map_coordinates
+
+from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.rounds.observation import CHANNELS, observe, sample
+from ghgs_lit.types import Gaussians
+from tests.helpers.scenes import make_batch
+
+
+def splats(batch):
+    """A small opaque Gaussian at the true point of each pixel of the subject."""
+    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    means = unproject_maps(batch.depths, batch.cameras).flatten(0, 1).flatten(1, 2)[image, pixel]
+    own = batch.images.flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
+    n = len(means)
+    return Gaussians(
+        means,
+        torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
+        torch.full((n, 3), 0.004),
+        torch.full((n,), 0.9),
+        own,
+        tuple(batch.masks.flatten(1).sum(1).tolist()),
+        image,
+        pixel,
+    )
+
+
+def test_sampling_is_bilinear_and_0_outside():
+    generator = torch.Generator().manual_seed(0)
+    maps = torch.rand(5, 2, 9, 7, generator=generator)
+    image = torch.randint(5, (40,), generator=generator)
+    pixels = torch.rand(40, 2, generator=generator) * torch.tensor([7.0, 9.0])
+    found = sample(maps, image, pixels)
+    for n in range(40):
+        place = (pixels[n].flip(0) - 0.5).double().numpy()[:, None]
+        for c in range(2):
+            expected = map_coordinates(
+                np.pad(maps[image[n], c].double().numpy(), 1), place + 1, order=1, mode="constant"
+            )[0]
+            assert abs(found[n, c].item() - expected) < 1e-5
+    assert not sample(maps, image[:2], torch.tensor([[-1e9, 3.0], [3.0, 1e9]])).any()
+
+
+def test_a_gaussian_sees_itself_in_its_own_view():
+    """Colour equal to the photograph's, inside the mask, not hidden."""
+    batch = make_batch(2, 3)
+    gaussians = splats(batch)
+    each = observe(gaussians, batch)
+    assert each.shape == (len(gaussians), 3, CHANNELS)
+    own = each[torch.arange(len(gaussians)), gaussians.image % 3]
+    assert own[:, :3].abs().max() < 1e-3  # the photograph's colour is its own
+    assert (own[:, 6] - 1).abs().max() < 1e-3  # inside the mask
+    assert (own[:, 9] == 1).all()
+    assert (own[:, 10] == 1).all()
+    assert each[..., 10].sum(1).eq(1).all()
+
+
+def test_what_lies_behind_the_surface_is_hidden():
+    """Against the true depths of the pixels that Gaussians fall on."""
+    batch = make_batch(1, 4)
+    gaussians = splats(batch)
+    behind = observe(gaussians, batch)[..., 8]
+    for view in range(4):
+        camera = batch.cameras[0, view]
+        pixels, z = project(gaussians.means, camera.intrinsics, camera.extrinsics)
+        column, row = pixels.long().clamp(0, 55).unbind(-1)
+        surface = batch.depths[0, view, row, column]
+        hidden = (surface > 0) & (z - surface > 0.15)
+        assert hidden.sum() > 50
+        assert (behind[hidden, view] > 0.9).all()
+        own = gaussians.image == view
+        assert behind[own, view].abs().mean() < 0.3
+
+
+def test_batch_mates_change_nothing():
+    both = make_batch(2, 3)
+    gaussians = splats(both)
+    each = observe(gaussians, both)
+    for b in range(2):
+        alone = dataclasses.replace(
+            both,
+            images=both.images[b : b + 1],
+            masks=both.masks[b : b + 1],
+            cameras=both.cameras[b : b + 1],
+            depths=None,
+        )
+        own = gaussians[b]
+        own = dataclasses.replace(own, image=own.image - 3 * b)
+        found = observe(own, alone)
+        chosen = gaussians.image // 3 == b
+        assert torch.allclose(found, each[chosen], atol=1e-5)
+
+
+@pytest.mark.parametrize("means", [torch.tensor([[0.1, 0.9, 50.0]]), torch.tensor([[1e6, 0.0, 0.0]])])
+def test_outside_of_all_images_everything_is_0(means):
+    batch = make_batch(1, 2)
+    one = splats(batch).select(slice(0, 1), (1,))
+    each = observe(dataclasses.replace(one, means=means), batch)
+    assert each.isfinite().all()
+    assert not each[each[..., 9] == 0][:, :9].any()

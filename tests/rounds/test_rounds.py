@@ -1,0 +1,117 @@
+"""Rounds: where they start, that they stay within bounds, that they learn."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.losses import terms
+from ghgs_lit.model import GHGS
+from ghgs_lit.rendering import render
+from tests.helpers.models import ATTRIBUTES, close, config, make_model
+from tests.helpers.scenes import make_batch
+
+RECURRENT = ("model=recurrent", "skip=exact", "rounds.hidden=16", "rounds.depths=4")
+
+
+def model(*overrides, kick=0.0, seed=0):
+    found = make_model(*RECURRENT, *overrides, seed=seed).eval()
+    if kick:
+        torch.nn.init.normal_(found.rounds.change[-1].weight, std=kick)
+    return found
+
+
+def test_untrained_rounds_change_nothing():
+    batch, recurrent = make_batch(2, 3), model()
+    with torch.no_grad():
+        found = recurrent(batch)
+        recurrent.rounds = None
+        expected = recurrent(batch)
+    assert torch.equal(found.depth, expected.depth)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
+    assert len(found.rounds) == 3
+    assert len(found.drafts) == 2
+    assert found.depth is found.rounds[-1].depth
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_more_rounds_than_trained_stay_within_bounds(count):
+    """Whatever the weights are: depths between near and far, everything finite."""
+    batch = make_batch(1, 4)
+    wild = model(kick=30.0)
+    wild.rounds.count = count
+    with torch.no_grad():
+        found = wild(batch)
+    assert len(found.rounds) == count + 1
+    for maps in found.rounds[1:]:
+        depth, bounds = maps.depth[maps.valid], maps.bounds
+        slack = 1e-5 * depth
+        assert (depth >= bounds.near[maps.valid] - slack).all()
+        assert (depth <= bounds.far[maps.valid] + slack).all()
+    for name in ATTRIBUTES:
+        assert getattr(found.gaussians, name).isfinite().all(), name
+    assert (found.rounds[-1].depth != found.rounds[0].depth)[batch.masks].float().mean() > 0.9
+
+
+def test_a_batch_equals_its_elements_and_the_order_of_other_views_does_not_matter():
+    batch, kicked = make_batch(2, 4), model(kick=0.5)
+    with torch.no_grad():
+        together = kicked(batch)
+        alone = [
+            kicked(
+                dataclasses.replace(
+                    batch,
+                    images=batch.images[b : b + 1],
+                    masks=batch.masks[b : b + 1],
+                    cameras=batch.cameras[b : b + 1],
+                    depths=None,
+                )
+            )
+            for b in range(2)
+        ]
+    for b in range(2):
+        close(together.gaussians[b], alone[b].gaussians, 2e-4)
+
+
+def test_gradients_reach_every_weight_and_every_round_is_supervised():
+    batch = make_batch(1, 3)
+    kicked = model(kick=0.1).train()
+    prediction = kicked(batch)
+    rendering = render(prediction.gaussians, batch.cameras)
+    loss = (rendering.image - batch.images).abs().mean() + terms.depth(prediction, rendering, batch)
+    loss.backward()
+    for name, parameter in kicked.rounds.named_parameters():
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+    assert any(p.grad is not None and p.grad.any() for p in kicked.encoder.parameters())
+    error = [
+        (m.depth - batch.depths).abs()[batch.masks & (batch.depths > 0)].mean() for m in prediction.rounds
+    ]
+    assert torch.isclose(terms.depth(prediction, rendering, batch), torch.stack(error).mean(), rtol=1e-5)
+
+
+def test_half_precision_gives_finite_values():
+    batch, kicked = make_batch(1, 3), model(kick=0.5)
+    with torch.no_grad(), torch.autocast("cpu", dtype=torch.bfloat16):
+        found = kicked(batch)
+    for name in ATTRIBUTES:
+        value = getattr(found.gaussians, name)
+        assert value.dtype == torch.float32, name
+        assert value.isfinite().all(), name
+
+
+def test_options_are_checked():
+    with pytest.raises(InputError, match=r"rounds\.reach"):
+        GHGS.from_config(config(*RECURRENT, "rounds.reach=0"))
+    with pytest.raises(InputError, match=r"rounds: expected .* bounds"):
+        GHGS.from_config(
+            config(
+                *RECURRENT,
+                "bounds=none",
+                "depth_head.parameterization=inverse_linear",
+                "depth_head.consistency_depths=0",
+                "encoder.bounds_input=false",
+            )
+        )
