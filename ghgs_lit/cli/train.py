@@ -152,12 +152,13 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     model.feature_cache = open_cache(config.get("feature_cache"), model.recalibration.tokens)
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
-    renderer = build(config["renderer"], "renderer")
+    renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")
+    data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
     budgets = config.get("token_budgets")
     module = GHGSModule(
         model,
         renderer,
-        build(config["loss"], "loss"),
+        losses,
         build(config["optimizer"], "optimizer"),
         config,
         None if budgets is None else TokenBudgets(budgets),

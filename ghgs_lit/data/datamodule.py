@@ -1,5 +1,6 @@
 """The LightningDataModule of all data sets: a data set, protocols and options turned into loaders."""
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -72,6 +73,8 @@ class PhotographsDataModule(LightningDataModule):
         self.targets = from_config(TargetProtocol, "targets", targets)
         self.dataset.check_targets(self.targets)
         self.seed = seed
+        #: Whether training reads depth maps; evaluation reads them all the same, for its depth error.
+        self.trains_on_depths = self.options.depths
         self._builders: dict[str, BatchBuilder] = {}
 
     @property
@@ -115,7 +118,8 @@ class PhotographsDataModule(LightningDataModule):
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(sampler.subjects) / (self.options.batch_size * world))
         length = self.options.steps_per_epoch or once
-        batches = TrainingBatches(self.builder("train"), sampler, length, rank, world)
+        builder = dataclasses.replace(self.builder("train"), depths=self.trains_on_depths)
+        batches = TrainingBatches(builder, sampler, length, rank, world)
         return self._loader(
             batches, sampler=StepSampler(batches, lambda: trained_batches(self.trainer, length))
         )

@@ -55,6 +55,11 @@ class Losses:
         self.weights = {name: float(weight) for name, weight in weights.items() if weight > 0}
         require(bool(self.weights), "loss.weights", "at least one weight above 0", dict(weights))
 
+    @property
+    def reads_depths(self) -> bool:
+        """Whether a term compares with true depths."""
+        return "depth" in self.weights
+
     def __call__(
         self, prediction: Prediction, rendering: Rendering, batch: Batch
     ) -> tuple[Tensor, dict[str, Tensor]]:

@@ -206,6 +206,16 @@ def test_data_without_depth_or_body_says_none(root, tmp_path):
     assert batch.body_vertices is None
 
 
+def test_training_reads_depths_where_a_loss_does(root):
+    """Decoding depth maps that nothing reads is wasted; the depth error needs them in validation."""
+    data = module(root)
+    assert next(iter(data.train_dataloader())).depths is not None
+    data.trains_on_depths = False
+    assert next(iter(data.train_dataloader())).depths is None
+    assert next(iter(data.val_dataloader())).depths is not None
+    assert not module(root, depths=False).trains_on_depths
+
+
 class Recorder(LightningModule):
     """Trains one number and notes what it saw."""
 

@@ -166,7 +166,10 @@ def test_the_total_is_the_weighted_sum_of_reference_terms():
 def test_terms_of_weight_zero_are_not_computed():
     """A term with weight 0 needs no data."""
     prediction, rendering, batch = _example(body=False, depths=False)
-    total, values = Losses({"render_l1": 1.0, "chamfer": 0.0, "depth": 0.0})(prediction, rendering, batch)
+    losses = Losses({"render_l1": 1.0, "chamfer": 0.0, "depth": 0.0})
+    total, values = losses(prediction, rendering, batch)
+    assert not losses.reads_depths
+    assert Losses({"depth": 0.5}).reads_depths
     assert list(values) == ["render_l1"]
     assert total == values["render_l1"]
 
