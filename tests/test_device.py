@@ -143,6 +143,18 @@ def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywh
         close(GHGS.from_checkpoint(path)(batch).gaussians, found.gaussians)
 
 
+def test_batches_are_copied_there_without_a_wait():
+    """From pinned memory such copies run beside the step before."""
+    module = GHGSModule(make_model("model=hull"), REFERENCE, Losses(WEIGHTS), Optimization(lr=1e-3), {})
+    with pretend_device() as log:
+        batch = module.transfer_batch_to_device(full_batch(), DEVICE, 0)
+        assert log.calls.total() >= 8
+        assert log.waits.total() == 0
+        full_batch().to(DEVICE)
+        assert log.waits.total() >= 8
+    assert batch.body_vertices[0].device == batch.targets.cameras.extrinsics.device == DEVICE
+
+
 def test_everything_is_measured_there(tmp_path):
     """The model and all baselines with all metrics and pictures: the rows are those of the CPU."""
     metrics = ImageMetrics(regions=("image", "box", "subject"), lpips="off")

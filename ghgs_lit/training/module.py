@@ -74,6 +74,10 @@ class GHGSModule(L.LightningModule):
         self.clock.mark("render")
         return prediction, rendering
 
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        # Lightning copies structures that it does not know one tensor after the other, and waits for each.
+        return batch.to(device, non_blocking=device.type != "cpu")
+
     def on_train_start(self) -> None:
         # After a restart the scheduler asks for the first time when a step has been taken.
         self.used_budget = self.progress()
