@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
+from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from ghgs_lit import encoder, recalibration
 
@@ -40,8 +40,17 @@ def _cpu_attention(query: tuple, key: tuple, value: tuple, *_: Any, **__: Any) -
     return sdpa_flop_count(query, key, value)
 
 
+def _cpu_attention_backward(
+    gradient: tuple, query: tuple, key: tuple, value: tuple, *_: Any, **__: Any
+) -> int:
+    return sdpa_backward_flop_count(gradient, query, key, value)
+
+
 #: PyTorch's attention on a CPU, which its own counter does not know.
-_UNKNOWN = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _cpu_attention}
+_UNKNOWN = {
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _cpu_attention,
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward: _cpu_attention_backward,
+}
 
 
 class FlopsProbe:

@@ -71,9 +71,9 @@ def top_level(names: Any) -> list[str]:
 @torch.no_grad()
 def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Probe) -> tuple[Prediction, Rendering]:
     """Predict the Gaussians of a batch and render its targets, while ``probe`` watches."""
-    with watched(model, probe), _inside(TOTAL, probe):
+    with watched(model, probe), inside(TOTAL, probe):
         prediction = model(dataclasses.replace(batch, targets=None))
-        with _inside(RENDER, probe):
+        with inside(RENDER, probe):
             rendering = renderer(prediction.gaussians, batch.targets.cameras)
     return prediction, rendering
 
@@ -94,7 +94,8 @@ def watched(model: GHGS, probe: Probe) -> Iterator[None]:
 
 
 @contextmanager
-def _inside(name: str, probe: Probe) -> Iterator[None]:
+def inside(name: str, probe: Probe) -> Iterator[None]:
+    """Let ``probe`` see the stage ``name`` while the context lasts."""
     probe.begin(name)
     yield
     probe.end(name)
@@ -129,7 +130,7 @@ class _Watched:
         self._stage, self._name, self._probe = stage, name, probe
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        with _inside(self._name, self._probe):
+        with inside(self._name, self._probe):
             return self._stage(*arguments, **options)
 
     def __getattr__(self, name: str) -> Any:

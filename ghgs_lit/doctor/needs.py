@@ -1,4 +1,4 @@
-"""What a configuration needs: parameters, and the memory that weights and training state take."""
+"""The parameters of a configuration, by stage."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,27 +9,14 @@ from torch import nn
 
 from ghgs_lit.model import GHGS, HEADS
 
-#: Bytes of a trained parameter beside its weight, in float32: a gradient and AdamW's two moments.
-_TRAINED = 3 * 4
-
 
 @dataclass(frozen=True)
 class Needs:
-    """Of one stage: parameters, those that are trained, and bytes of weights and of the training's state."""
+    """Of one stage: parameters, and those that are trained."""
 
     stage: str
     parameters: int
     trained: int
-
-    @property
-    def weights(self) -> int:
-        """Bytes in float32."""
-        return 4 * self.parameters
-
-    @property
-    def training(self) -> int:
-        """Bytes of weights, gradients and AdamW's moments in float32."""
-        return self.weights + _TRAINED * self.trained
 
 
 def needs(config: Mapping[str, Any]) -> list[Needs]:

@@ -187,12 +187,13 @@ def test_memory_of_a_stage_counts_for_the_stages_around_it_alone():
 @pytest.mark.parametrize("share", [0.05, 0.15, 0.6])
 def test_the_subject_covers_the_asked_part_of_the_frame(share):
     """The study varies the share; the mask must have it, in every view."""
-    assert ellipse(share, 280).float().mean().item() == pytest.approx(share, rel=0.02)
+    for size in ((280, 280), (420, 280), (210, 280)):
+        assert ellipse(share, size).float().mean().item() == pytest.approx(share, rel=0.02)
     batch = ellipsoid_batch(share, 3, 56, 2)
     assert batch.masks.float().mean((-2, -1)).sub(share).abs().max() < 0.02
     assert batch.images.shape == (2, 3, 3, 56, 56)
-    with pytest.raises(InputError, match=r"scaling\.share"):
-        ellipse(0.75, 56)
+    with pytest.raises(InputError, match="share"):
+        ellipse(0.75, (56, 56))
 
 
 def test_knobs_are_combined_and_checked():

@@ -5,11 +5,10 @@ import importlib.metadata
 import torch
 
 from ghgs_lit.cli import doctor_machine
-from ghgs_lit.cli.doctor_machine import advice
 from ghgs_lit.doctor.machine import machine_lines, missing_extras
-from ghgs_lit.doctor.needs import Needs, needs
+from ghgs_lit.doctor.needs import needs
 from ghgs_lit.model import GHGS
-from tests.helpers.models import config
+from tests.helpers.models import TINY, config
 from tests.helpers.verbs import ghgs
 
 
@@ -28,37 +27,33 @@ def test_the_machine_is_described():
     assert {"processor", "threads", "memory", "renderer", "compiled kernels"} <= set(found)
 
 
-def test_parameters_and_bytes_are_those_of_the_model():
+def test_parameters_are_those_of_the_model():
     """The meta device gives what a built model has."""
     for trainable in ("all", "none"):
         described = config("model=hull", f"encoder.trainable={trainable}")
         found = {n.stage: n for n in needs(described)}
         model = GHGS.from_config(described)
         assert found["model"].parameters == sum(p.numel() for p in model.parameters())
-        trained = sum(p.numel() for p in model.parameters() if p.requires_grad)
-        assert found["model"].training == 4 * found["model"].parameters + 12 * trained
+        assert found["model"].trained == sum(p.numel() for p in model.parameters() if p.requires_grad)
         assert found["encoder"].trained == (found["encoder"].parameters if trainable == "all" else 0)
 
 
-def test_what_does_not_fit_is_said_with_the_key_that_helps():
-    """Training takes four times the weights."""
-    described = config("model=hull")
-    large = Needs("model", 10**9, 10**9)
-    said = "\n".join(advice(large, described, free=10 * 10**9))
-    assert "prediction: 4.0 GB of 10.0 GB fits" in said
-    assert "training: 16.0 GB of 10.0 GB does not fit" in said
-    assert "encoder.trainable=none" in said
-    assert "encoder.trainable" not in "\n".join(advice(large, described, free=20 * 10**9))
-
-
-def test_the_verb_prints_machine_and_needs(tmp_path, capsys, monkeypatch):
-    """An experiment is described without its data; brackets are no markup."""
+def test_the_verb_says_what_fits_and_which_keys_make_it_fit(tmp_path, capsys, monkeypatch):
+    """A data set is described without its files; brackets are no markup."""
     missing = [("magic", "x missing: pip install 'ghgs-lit[magic]'")]
     monkeypatch.setattr(doctor_machine, "missing_extras", lambda: missing)
-    code = ghgs("doctor", "task=machine", "experiment=thuman2", "device=cpu", f"hydra.run.dir={tmp_path}")
+    code = ghgs(
+        "doctor", "task=machine", *TINY, "data=thuman2", "data.size=56", "loss=depth", "device=cpu",
+        "gpu_memory=0.006", f"hydra.run.dir={tmp_path}",
+    )  # fmt: skip
     out = capsys.readouterr().out
     assert code == 0
     assert "This machine" in out
     assert "ghgs-lit[magic]" in out
-    assert "recalibration" in out
-    assert "before activations" in out
+    assert "4 views of 56 x 56, the subject on 15% of the frame" in out
+    lines = {line.split(": ")[0].strip(): line for line in out.splitlines() if "fit" in line}
+    assert lines["training step"].endswith("of 6.0 MB does not fit")
+    assert {"prediction", "skip=fast", "encoder.checkpointing=true", "trainer.precision=bf16-mixed"} < set(
+        lines
+    )
+    assert "all of them" in lines
