@@ -16,7 +16,8 @@ Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -143,6 +144,47 @@ class Batch(_TensorStruct):
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
 
+    @cached_property
+    def extents(self) -> list["Extent"]:
+        """Of the subject in each image ``b * V + v``; the host waits for a GPU when they are first read."""
+        return extents(self.masks.flatten(0, 1))
+
+    @cached_property
+    def pixels(self) -> Int[Tensor, " n"]:
+        """Indices of the subject's pixels among those of all images."""
+        return true_places(self.masks, sum(extent.count for extent in self.extents))
+
+
+class Extent(NamedTuple):
+    """How many pixels a mask has, and the rows and columns from the first of them to the last.
+
+    The ends are excluded. Of an empty mask only ``count`` has a meaning.
+    """
+
+    count: int
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+
+def extents(masks: Bool[Tensor, "n H W"]) -> list[Extent]:
+    """Of each mask; the host waits for a GPU once."""
+    found = [masks.sum((1, 2))]
+    for lines in (masks.any(2).to(torch.uint8), masks.any(1).to(torch.uint8)):
+        found += [lines.argmax(1), lines.shape[1] - lines.flip(1).argmax(1)]
+    return [Extent(*numbers) for numbers in torch.stack(found, dim=1).tolist()]
+
+
+def true_places(mask: Bool[Tensor, "..."], count: int) -> Int[Tensor, " count"]:
+    """Flat indices of the ``count`` True values: as ``nonzero``, for whose number the host waits."""
+    flat = mask.flatten()
+    if flat.device.type == "cpu":
+        return flat.nonzero()[:, 0]
+    index = torch.arange(len(flat), device=flat.device)
+    target = torch.where(flat, flat.cumsum(0) - 1, count)  # the last place is for all others
+    return index.new_empty(count + 1).scatter_(0, target, index)[:count]
+
 
 @dataclass(frozen=True)
 class DepthBounds(_TensorStruct):
@@ -186,6 +228,19 @@ class Tokens(_TensorStruct):
             row=self.row[index],
             column=self.column[index],
         )
+
+    def of_images(self, images: slice) -> "Tokens":
+        """The tokens of consecutive images, as of one element; the host may wait for a GPU."""
+        b, v, h, w = self.grid
+        if images == slice(0, b * v):
+            part = self
+        elif self.is_dense:
+            part = self.select(slice(images.start * h * w, images.stop * h * w))
+        else:
+            ends = torch.tensor((images.start, images.stop), device=self.image.device)
+            part = self.select(slice(*torch.searchsorted(self.image, ends).tolist()))
+        grid = (1, images.stop - images.start, h, w)
+        return dataclasses.replace(part, image=part.image - images.start, grid=grid)
 
     def maps(self, layer: int) -> Float[Tensor, "BV C h w"]:
         """One layer on the token grid; 0 at patches whose tokens were not kept."""

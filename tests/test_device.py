@@ -206,6 +206,22 @@ def test_predict_runs_there(tmp_path, monkeypatch):
     assert list((tmp_path / "run").glob("*.ply"))
 
 
+@pytest.mark.parametrize(
+    "overrides", [["model=hull"], ["model=paper"], ["model=hull", "skip=fast"]], ids=" ".join
+)
+def test_the_host_waits_at_most_four_times(overrides):
+    """For the check of the batch, the subject's extent, and the numbers of tokens and Gaussians."""
+    waits = []
+    for size in (1, 2):
+        with torch.no_grad(), pretend_device(True) as log:
+            model, batch = make_model(*overrides).eval().to(DEVICE), make_batch(size, 4, 56, 42).to(DEVICE)
+            log.clear()
+            model(batch)
+        waits.append(log.waits.total())
+        assert waits[-1] <= 4 + ("skip=fast" in overrides), log.waits.most_common()
+    assert waits[0] == waits[1]
+
+
 class Planted:
     """A stage with a defect in front of it."""
 

@@ -101,7 +101,7 @@ def subject_box(
     center = _center(masks, cameras)
     reach = _reach(masks, cameras, center)[:, None]
     lower, upper = center - reach, center + reach
-    focal = at_least_float32(cameras.intrinsics)[..., [0, 1], [0, 1]].amax(-1)
+    focal = _focal_lengths(cameras).amax(-1)
     for _ in range(2):
         cell = (upper - lower) / cells
         depth = _project_one((lower + upper) / 2, cameras)[1]
@@ -129,20 +129,22 @@ def _carve(
     matrices = projection_matrices(cameras)
     if cpu.is_supported(matrices, position):
         return cpu.carve(outside, matrices, position, tolerance)
-    element = torch.arange(len(lower), device=lower.device)[:, None, None, None]
-    votes = torch.zeros(len(lower), *3 * (cells,), dtype=torch.uint8, device=lower.device)
-    for v in range(outside.shape[1]):
-        x, y, z = (matrices[:, v, :, axis, None] * position[:, None, axis] for axis in range(3))
-        z = z + matrices[:, v, :, 3, None]
-        pixel = (x[..., :, None] + y[..., None, :])[..., None] + z[..., None, None, :]
-        votes += look_up(outside[:, v], element, *pixel.unbind(1))
-    return votes <= tolerance
+    x, y, z = (matrices[..., axis, None] * position[:, None, None, axis] for axis in range(3))
+    z = z + matrices[..., 3, None]
+    pixel = (x[..., :, None] + y[..., None, :])[..., None] + z[..., None, None, :]
+    image = torch.arange(outside[..., 0, 0].numel(), device=lower.device).view(*outside.shape[:2], 1, 1, 1)
+    votes = look_up(outside.flatten(0, 1), image, *pixel.unbind(2))
+    return votes.sum(1) <= tolerance
 
 
 def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Pixel [B, V, 2] and depth [B, V] of one point of each element in all of its cameras."""
     points = points[:, None].expand(*cameras.shape, 3)
     return project(points, cameras.intrinsics, cameras.extrinsics)
+
+
+def _focal_lengths(cameras: Cameras) -> Float[Tensor, "B V 2"]:
+    return at_least_float32(cameras.intrinsics).diagonal(dim1=-2, dim2=-1)[..., :2]
 
 
 def _center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
@@ -178,6 +180,6 @@ def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tenso
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
         for dim, line in enumerate(pixel_axes(cameras))
     ]
-    extent = torch.stack(extents, -1) / at_least_float32(cameras.intrinsics)[..., [0, 1], [0, 1]]
+    extent = torch.stack(extents, -1) / _focal_lengths(cameras)
     # More than what is seen: what reaches away from a camera looks smaller than it is.
     return 1.4 * (extent.norm(dim=-1) * depth.clamp(min=NEAREST)).amax(1).clamp(min=0.05)

@@ -40,9 +40,8 @@ class VisualHull(SubjectBox):
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
         # One cell at least: the rays of a cell's pixels run beside the ray of its centre.
-        hull = hull_bounds(
-            coarse.masks, coarse.cameras, start, max(coarse.dilation, 1), self.tolerance, self.samples
-        )
+        radius, rays = max(coarse.dilation, 1), batch.pixels if coarse.stride == 1 else None
+        hull = hull_bounds(coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays)
         near, far = (_enlarge(x, coarse.stride, batch.masks.shape[-2:]) for x in (hull.near, hull.far))
         return self._valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
 
@@ -54,6 +53,7 @@ def hull_bounds(
     radius: int,
     tolerance: int = 0,
     samples: int = 48,
+    rays: Int[Tensor, " r"] | None = None,
 ) -> DepthBounds:
     """First and last depth within ``start`` that the dilated masks of the other views allow.
 
@@ -66,6 +66,7 @@ def hull_bounds(
         radius: dilation of the masks in pixels.
         tolerance: how many other views may say "outside" of a depth that is allowed.
         samples: depths that are tried along each ray.
+        rays: indices of the masks' pixels, where they are known.
     """
     outside = votes_outside(dilate(masks, radius), masks)
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
@@ -74,8 +75,8 @@ def hull_bounds(
     if cpu.is_supported(near, directions, matrices):
         cpu.march(outside, masks, matrices, directions, cameras.centers, near, far, steps, tolerance)
         return DepthBounds(near, far)
-    rays = masks.flatten().nonzero()[:, 0]
-    for part in even_parts(len(rays), _DEPTHS // samples):
+    rays = masks.flatten().nonzero()[:, 0] if rays is None else rays
+    for part in even_parts(len(rays), _DEPTHS // (samples * (masks.shape[1] - 1))):
         _march(rays[part], outside, matrices, directions, cameras.centers, near, far, steps, tolerance)
     return DepthBounds(near, far)
 
@@ -98,15 +99,14 @@ def _march(
     length = end - begin
     depth = begin[:, None] + steps * length[:, None]
     direction, center = directions.reshape(-1, 1, 3)[rays], centers.reshape(-1, 1, 3)[image]
-    votes = torch.zeros(depth.shape, dtype=torch.uint8, device=depth.device)
-    for turn in range(1, views):
-        other = image // views * views + (image + turn) % views
-        matrix = matrices.flatten(0, 1)[other]
-        along = (matrix[..., :3] * direction).sum(-1)
-        origin = (matrix[..., :3] * center).sum(-1) + matrix[..., 3]
-        pixel = [torch.addcmul(origin[:, i, None], depth, along[:, i, None]) for i in range(3)]
-        votes += look_up(outside.flatten(0, 1), other[:, None], *pixel)
-    inside = (votes <= tolerance).to(torch.uint8)
+    turn = torch.arange(1, views, device=depth.device)
+    other = (image // views * views)[:, None] + (image[:, None] + turn) % views
+    matrix = matrices.flatten(0, 1)[other]
+    along = (matrix[..., :3] * direction[:, None]).sum(-1)
+    origin = (matrix[..., :3] * center[:, None]).sum(-1) + matrix[..., 3]
+    pixel = torch.addcmul(origin[..., None], depth[:, None, None], along[..., None])
+    votes = look_up(outside.flatten(0, 1), other[..., None], *pixel.unbind(2))
+    inside = (votes.sum(1) <= tolerance).to(torch.uint8)
     hit = inside.amax(1).bool()
     half = length / (2 * samples)
     first = depth.gather(1, inside.argmax(1, keepdim=True))[:, 0] - half

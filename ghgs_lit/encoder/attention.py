@@ -12,6 +12,10 @@ from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.rope import Rotary, rotate
 from ghgs_lit.errors import require
 from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.parts import even_parts
+
+#: Values of queries or keys that are rotated at once without a gradient (bounds memory).
+_ROTATED = 1 << 18
 
 
 class Attention(nn.Module):
@@ -50,8 +54,8 @@ class Attention(nn.Module):
             return norm(x)
         if torch.is_grad_enabled():
             return rotate(norm(x), rotary)
-        for head in x:  # one head at a time, so no second tensor of the full size is held
-            head.copy_(rotate(norm(head), rotary))
+        for heads in even_parts(len(x), _ROTATED // x[0].numel()):
+            x[heads] = rotate(norm(x[heads]), rotary)
         return x
 
 

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghgs_lit.types import true_places
+
 
 class KeptPatches:
     """The patches of a batch that take part, and their places among packed tokens.
@@ -22,9 +24,10 @@ class KeptPatches:
 
     def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):
         _, _, height, width = self.grid = tuple(kept.shape)
-        kept = kept.cpu()  # once: the lengths below are needed as numbers
-        self._counts = kept.flatten(2).sum(-1)
-        self.index = kept.flatten().nonzero()[:, 0].to(device)
+        self._counts = kept.cpu().flatten(2).sum(-1)  # the lengths below are needed as numbers
+        total = int(self._counts.sum())
+        is_whole = total == kept.numel()
+        self.index = torch.arange(total, device=device) if is_whole else true_places(kept.to(device), total)
         self.image = self.index // (height * width)
         self.row = self.index // width % height
         self.column = self.index % width
@@ -53,8 +56,8 @@ class KeptPatches:
             [B * V * s + N, C], in the wider precision of both.
         """
         images, count, width = special.shape
-        counts = self._counts.flatten().to(patches.device)
-        before = torch.arange(images, device=patches.device) * count + counts.cumsum(0) - counts
+        number = torch.arange(images, device=patches.device)
+        before = number * count + torch.searchsorted(self.image, number)
         places = before[:, None] + torch.arange(count, device=patches.device)
         dtype = torch.promote_types(special.dtype, patches.dtype)
         packed = patches.new_empty(images * count + len(patches), width, dtype=dtype)

@@ -54,8 +54,8 @@ def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V 
         result = cpu.sweep(colors, batch.masks, near, far, turn, shift, compared, shares, TOLERANCE)
         return result.permute(0, 1, 4, 2, 3)
     result = near.new_zeros(b * v * height * width, steps)
-    pixels = batch.masks.flatten().nonzero()[:, 0]
-    for part in even_parts(len(pixels), _SAMPLES // steps):
+    pixels = batch.pixels
+    for part in even_parts(len(pixels), _SAMPLES // (steps * (v - 1))):
         some = pixels[part]
         low, high = (bound.flatten()[some, None] for bound in (near, far))
         depth = low + (high - low) * shares
@@ -77,30 +77,35 @@ def _best_match(
     centers = F.pad(pixel_centers(height, width, depth).flatten(0, 1)[place], (0, 1), value=1.0)
     flat = colors.flatten(0, 1)
     own = flat.flatten(2)[image, :3, place]
-    best = torch.zeros_like(depth)
-    for turned in range(1, views):
-        k = (image + turned) % views
-        pair = image * views + k
-        rays = (turn.flatten(0, 2)[pair] * centers[:, None]).sum(-1)
-        found = _match(flat, image // views * views + k, own, rays, shift.flatten(0, 2)[pair], depth)
-        best = torch.maximum(best, found * compared.flatten()[pair, None])
-    return best
+    k = (image[:, None] + torch.arange(1, views, device=image.device)) % views
+    pair = image[:, None] * views + k
+    rays = (turn.flatten(0, 2)[pair] * centers[:, None, None]).sum(-1)
+    other = image[:, None] // views * views + k
+    found = _match(flat, other, own, rays, shift.flatten(0, 2)[pair], depth)
+    return torch.where(compared.flatten()[pair][..., None], found, 0).amax(1)
 
 
 def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tensor) -> Tensor:
-    """Agreement [n, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W] along their rays in them."""
-    points = rays[:, None] * depth[..., None] + shift[:, None]
-    z = points[..., 2:]
+    """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W].
+
+    Args:
+        images: colours and masks.
+        image: [n, o], the o others that each pixel is compared with.
+        own: of the pixels.
+        rays, shift: [n, o, 3], of the pixels in the others.
+        depth: [n, S].
+    """
+    points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
+    x, y, z = points.unbind(-1)
     front = z > 0
+    inverse = 2 / torch.where(front, z, 1.0)
     count, _, height, width = images.shape
-    size = points.new_tensor([width, height])
-    grid = points[..., :2] / torch.where(front, z, 1.0) * (2 / size) - 1
     # The images are the layers of a volume; all points lie in the middle of a layer.
-    layer = ((2 * image + 1) / count - 1).to(grid)[:, None, None].expand(*depth.shape, 1)
-    grid = torch.cat((grid, layer), -1)
-    seen = F.grid_sample(images.transpose(0, 1)[None], grid[None, None], align_corners=False)[0, :, 0]
-    difference = (seen[:3] - own.T[:, :, None]).abs().mean(0)
-    return torch.exp(-difference / TOLERANCE) * seen[3] * front[..., 0]
+    layer = ((2 * image + 1) / count - 1).to(depth)[..., None].expand_as(x)
+    grid = torch.stack((x * inverse / width - 1, y * inverse / height - 1, layer), -1)
+    seen = F.grid_sample(images.transpose(0, 1)[None], grid[None], align_corners=False)[0]
+    difference = (seen[:3] - own.T[:, :, None, None]).abs().mean(0)
+    return torch.exp(-difference / TOLERANCE) * seen[3] * front
 
 
 def _smooth(images: Tensor, masks: Tensor) -> Tensor:

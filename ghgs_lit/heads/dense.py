@@ -1,6 +1,5 @@
 """Dense heads whose widths follow the encoder's, run on windows around the subject."""
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -8,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.heads.dpt import DPTHead
-from ghgs_lit.heads.window import Span, Window, subject_windows
+from ghgs_lit.heads.window import Span, Window
 from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
 
@@ -51,18 +50,14 @@ class Part:
     window: Window
     maps: Float[Tensor, "n o h w"]
 
-    def cut(self, values: Tensor) -> Tensor:
-        """The same images and window of whole maps [B, V, H, W, ...]."""
-        return values.flatten(0, 1)[self.images, *self.window.slices]
-
 
 def decode(
     dpt: DPTHead,
     tokens: Tokens,
     guide: Float[Tensor, "b v k H W"] | None,
-    wanted: Bool[Tensor, "b v H W"] | None,
+    windows: Sequence[Window | None] | None,
 ) -> Iterator[Part]:
-    """Maps of the windows around wanted pixels, in the order of the images.
+    """Maps of the windows of the images, in their order.
 
     Images whose maps are small share one window. Without a gradient, larger maps are computed one after
     another, each in a window of its own, to save memory and work.
@@ -71,26 +66,20 @@ def decode(
         dpt: the dense head.
         tokens: of all images.
         guide: of all images, for a head with a guide.
-        wanted: pixels; None: all. An image without any is left out; where no image has one, a single pixel is
-            decoded: there is always a part, through which gradients of 0 flow.
+        windows: of each image; None: all of every image. An image without a window is left out; where none
+            has one, a single pixel is decoded: there is always a part, through which gradients of 0 flow.
     """
     b, v, rows, columns = tokens.grid
     size = (tokens.patch_size * rows, tokens.patch_size * columns)
-    if wanted is None:
+    if windows is None:
         windows = [Window.whole(size)] * (b * v)
-    else:
-        windows = subject_windows(wanted.flatten(0, 1))
-        if not any(windows):
-            windows[0] = Window(*(Span(0, 1, full) for full in size))
+    elif not any(windows):
+        windows = [Window(*(Span(0, 1, full) for full in size)), *windows[1:]]
     most = b * v if torch.is_grad_enabled() else _LARGEST // (dpt.full_channels * math.prod(size))
-    ends = [0, *torch.bincount(tokens.image, minlength=b * v).cumsum(0).tolist()]
     for images in _runs(windows, most):
         window = functools.reduce(Window.hull, windows[images])
-        part = tokens.select(slice(ends[images.start], ends[images.stop]))
-        grid = (1, images.stop - images.start, rows, columns)
-        part = dataclasses.replace(part, image=part.image - images.start, grid=grid)
         seen = None if guide is None else guide.flatten(0, 1)[images][None]
-        yield Part(images, window, dpt(part, seen, window))
+        yield Part(images, window, dpt(tokens.of_images(images), seen, window))
 
 
 def _runs(windows: Sequence[Window | None], most: int) -> Iterator[slice]:

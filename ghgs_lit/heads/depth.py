@@ -15,6 +15,7 @@ from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.heads.activations import CONFIDENCES, bounded_sigmoid
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
+from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
 
 
@@ -122,13 +123,16 @@ class DepthHead(nn.Module):
             if self.consistency_depths:
                 maps.append(photo_consistency(batch, bounds, self.consistency_depths))
             guide = photo_guide(batch, *maps)
-        wanted = None
+        wanted = windows = None
         if self.pixels == "subject":
             # Whole patches: the token points of the release depend on pixels beside the mask.
-            p = tokens.patch_size
+            p, size = tokens.patch_size, tuple(batch.masks.shape[2:])
             patches = patches_around_subject(batch.masks, p, 0)
             wanted = patches.repeat_interleave(p, -2).repeat_interleave(p, -1)
-        value, confidence = _whole(decode(self.dpt, tokens, guide, wanted), batch, wanted)
+            windows = [
+                window and window.coarser(p).finer(p, size) for window in subject_windows(batch.extents, size)
+            ]
+        value, confidence = _whole(decode(self.dpt, tokens, guide, windows), batch, wanted)
         if self.is_bounded:
             depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.parameterization)
         else:

@@ -19,7 +19,8 @@ from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens
+from ghgs_lit.heads.window import subject_windows
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens, true_places
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -62,6 +63,7 @@ class RawGaussians:
     color: Float[Tensor, "N 3"] | None
     image: Int[Tensor, " N"]
     pixel: Int[Tensor, " N"]
+    splits: tuple[int, ...]
 
     def changed(self, change: Float[Tensor, "N c"]) -> "RawGaussians":
         """With :data:`RAW_VALUES` of each added to offset, scale, rotation, opacity and color."""
@@ -229,12 +231,16 @@ class GaussianHead(nn.Module):
             points: of the pixels.
             depth_maps: of the same pixels.
         """
-        wanted = None if self.pixels == "all" else points.valid
-        parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), wanted)
-        raw = zip(*(self._of_subject(part, points) for part in parts), strict=True)
-        image, pixel = points.valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+        views, height, width = points.valid.shape[1:]
+        counts = points.valid.flatten(0, 1).sum((1, 2)).tolist()
+        places = true_places(points.valid, sum(counts))
+        image, pixel = places // (height * width), places % (height * width)
+        windows = None if self.pixels == "all" else subject_windows(batch.extents, (height, width))
+        parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), windows)
+        raw = zip(*(self._of_subject(part, image, pixel, counts) for part in parts), strict=True)
         values = [torch.cat(values) for values in raw]
-        return RawGaussians(*values[:5], values[5] if len(values) > 5 else None, image, pixel)
+        splits = tuple(sum(counts[first : first + views]) for first in range(0, len(counts), views))
+        return RawGaussians(*values[:5], values[5] if len(values) > 5 else None, image, pixel, splits)
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """The Gaussians of raw attributes at the points of their pixels; arguments as of :meth:`forward`."""
@@ -259,7 +265,7 @@ class GaussianHead(nn.Module):
             scales=scales,
             opacities=opacities,
             colors=colors if raw.color is None else colors + self.color_limit * bounded_tanh(raw.color),
-            splits=tuple(points.valid.flatten(1).sum(1).tolist()),
+            splits=raw.splits,
             image=image,
             pixel=pixel,
             low_pass=self.low_pass,
@@ -277,16 +283,22 @@ class GaussianHead(nn.Module):
             maps.append(photo_consistency(batch, DepthBounds(depth, depth), 1))
         return photo_guide(batch, *maps)
 
-    def _of_subject(self, part: Part, points: Points) -> Sequence[Tensor]:
-        """Descriptors and raw values (:meth:`_raw`) of the valid pixels of a part."""
-        descriptors, valid = part.maps.permute(0, 2, 3, 1), part.cut(points.valid)
+    def _of_subject(
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
+    ) -> Sequence[Tensor]:
+        """Descriptors and raw values (:meth:`_raw`) of a part at its pixels; each image has ``counts``."""
+        descriptors, begin = part.maps.permute(0, 2, 3, 1), part.images.start
+        own = slice(sum(counts[:begin]), sum(counts[: part.images.stop]))
+        (top, _, _), (left, _, width) = part.window
+        row, column = pixel[own] // width - top, pixel[own] % width - left
         if self.pixels == "subject":
-            chosen = descriptors[valid]
+            chosen = descriptors[image[own] - begin, row, column]
             return chosen, *self._raw(chosen)
         # One image at a time: the networks' hidden layers are wider than the maps.
+        places = zip(*(place.split(counts[part.images]) for place in (row, column)), strict=True)
         each = [
-            [values[own] for values in (pixels, *self._raw(pixels))]
-            for pixels, own in zip(descriptors, valid, strict=True)
+            [values[place] for values in (maps, *self._raw(maps))]
+            for maps, place in zip(descriptors, places, strict=True)
         ]
         return [torch.cat(values) for values in zip(*each, strict=True)]
 

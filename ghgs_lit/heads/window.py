@@ -1,14 +1,16 @@
 """Windows of maps, and how large a window each layer of a dense head needs for a window of its result."""
 
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.types import Extent
 
 
 class Span(NamedTuple):
@@ -103,24 +105,37 @@ class Window(NamedTuple):
 
 def _interpolate(maps: Tensor, axis: int, source: Span, target: Span) -> Tensor:
     """Linear interpolation along one axis, with the weights of ``F.interpolate``."""
-    # One division, then one product, both rounded to the precision of the maps, as PyTorch does.
-    step = torch.tensor((source.full - 1) / max(target.full - 1, 1), dtype=maps.dtype).item()
-    place = torch.arange(target.start, target.stop, dtype=maps.dtype, device=maps.device) * step
-    low = place.long().clamp(source.start, source.stop - 1)
-    high = (low + 1).clamp(max=source.stop - 1)
-    weight = (place - low).unflatten(0, (-1, *[1] * (3 - axis)))
-    below, above = (maps.index_select(axis, cell - source.start) for cell in (low, high))
+    low, high, weight = _sources(source, target, maps.dtype, maps.device)
+    weight = weight.view(-1, *[1] * (3 - axis))
+    below, above = (maps.index_select(axis, cell) for cell in (low, high))
     return torch.lerp(below, above, weight) if torch.is_grad_enabled() else below.lerp_(above, weight)
 
 
-def subject_windows(masks: Bool[Tensor, "n H W"]) -> list[Window | None]:
-    """The smallest window that holds the mask of each image; None for an empty one."""
-    ends = [first_and_last(masks.any(axis)) for axis in (2, 1)]
-    found = torch.stack([end for pair in ends for end in pair], dim=-1).tolist()
-    height, width = masks.shape[1:]
+@lru_cache(maxsize=256)
+@torch.inference_mode(False)  # what is made here may be used with a gradient later
+def _sources(
+    source: Span, target: Span, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The two cells of the source that each cell of the target lies between, and the share of the second."""
+    # One division, then one product, both rounded to the precision of the maps, as PyTorch does.
+    step = torch.tensor((source.full - 1) / max(target.full - 1, 1), dtype=dtype, device="cpu").item()
+    place = torch.arange(target.start, target.stop, dtype=dtype, device=device) * step
+    low = place.long().clamp(source.start, source.stop - 1)
+    high = (low + 1).clamp(max=source.stop - 1)
+    return low - source.start, high - source.start, place - low
+
+
+def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Window | None]:
+    """The smallest window that holds the mask of each image; None for an empty one.
+
+    Args:
+        extents: of the masks.
+        size: height and width of the images.
+    """
+    height, width = size
     return [
-        Window(Span(top, bottom + 1, height), Span(left, right + 1, width)) if bottom >= 0 else None
-        for top, bottom, left, right in found
+        Window(Span(top, bottom, height), Span(left, right, width)) if count else None
+        for count, top, bottom, left, right in extents
     ]
 
 

@@ -73,8 +73,8 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
     if batch.depths is None:
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
     used = batch.masks & prediction.depth_valid & (batch.depths > 0)
-    truth = batch.depths[used]
+    truth = torch.where(used, batch.depths, 1)
     rounds = prediction.rounds or (prediction.depth_maps,)
-    errors = [(at_least_float32(maps.depth)[used] - truth).abs() for maps in rounds]
+    errors = [(torch.where(used, at_least_float32(maps.depth), truth) - truth).abs() for maps in rounds]
     errors = [error / truth if relative else error for error in errors]
-    return sum(error.sum() / max(error.numel(), 1) for error in errors) / len(errors)
+    return sum(error.sum() for error in errors) / (used.sum().clamp(min=1) * len(errors))

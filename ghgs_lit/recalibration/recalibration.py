@@ -14,7 +14,7 @@ from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.attention import SemanticAttention
 from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
-from ghgs_lit.types import Points, Tokens
+from ghgs_lit.types import Points, Tokens, true_places
 
 #: Number of cosines that are held at once (bounds memory).
 _COSINES = 1 << 21
@@ -66,14 +66,15 @@ class Recalibration(nn.Module):
             points: of the same tokens.
         """
         batch_size, views = tokens.grid[:2]
-        chosen = self.takes_part(points).nonzero()[:, 0]
+        takes_part = self.takes_part(points)
+        elements = torch.arange(batch_size, device=takes_part.device)[:, None]
+        counts = ((tokens.image // views == elements) & takes_part).sum(1).tolist()
+        chosen = true_places(takes_part, sum(counts))
 
         def part(values: Tensor) -> Tensor:
             return values if len(chosen) == len(values) else values[chosen]
 
         image = part(tokens.image)
-        elements = torch.arange(batch_size, device=image.device)[:, None]
-        counts = (image // views == elements).sum(1).tolist()
         places = self.places(tokens)
         neighbors = [
             nearest_neighbors(positions, views_of, self.k, self.neighbors, places_of)
