@@ -130,13 +130,13 @@ def ssim_map(
         if padding != "valid":
             border, mode = [SSIM_WINDOW // 2] * 4, "reflect" if padding == "reflect" else "constant"
             x, y = F.pad(x, border, mode), F.pad(y, border, mode)
-        moments = torch.cat((x, y, x * x, y * y, x * y), dim=1)
+        moments = torch.cat((x, y, x * x + y * y, x * y), dim=1)
         weights = _gaussian_window(moments)
         blurred = correlate(moments, weights, weights)
-        mx, my, xx, yy, xy = blurred.chunk(5, dim=1)
+        mx, my, squares, product = blurred.chunk(4, dim=1)
+        both, of_means = mx * my, mx * mx + my * my
         c1, c2 = 0.01**2, 0.03**2
-        luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
-        return luminance * (2 * (xy - mx * my) + c2) / (xx - mx * mx + yy - my * my + c2)
+        return (2 * both + c1) / (of_means + c1) * (2 * (product - both) + c2) / (squares - of_means + c2)
 
 
 def ssim(
