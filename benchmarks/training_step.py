@@ -31,6 +31,11 @@ from ghgs_lit.training.callbacks import StepTime
 
 steps, warmup, threads, *overrides = sys.argv[1:]
 torch.set_num_threads(int(threads))
+try:  # as the command line of the version does
+    from ghgs_lit.kernels.allocation import keep_freed_memory
+    keep_freed_memory()
+except ImportError:
+    pass
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 with initialize_config_dir(str(conf_dir()), version_base="1.3"):
     config = OmegaConf.to_container(compose("train", overrides), resolve=True)
