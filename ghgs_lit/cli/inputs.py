@@ -45,7 +45,10 @@ def build_data(config: Mapping[str, Any]) -> PhotographsDataModule:
     """The configured data with its view and target protocols."""
     # Cameras are targets that every data set could have; a verb without targets reads none.
     targets = config.get("targets") or CAMERAS
-    return build(config["data"], "data", views=config["views"], targets=targets, seed=config["seed"])
+    extra = {"views": config["views"], "targets": targets, "seed": config["seed"]}
+    if "augmentation" in config:  # of verbs that train
+        extra["augmentation"] = config["augmentation"]
+    return build(config["data"], "data", **extra)
 
 
 def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, DistributedSampler
 
 from ghgs_lit.config.settings import image_size, set_fields
+from ghgs_lit.data.augmentation import Augmentation, Size
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name, subject_rng
 from ghgs_lit.data.view import RESAMPLINGS, View
@@ -77,9 +78,16 @@ class BatchBuilder:
     body_vertices: int | None = None
     depths: bool = True
 
-    def batch(self, specs: Sequence[SampleSpec]) -> Batch:
-        """Samples with equal numbers of inputs and equal protocols of targets, which may be none."""
-        inputs = [_views(self.inputs, s.subject, s.inputs, self.depths) for s in specs]
+    def batch(
+        self, specs: Sequence[SampleSpec], size: Size | None = None, target_size: Size | None = None
+    ) -> Batch:
+        """Samples with equal numbers of inputs and equal protocols of targets, which may be none.
+
+        Args:
+            specs: the samples.
+            size, target_size: (height, width) of inputs and targets (None: those of the photographs).
+        """
+        inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
         depths = [[view.depth for view in row] for row in inputs]
         known = all(depth is not None for row in depths for depth in row)
         bodies = [self._body(s.subject) for s in specs]
@@ -87,15 +95,15 @@ class BatchBuilder:
             images=self._images(inputs),
             masks=_stack([[view.mask for view in row] for row in inputs]),
             cameras=_cameras(inputs),
-            targets=self._targets(specs) if specs[0].targets else None,
+            targets=self._targets(specs, target_size) if specs[0].targets else None,
             body_vertices=None if any(body is None for body in bodies) else bodies,
             depths=_stack(depths) if known else None,
             subjects=tuple(s.subject for s in specs),
             views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
         )
 
-    def _targets(self, specs: Sequence[SampleSpec]) -> Targets:
-        views = [_views(self.targets, s.subject, s.targets, False) for s in specs]
+    def _targets(self, specs: Sequence[SampleSpec], size: Size | None) -> Targets:
+        views = [_views(self.targets, s.subject, s.targets, False, size) for s in specs]
         return Targets(
             images=self._images(views),
             masks=_stack([[view.mask for view in row] for row in views]),
@@ -120,8 +128,10 @@ class BatchBuilder:
         return torch.from_numpy(vertices)
 
 
-def _views(photographs: Photographs, subject: str, photos: Sequence[Photo], depth: bool) -> list[View]:
-    return [photographs.view(subject, *photo, depth=depth) for photo in photos]
+def _views(
+    photographs: Photographs, subject: str, photos: Sequence[Photo], depth: bool, size: Size | None
+) -> list[View]:
+    return [photographs.view(subject, *photo, depth=depth, size=size) for photo in photos]
 
 
 def _stack(arrays: list[list[np.ndarray]]) -> Tensor:
@@ -144,6 +154,7 @@ class TrainingBatches(Dataset):
 
     builder: BatchBuilder
     sampler: TrainingSampler
+    augmentation: Augmentation
     length: int
     rank: int = 0
     world: int = 1
@@ -152,7 +163,12 @@ class TrainingBatches(Dataset):
         return self.length
 
     def __getitem__(self, step: int) -> Batch:
-        return self.builder.batch(self.sampler.batch(step, self.rank, self.world))
+        sizes = self.augmentation.draw_sizes(
+            self.builder.inputs.size, self.builder.targets.size, self.sampler.seed, step
+        )
+        batch = self.builder.batch(self.sampler.batch(step, self.rank, self.world), *sizes)
+        indices = self.sampler.indices(step, self.rank, self.world)
+        return self.augmentation.imperfect(batch, self.sampler.seed, step, indices)
 
 
 class EvaluationBatches(Dataset):

@@ -11,6 +11,7 @@ from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from ghgs_lit.config.settings import from_config, from_flat
+from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, BatchOptions, EvaluationBatches, StepSampler, TrainingBatches
 from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.reader import PHASES, Photographs
@@ -52,6 +53,7 @@ class PhotographsDataModule(LightningDataModule):
         views: :class:`ViewProtocol` or its mapping.
         targets: :class:`TargetProtocol` or its mapping.
         seed: seed of all samples.
+        augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
         options: the fields of ``dataset_type`` and of :class:`BatchOptions`, in one flat mapping.
 
     Raises:
@@ -61,7 +63,12 @@ class PhotographsDataModule(LightningDataModule):
     dataset_type: ClassVar[type[DataSet]]
 
     def __init__(
-        self, views: ViewProtocol | Mapping[str, Any], targets: Targets, seed: int = 0, **options: Any
+        self,
+        views: ViewProtocol | Mapping[str, Any],
+        targets: Targets,
+        seed: int = 0,
+        augmentation: Augmentation | Mapping[str, Any] | None = None,
+        **options: Any,
     ) -> None:
         super().__init__()
         self.dataset: DataSet
@@ -71,6 +78,7 @@ class PhotographsDataModule(LightningDataModule):
         )
         self.views = from_config(ViewProtocol, "views", views)
         self.targets = from_config(TargetProtocol, "targets", targets)
+        self.augmentation = from_config(Augmentation, "augmentation", augmentation or {})
         self.dataset.check_targets(self.targets)
         self.seed = seed
         #: Whether training reads depth maps; evaluation reads them all the same, for its depth error.
@@ -109,7 +117,13 @@ class PhotographsDataModule(LightningDataModule):
 
     def training_batch(self, step: int) -> Batch:
         """The batch of a single process at ``step``."""
-        return self.builder("train").batch(self.training_sampler().batch(step))
+        return self._training_batches(self.training_sampler(), step + 1)[step]
+
+    def _training_batches(
+        self, sampler: TrainingSampler, length: int, rank: int = 0, world: int = 1
+    ) -> TrainingBatches:
+        builder = dataclasses.replace(self.builder("train"), depths=self.trains_on_depths)
+        return TrainingBatches(builder, sampler, self.augmentation, length, rank, world)
 
     def train_dataloader(self) -> DataLoader:
         """Batches of one epoch; the next epoch continues where it ended."""
@@ -118,8 +132,7 @@ class PhotographsDataModule(LightningDataModule):
         rank = self.trainer.global_rank if self.trainer else 0
         once = math.ceil(len(sampler.subjects) / (self.options.batch_size * world))
         length = self.options.steps_per_epoch or once
-        builder = dataclasses.replace(self.builder("train"), depths=self.trains_on_depths)
-        batches = TrainingBatches(builder, sampler, length, rank, world)
+        batches = self._training_batches(sampler, length, rank, world)
         return self._loader(
             batches, sampler=StepSampler(batches, lambda: trained_batches(self.trainer, length))
         )

@@ -134,13 +134,20 @@ class Photographs:
         self.cached_bytes, self.cache_bytes = 0, int(cache_mb * 2**20)
         self._cache: OrderedDict[tuple, View | np.ndarray | None] = OrderedDict()
 
-    def view(self, name: str, position: int, view: int = 0, depth: bool = True) -> View:
-        """One photograph, resized together with its intrinsics; arguments as :meth:`Reader.read_view`.
+    def view(
+        self, name: str, position: int, view: int = 0, depth: bool = True, size: tuple[int, int] | None = None
+    ) -> View:
+        """One photograph, resized together with its intrinsics.
+
+        Args:
+            name, position, view, depth: as for :meth:`Reader.read_view`.
+            size: (height, width) in pixels; None: that of all.
 
         Raises:
             InputError: a file is missing or bad, the reader gives something else than a :class:`View` has, or
                 the mask is empty.
         """
+        size = size or self.size
 
         def read() -> View:
             stored = self.reader.read_view(name, position, view, depth)
@@ -148,9 +155,9 @@ class Photographs:
             check_view(place, stored)
             if not stored.mask.any():
                 raise InputError(f"{place}: expected a subject in the mask; found none")
-            return stored if self.size is None else resize_view(stored, *self.size, self.resampling)
+            return stored if size is None else resize_view(stored, *size, self.resampling)
 
-        return self._cached((name, position, view, depth), read)
+        return self._cached((name, position, view, depth, size), read)
 
     def body(self, name: str) -> np.ndarray | None:
         """Body vertices as :meth:`Reader.read_body`.

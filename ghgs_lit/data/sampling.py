@@ -58,7 +58,8 @@ class ViewProtocol:
         name: name of the protocol in results.
         training_counts: numbers of views; one of them is drawn for each training step.
         evaluation_count: number of views in evaluation.
-        training: ``any`` (ring cameras in random order) or ``even`` (evenly spaced from a random start).
+        training: ``any`` (ring cameras in random order), ``even`` (evenly spaced from a random start) or
+            ``mixed`` (one of both, drawn for each sample).
     """
 
     name: str
@@ -71,11 +72,11 @@ class ViewProtocol:
         valid = len(self.training_counts) > 0 and min(self.training_counts) >= 2
         require(valid, "views.training_counts", "counts of at least 2", list(self.training_counts))
         require(self.evaluation_count >= 2, "views.evaluation_count", "at least 2", self.evaluation_count)
-        choice("views.training", self.training, ("any", "even"))
+        choice("views.training", self.training, ("any", "even", "mixed"))
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
         """Positions of the ``count`` inputs of a training sample."""
-        if self.training == "even":
+        if self.training == "even" or (self.training == "mixed" and rng.uniform() < 0.5):
             start = int(rng.integers(ring))
             return [(start + position) % ring for position in even_positions(ring, count)]
         return [int(position) for position in rng.choice(np.asarray(available), count, replace=False)]
@@ -209,7 +210,7 @@ class TrainingSampler:
 
     def __post_init__(self) -> None:
         most = max(self.views.training_counts)
-        wanted = self.ring if self.views.training == "even" else most
+        wanted = most if self.views.training == "any" else self.ring
         for name, positions in self.subjects.items():
             if len(positions) < max(wanted, most):
                 raise InputError(
@@ -220,8 +221,12 @@ class TrainingSampler:
     def batch(self, step: int, rank: int = 0, world: int = 1) -> list[SampleSpec]:
         """Samples of process ``rank`` of ``world`` at ``step``; all have the same number of inputs."""
         count = int(np.random.default_rng([self.seed, _COUNT, step]).choice(self.views.training_counts))
+        return [self._sample(step, index, count) for index in self.indices(step, rank, world)]
+
+    def indices(self, step: int, rank: int = 0, world: int = 1) -> range:
+        """Numbers in the run of the samples of process ``rank`` of ``world`` at ``step``."""
         first = (step * world + rank) * self.batch_size
-        return [self._sample(step, first + i, count) for i in range(self.batch_size)]
+        return range(first, first + self.batch_size)
 
     def _sample(self, step: int, index: int, count: int) -> SampleSpec:
         """Sample number ``index`` of the run: all subjects once in random order, then in another."""

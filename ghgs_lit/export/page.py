@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ghgs_lit.export.splat import to_records
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.types import Cameras, Gaussians
-from ghgs_lit.visualization.turntable import look_at_point, pixel_size
+from ghgs_lit.visualization.turntable import pixel_size
 
 
 def write_page(

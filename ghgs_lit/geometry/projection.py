@@ -95,3 +95,15 @@ def project(
     u = intrinsics[..., 0, 0] * x + intrinsics[..., 0, 1] * y + intrinsics[..., 0, 2]
     v = intrinsics[..., 1, 1] * y + intrinsics[..., 1, 2]
     return torch.stack((u, v), dim=-1), z
+
+
+def look_at_point(cameras: Cameras) -> Tensor:
+    """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64.
+
+    Where the axes are parallel, the one of these points nearest to the mean position of the cameras.
+    """
+    forward, centers = cameras.extrinsics[:, 2, :3].double(), cameras.centers.double()
+    middle = centers.mean(0)
+    away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
+    right = (away @ (centers - middle)[:, :, None]).sum(0)
+    return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]

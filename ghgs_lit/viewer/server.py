@@ -9,10 +9,11 @@ import numpy as np
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.export.scene import smoothed
+from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.viewer.content import Content
 from ghgs_lit.visualization.pictures import to_uint8
-from ghgs_lit.visualization.turntable import look_at_point, pixel_size
+from ghgs_lit.visualization.turntable import pixel_size
 
 PICTURES = ("render", "photograph", "FLIP")
 

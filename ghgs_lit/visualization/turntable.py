@@ -5,19 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.types import Cameras
-
-
-def look_at_point(cameras: Cameras) -> Tensor:
-    """The world point [3] nearest to all optical axes of ``cameras`` [V] (least squares), float64.
-
-    Where the axes are parallel, the one of these points nearest to the mean position of the cameras.
-    """
-    forward, centers = cameras.extrinsics[:, 2, :3].double(), cameras.centers.double()
-    middle = centers.mean(0)
-    away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
-    right = (away @ (centers - middle)[:, :, None]).sum(0)
-    return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]
 
 
 def pixel_size(cameras: Cameras) -> float:

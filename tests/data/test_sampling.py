@@ -52,6 +52,15 @@ def test_even_positions_are_the_protocols():
     assert even_positions(16, 5) == [0, 3, 6, 9, 12]
 
 
+def test_mixed_views_are_even_or_any():
+    """About half of the samples are even; the others have any angles."""
+    mixed = ViewProtocol("mixed", (4,), 4, "mixed")
+    draws = [mixed.draw(FULL, 4, 16, np.random.default_rng(seed)) for seed in range(80)]
+    even = [set(np.diff(positions) % 16) == {4} for positions in draws]
+    assert 25 < sum(even) < 55
+    assert all(len(set(positions)) == 4 for positions in draws)
+
+
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_targets_stand_where_their_protocol_says(root, count):
     """Angles of the actual cameras: 11.25 degrees beside the first input; equally far from two inputs."""
@@ -284,7 +293,10 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
     [
         ({"batch_size": 0}, "data.batch_size: expected at least 1; found 0"),
         ({"views": V4 | {"training_counts": [1]}}, "views.training_counts: expected counts of at least 2"),
-        ({"views": V4 | {"training": "odd"}}, "views.training: expected one of any, even; found 'odd'"),
+        (
+            {"views": V4 | {"training": "odd"}},
+            "views.training: expected one of any, even, mixed",
+        ),
         ({"views": V4 | {"trainign": "any"}}, "views key: expected one of .*; found 'trainign'"),
         ({"targets": {"name": "sideways"}}, "targets.kind: expected one of release, midway, random"),
         ({"targets": RELEASE | {"training_views": [7]}}, "targets.training_views: expected some of"),

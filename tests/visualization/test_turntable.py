@@ -4,8 +4,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.types import Cameras
-from ghgs_lit.visualization.turntable import look_at_point, turntable, up_direction
+from ghgs_lit.visualization.turntable import turntable, up_direction
 from tests.helpers.training import ring
 
 

@@ -1,0 +1,158 @@
+"""What imperfect captures cost a model: built-in people, photographed in ten ways, with the same targets.
+
+    python benchmarks/captures.py model.ckpt [model.ckpt ...] --out captures.json
+
+Each capture has one trouble, the last one all of them. Targets are always those of the clean rig, so that a
+loss is one of the prediction. Prints PSNR on the clean rig and what each capture loses, whole and in the box.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ghgs_lit import GHGS
+from ghgs_lit.capture.predict import trained_size
+from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
+from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.config.groups import read_option
+from ghgs_lit.config.settings import image_size
+from ghgs_lit.data.augmentation import Augmentation
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.sampling import even_positions, subject_rng
+from ghgs_lit.evaluation.measure import ModelMethod, measure
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import read_checkpoint
+
+_RING, _VIEWS = 16, 4
+_EVEN = even_positions(_RING, _VIEWS)
+_UNEVEN = [0, 5, 7, 12]
+_TARGETS = ("release", "midway")
+_HELD = {"camera_pitch": 6.0, "camera_roll": 8.0, "camera_look_at": 0.08}
+_COLORS = {"exposure": 0.5, "white_balance": 0.25}
+_OUTLINES = {"mask_offset": 1.5, "mask_ragged": 2.0}
+_PIECES = {"mask_hole": 0.12, "mask_hole_chance": 1.0}
+
+
+@dataclass(frozen=True)
+class Imperfection:
+    """How a capture differs: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`."""
+
+    rig: Mapping[str, Any] = field(default_factory=dict)
+    positions: list[int] = field(default_factory=lambda: _EVEN)
+    augmentation: Mapping[str, float] = field(default_factory=dict)
+
+
+CAPTURES = {
+    "clean": Imperfection(),
+    "ring a third wider": Imperfection({"radius": [2.67, 2.67]}),
+    "from 3.4 m, longer lens": Imperfection({"radius": [3.4, 3.4], "fill": [0.7, 0.7]}),
+    "20 degrees farther down": Imperfection({"pitch": [-28.0, -28.0]}),
+    "rolled, tilted, shifted": Imperfection(_HELD),
+    "uneven angles": Imperfection(positions=_UNEVEN),
+    "exposure, white balance": Imperfection(augmentation=_COLORS),
+    "masks off and ragged": Imperfection(augmentation=_OUTLINES),
+    "masks with holes": Imperfection(augmentation=_PIECES),
+    "calibration up to 3 px": Imperfection(augmentation={"calibration": 3.0}),
+    "all at once": Imperfection(
+        {"radius": [2.67, 2.67], "pitch": [-28.0, -28.0], "fill": [0.7, 0.7], **_HELD},
+        _UNEVEN,
+        {**_COLORS, **_OUTLINES, **_PIECES, "calibration": 3.0},
+    ),
+}
+
+
+def data_of(capture: Imperfection, people: int, size: list[int]) -> PhotographsDataModule:
+    """People in front of the rig of a capture; what is missing is rendered."""
+    # Inputs, the targets beside the first one and half-way to the second one.
+    positions = sorted({*_EVEN, *_UNEVEN, _EVEN[1] // 2})
+    overrides = [
+        "data=synthetic",
+        "targets.training_views=[0,3]",
+        f"data.people={{train: 1, val: {people}}}",
+        f"data.size={size}",
+        f"data.render.positions={positions}",
+        "data.render.views=[0,3]",
+        f"data.evaluation_positions={{{_VIEWS}: {capture.positions}}}",
+        *(f"data.rig.variation.{name}={value}" for name, value in capture.rig.items()),
+    ]
+    data = build_data(resolve(compose("prepare", overrides)))
+    data.prepare_data()
+    return data
+
+
+def batches(
+    capture: Imperfection, clean: PhotographsDataModule, own: PhotographsDataModule
+) -> Iterator[Batch]:
+    """Inputs as ``capture`` has them, with the targets of the clean rig."""
+    augmentation = Augmentation(**capture.augmentation)
+    targets = [read_option("targets", name) for name in _TARGETS]
+    for batch in clean.evaluation_loader(_VIEWS, targets, batch_size=1):
+        seen = own.evaluation_batch(batch.subjects[0], views=_VIEWS)
+        yield augmentation.imperfections(
+            dataclasses.replace(seen, targets=batch.targets), [subject_rng(0, batch.subjects[0])]
+        )
+
+
+def means(rows: list[dict]) -> dict[str, float]:
+    """PSNR by target and region, and the error of depth, over the subjects."""
+    found = {
+        f"{target}_{name}": sum(row[name] for row in rows if row["targets"] == target)
+        / sum(row["targets"] == target for row in rows)
+        for target in _TARGETS
+        for name in ("psnr", "psnr_box")
+    }
+    return found | {"depth_error_mm": sum(row["depth_error_mm"] for row in rows) / len(rows)}
+
+
+def table(results: Mapping[str, dict[str, float]]) -> str:
+    """The clean rig, and what each capture loses."""
+    clean, single = results["clean"], [n for n in results if n not in ("clean", "all at once")]
+    mean = {name: sum(results[n][name] for n in single) / len(single) for name in clean}
+    lines = ["| capture | " + " | ".join(clean) + " |", "|---" * (len(clean) + 1) + "|"]
+    lines.append("| clean | " + " | ".join(f"{value:.2f}" for value in clean.values()) + " |")
+    for name, row in (
+        *((n, results[n]) for n in single),
+        ("mean", mean),
+        ("all at once", results["all at once"]),
+    ):
+        lines.append(f"| {name} | " + " | ".join(f"{row[k] - clean[k]:+.2f}" for k in clean) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("checkpoints", type=Path, nargs="+")
+    parser.add_argument("--people", type=int, default=8)
+    parser.add_argument("--size", type=int, help="side in pixels; none: the first checkpoint's")
+    parser.add_argument("--out", type=Path, default=Path("captures.json"))
+    options = parser.parse_args()
+    config = resolve(compose("evaluate", ["data=synthetic", "metrics.lpips=off"]))
+    device = pick_device(config["device"])
+    renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
+    size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
+    size = list(image_size("size", size))
+    data = {name: data_of(capture, options.people, size) for name, capture in CAPTURES.items()}
+    results = {}
+    for path in options.checkpoints:
+        method = ModelMethod(GHGS.from_checkpoint(path, device), renderer)
+        results[str(path)] = {
+            name: means(measure(method, name, batches(capture, data["clean"], data[name]), metrics, device))
+            for name, capture in CAPTURES.items()
+        }
+        print(
+            f"{path}, {options.people} people, {size[0]} x {size[1]}\n{table(results[str(path)])}\n",
+            flush=True,
+        )
+        write_text_atomically(options.out, json.dumps(results, indent=1))
+
+
+if __name__ == "__main__":
+    torch.set_grad_enabled(False)
+    main()

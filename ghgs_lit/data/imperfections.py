@@ -1,0 +1,138 @@
+"""What goes wrong in captures: exposure and colour of single cameras, masks, calibration.
+
+Each function draws equally many random numbers whatever its limits are.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt, zoom
+from torch import Tensor
+
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.projection import look_at_point, project, unproject
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.types import Cameras
+
+# Stored colours are light to the power 1/2.2.
+_GAMMA = 2.2
+# Side of the bumps of a ragged outline in pixels.
+_BUMP = 6
+
+
+def color_gains(
+    views: int, exposure: float, white_balance: float, rng: np.random.Generator
+) -> Float[np.ndarray, "V 3"]:
+    """What each camera multiplies stored colours by; the geometric mean over the cameras is 1.
+
+    Photographs do not tell which camera is right, so that only differences between cameras can be undone.
+
+    Args:
+        views: number of cameras.
+        exposure: greatest deviation of a camera in stops.
+        white_balance: greatest deviation of red and of blue from green in stops.
+        rng: random numbers.
+    """
+    deviation = rng.uniform(-1, 1, (views, 3))
+    deviation -= deviation.mean(0)
+    deviation /= np.maximum(1, np.abs(deviation).max(0))
+    red, green, blue = (deviation * (white_balance, exposure, white_balance)).T
+    return 2 ** (np.stack((green + red, green, green + blue), -1) / _GAMMA)
+
+
+def imperfect_mask(
+    mask: Bool[np.ndarray, "h w"],
+    offset: float,
+    ragged: float,
+    hole: float,
+    hole_chance: float,
+    rng: np.random.Generator,
+) -> Bool[np.ndarray, "h w"]:
+    """A mask as a segmentation might give it; the mask itself where nothing would be left of it.
+
+    Args:
+        mask: on the subject; an empty one stays empty.
+        offset: greatest number of pixels that it grows or shrinks by.
+        ragged: greatest number of pixels that bumps of its outline are high.
+        hole: greatest diameter of a round piece that is missing, as a share of the subject's height.
+        hole_chance: how often a piece is missing.
+        rng: random numbers.
+    """
+    grow, height, missing, size, place = rng.uniform(size=5)
+    bumps = rng.uniform(-1, 1, [side // _BUMP + 2 for side in mask.shape])
+    if not mask.any():
+        return mask
+    rows, columns = np.nonzero(mask)
+    result = mask.copy()
+    if offset or ragged:
+        margin = math.ceil(offset + ragged) + 1
+        window = tuple(
+            slice(max(0, lines.min() - margin), lines.max() + 1 + margin) for lines in (rows, columns)
+        )
+        part = mask[window]
+        # Pixels from the outline, which runs between pixel centres: above 0 inside.
+        outline = 0.5 - distance_transform_edt(~part)
+        if not part.all():
+            outline = np.where(part, distance_transform_edt(part) - 0.5, outline)
+        noise = zoom(bumps, _BUMP, order=1)[: mask.shape[0], : mask.shape[1]][window]
+        result[window] = outline + (2 * grow - 1) * offset + height * ragged * noise > 0
+    if missing < hole_chance:
+        middle, radius = int(place * len(rows)), size * hole * (rows.max() - rows.min() + 1) / 2
+        v, u = np.ogrid[: mask.shape[0], : mask.shape[1]]
+        result &= (v - rows[middle]) ** 2 + (u - columns[middle]) ** 2 >= radius**2
+    return result if result.any() else mask
+
+
+def miscalibrated(
+    cameras: Cameras, masks: Bool[Tensor, "V H W"], pixels: float, rng: np.random.Generator
+) -> Cameras:
+    """Cameras that are off: each is turned, moved across its axis and has another focal length.
+
+    A camera's error is drawn up to ``pixels``: what the corners of its mask's box move by at the subject's
+    distance (root of the mean square).
+
+    Args:
+        cameras: ``V`` of one subject.
+        masks: theirs; in place of an empty one counts the whole photograph.
+        pixels: greatest error in pixels.
+        rng: random numbers.
+
+    Raises:
+        InputError: no point is before all cameras.
+    """
+    count = len(masks)
+    directions = torch.from_numpy(rng.standard_normal((count, 6)))
+    wanted = pixels * torch.from_numpy(rng.uniform(size=count))
+    lenses, poses = cameras.intrinsics.double(), cameras.extrinsics.double()
+    distances = (poses[:, 2, :3] * look_at_point(cameras)).sum(-1) + poses[:, 2, 3]
+    expected = "cameras that look at the subject"
+    require(bool((distances > 0).all()), "augmentation.calibration", expected, distances.tolist())
+    masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
+    lines = [mask.any(axis).nonzero()[:, 0] for mask in masks for axis in (0, 1)]
+    ends = torch.stack([torch.stack((line[0], line[-1] + 1)) for line in lines]).reshape(count, 2, 2)
+    corners = torch.stack([ends[:, [0, 1], [i, j]] for i in (0, 1) for j in (0, 1)], 1).double()
+
+    def moved(errors: Tensor) -> tuple[Tensor, Tensor]:
+        """Intrinsics and extrinsics after errors [V, 6], each in pixels about."""
+        focal, half = lenses[:, 1, 1], max(cameras.height, cameras.width) / 2
+        turn = errors[:, :3] / 2 / torch.stack((focal, focal, torch.full_like(focal, half)), -1)
+        rotation = quaternion_to_matrix(torch.cat((torch.ones(count, 1, dtype=turn.dtype), turn), -1))
+        pose, lens = poses.clone(), lenses.clone()
+        pose[:, :3] = rotation @ poses[:, :3]
+        pose[:, :2, 3] += errors[:, 3:5] * (distances / focal)[:, None]
+        lens[:, [0, 1], [0, 1]] *= 1 + errors[:, 5:] / half
+        return lens, pose
+
+    lens, pose = (matrix[:, None].expand(-1, 4, -1, -1) for matrix in (lenses, poses))
+    points = unproject(corners, distances[:, None].expand(-1, 4), lens, pose)
+    # Far from the world's origin these are not exactly the corners.
+    true = project(points, lens, pose)[0]
+    errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
+    for _ in range(3):  # errors grow nearly in proportion
+        lens, pose = (matrix[:, None].expand(-1, 4, -1, -1) for matrix in moved(errors))
+        found = (project(points, lens, pose)[0] - true).square().sum(-1).mean(-1).sqrt()
+        errors = errors * (wanted / found)[:, None]
+    lens, pose = (matrix.to(cameras.intrinsics) for matrix in moved(errors))
+    return Cameras(lens, pose, cameras.height, cameras.width)

@@ -1,0 +1,168 @@
+"""Variation of training batches: what each switch changes, and that batches depend on seed and step alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.config import compose
+from ghgs_lit.data.augmentation import Augmentation
+from ghgs_lit.data.datamodules import RenderedDataModule
+from ghgs_lit.errors import InputError
+from ghgs_lit.types import Batch
+from tests.helpers.people import RELEASE, V4, equal, render_boxes
+
+RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "mixed"}
+IMPERFECT = {
+    "exposure": 0.5, "white_balance": 0.2, "mask_offset": 1.5, "mask_ragged": 1.0, "mask_hole": 0.2,
+    "mask_hole_chance": 0.5, "calibration": 2.0,
+}  # fmt: skip
+EVERYTHING = IMPERFECT | {"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rendered")
+    render_boxes(folder / "out", folder / "scans", train=3, val=1)
+    return folder / "out"
+
+
+def module(root, **changes) -> RenderedDataModule:
+    arguments = {"views": RANDOM, "targets": RELEASE, "size": 28, "batch_size": 2, "steps_per_epoch": 6}
+    return RenderedDataModule(root=str(root), **(arguments | changes))
+
+
+def test_nothing_varies_by_default(root):
+    """augmentation=none and no augmentation give the photographs as they are read, to the bit."""
+    none = compose("train").augmentation
+    assert Augmentation(**none) == Augmentation()
+    data = module(root, augmentation=none)
+    for step in range(3):
+        batch = data.builder("train").batch(data.training_sampler().batch(step))
+        assert equal(data.training_batch(step), batch)
+        assert equal(module(root).training_batch(step), batch)
+
+
+def test_batches_depend_on_seed_and_step_alone(root):
+    """Neither on loading processes nor on what was read before; steps and seeds differ."""
+    batches = list(module(root, augmentation=EVERYTHING, workers=2).train_dataloader())
+    for step in (5, 0, 3):
+        assert equal(module(root, augmentation=EVERYTHING).training_batch(step), batches[step])
+    assert len({(batch.images.shape, round(batch.images.sum().item(), 3)) for batch in batches}) == 6
+    other = module(root, augmentation=EVERYTHING, seed=1).training_batch(0)
+    assert not torch.equal(other.cameras.intrinsics[:, :3], batches[0].cameras.intrinsics[:, :3])
+
+
+def test_sizes_are_drawn_for_a_step_and_cameras_follow(root):
+    """Every size occurs, the same for all processes; targets are 0.7 to 2 times as large."""
+    data = module(root, augmentation={"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]})
+    inputs, scales = set(), []
+    for step in range(12):
+        batch = data.training_batch(step)
+        size = tuple(batch.images.shape[-2:])
+        inputs.add(size)
+        ratios = np.array(batch.targets.images.shape[-2:]) / size
+        assert abs(ratios[0] - ratios[1]) < 1 / 28
+        scales.append(ratios[0])
+        assert (batch.cameras.height, batch.cameras.width) == size
+        whole = data.builder("train").batch(data.training_sampler().batch(step))
+        expected = whole.cameras.resized(*size).intrinsics
+        torch.testing.assert_close(batch.cameras.intrinsics, expected)
+        processes = [data._training_batches(data.training_sampler(), 1, rank, 2)[step] for rank in (0, 1)]
+        assert len({one.images.shape[-3:] for one in processes}) == 1
+        assert len({one.targets.images.shape for one in processes}) == 1
+    assert inputs == {(28, 28), (42, 28)}
+    assert min(scales) >= 0.69
+    assert max(scales) <= 2.01
+    assert np.ptp(scales) > 0.6
+
+
+def test_drawn_sizes_keep_the_proportion_of_the_targets(root):
+    """data.target_size twice data.size: targets are twice as large as the inputs that are drawn."""
+    batch = module(root, target_size=56, augmentation={"sizes": [42]}).training_batch(0)
+    assert batch.images.shape[-2:] == (42, 42)
+    assert batch.targets.images.shape[-2:] == (84, 84)
+
+
+def differing(a, b) -> set[str]:
+    """Names of the fields in which two batches differ."""
+    cameras = {
+        f"cameras.{name}": (getattr(a.cameras, name), getattr(b.cameras, name))
+        for name in ("intrinsics", "extrinsics")
+    }
+    tensors = {name: (getattr(a, name), getattr(b, name)) for name in ("images", "masks", "depths")} | cameras
+    found = {name for name, (x, y) in tensors.items() if not torch.equal(x, y)}
+    return found | ({"targets"} if not equal(a.targets, b.targets) else set())
+
+
+@pytest.mark.parametrize(
+    ("names", "changed"),
+    [
+        (("exposure",), {"images"}),
+        (("white_balance",), {"images"}),
+        (("mask_offset",), {"images", "masks"}),
+        (("mask_ragged",), {"images", "masks"}),
+        (("mask_hole", "mask_hole_chance"), {"images", "masks"}),
+        (("calibration",), {"cameras.intrinsics", "cameras.extrinsics"}),
+    ],
+)
+def test_each_imperfection_changes_its_part_of_the_inputs_alone(root, names, changed):
+    """Targets, depths and all else stay; together they are what they are alone."""
+    chosen = {name: IMPERFECT[name] for name in names}
+    clean, batch = (module(root, augmentation=a).training_batch(1) for a in ({}, chosen))
+    assert differing(clean, batch) == changed
+    together = module(root, augmentation=IMPERFECT).training_batch(1)
+    assert differing(clean, together) == {"images", "masks", "cameras.intrinsics", "cameras.extrinsics"}
+    if names == ("calibration",):
+        assert "cameras.extrinsics" not in differing(batch, together)
+    for one in (batch, together):
+        assert one.images.min() >= 0
+        assert one.images.max() <= 1
+        assert one.masks.flatten(2).any(-1).all()
+
+
+def test_imperfections_do_not_depend_on_batch_mates(root):
+    """Two elements together are as each alone."""
+    batch = module(root).training_batch(0)
+    augmentation = Augmentation(**IMPERFECT)
+
+    def imperfect(one, seeds):
+        return augmentation.imperfections(one, [np.random.default_rng(seed) for seed in seeds])
+
+    def element(one, b):
+        return Batch(one.images[[b]], one.masks[[b]], one.cameras[[b]])
+
+    both = imperfect(batch, (3, 4))
+    for b, seed in enumerate((3, 4)):
+        alone = imperfect(element(batch, b), (seed,))
+        assert torch.equal(alone.images[0], both.images[b])
+        assert torch.equal(alone.masks[0], both.masks[b])
+        assert torch.equal(alone.cameras.extrinsics[0], both.cameras.extrinsics[b])
+
+
+def test_validation_does_not_vary(root):
+    """Numbers of different runs are measured on the same photographs."""
+    clean, varied = (module(root, views=V4, augmentation=a) for a in ({}, EVERYTHING))
+    assert all(map(equal, clean.val_dataloader(), varied.val_dataloader()))
+
+
+def test_shipped_variation_is_built():
+    """The option composes; its sizes fit the encoder's patch."""
+    augmentation = Augmentation(**compose("train", ["augmentation=captures"]).augmentation)
+    assert all(side % 14 == 0 for size in augmentation.sizes for side in size)
+    assert all(getattr(augmentation, name) > 0 for name in IMPERFECT)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"sizes": []}, "augmentation.sizes: expected sizes or null; found"),
+        ({"sizes": [[3, 4, 5]]}, "augmentation.sizes: expected a side or"),
+        ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
+        ({"calibration": -1}, "augmentation.calibration: expected at least 0; found -1"),
+        ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole"),
+    ],
+)
+def test_impossible_values_are_refused(root, values, message):
+    """The message names the key."""
+    with pytest.raises(InputError, match=message):
+        module(root, augmentation=values)

@@ -1,0 +1,152 @@
+"""Imperfections of captures: their limits, measured in stops and in pixels by other means."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from ghgs_lit.data.imperfections import color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import project
+from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.types import Cameras
+
+
+def figure(height=96, width=72) -> np.ndarray:
+    """A body with outstretched arms."""
+    mask = np.zeros((height, width), bool)
+    mask[10:85, 28:44] = True
+    mask[25:33, 8:64] = True
+    return mask
+
+
+def disc(radius: float) -> np.ndarray:
+    reach = np.arange(-int(radius), int(radius) + 1)
+    return reach[:, None] ** 2 + reach**2 <= radius**2
+
+
+def test_gains_stay_within_their_stops_and_change_nothing_on_average():
+    """A stop doubles the light; stored values are light to the power 1/2.2."""
+    largest = np.zeros(3)
+    for seed in range(40):
+        gains = color_gains(4, 0.5, 0.2, np.random.default_rng(seed))
+        stops = 2.2 * np.log2(gains)
+        np.testing.assert_allclose(stops.mean(0), 0, atol=1e-9)
+        tint = stops - stops[:, [1]]
+        found = np.abs(np.stack((stops[:, 1], tint[:, 0], tint[:, 2]))).max(1)
+        assert (found <= np.array([0.5, 0.2, 0.2]) + 1e-9).all()
+        largest = np.maximum(largest, found)
+    assert (largest > 0.9 * np.array([0.5, 0.2, 0.2])).all()
+
+
+def test_masks_grow_shrink_and_fray_within_their_pixels():
+    """Nothing farther from the outline than the limits changes, and up to there it does."""
+    mask = figure()
+    most = {"grown": 0, "shrunk": 0}
+    both = 0
+    for seed in range(12):
+        for offset, ragged in ((3, 0), (0, 3), (1.5, 1.5)):
+            found = imperfect_mask(mask, offset, ragged, 0, 0, np.random.default_rng(seed))
+            # The outline lies half a pixel from the centres of its pixels.
+            assert not (found & ~binary_dilation(mask, disc(3.5))).any()
+            assert not (binary_erosion(mask, disc(3.5)) & ~found).any()
+            grown, shrunk = (found & ~mask).sum(), (mask & ~found).sum()
+            if ragged == 0:
+                assert grown == 0 or shrunk == 0
+                most = {"grown": max(most["grown"], grown), "shrunk": max(most["shrunk"], shrunk)}
+            both += bool(grown and shrunk)
+    outline = (mask & ~binary_erosion(mask)).sum()
+    assert min(most.values()) > 1.5 * outline
+    assert both > 6
+
+
+def test_a_missing_piece_is_round_and_not_larger_than_its_share():
+    """What is missing fits into a circle; the chance decides how often, 0 never."""
+    mask, missing = figure(), 0
+    for seed in range(60):
+        found = imperfect_mask(mask, 0, 0, 0.2, 0.5, np.random.default_rng(seed))
+        gone = np.argwhere(mask & ~found)
+        assert not (found & ~mask).any()
+        missing += len(gone) > 0
+        if len(gone):
+            distances = np.linalg.norm(gone[:, None] - gone, axis=-1)
+            assert distances.max() <= 0.2 * 75
+    assert 15 < missing < 40
+    np.testing.assert_array_equal(imperfect_mask(mask, 0, 0, 0.2, 0, np.random.default_rng(0)), mask)
+
+
+@pytest.mark.parametrize("mask", [np.eye(1, 30, 7, bool).repeat(20, 0), np.ones((14, 28), bool)])
+def test_no_mask_is_emptied(mask):
+    """A line one pixel wide, and a subject that fills the photograph."""
+    for seed in range(20):
+        assert imperfect_mask(mask, 4, 4, 3.0, 1.0, np.random.default_rng(seed)).any()
+
+
+def ring(shift=0.0, dtype=torch.float64) -> tuple[Cameras, torch.Tensor, torch.Tensor]:
+    """Four cameras, their masks of an ellipsoid, and points [n, 3] on it."""
+    cameras = Rig().cameras(np.array([10.0, 80.0, 150.0, 290.0]), 96, 72)
+    directions = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, 3)))
+    points = directions / directions.norm(dim=-1, keepdim=True) * torch.tensor([0.3, 0.85, 0.25])
+    points = points + torch.tensor([0, 0.9, 0])
+    masks = torch.zeros(4, 96, 72, dtype=torch.bool)
+    for v in range(4):
+        pixels, _ = project(points, cameras.intrinsics[v].double(), cameras.extrinsics[v].double())
+        columns, rows = pixels.floor().long().unbind(-1)
+        masks[v, rows, columns] = True
+    extrinsics = cameras.extrinsics.to(dtype).clone()
+    extrinsics[:, :3, 3] -= shift * extrinsics[:, :3, :3].sum(-1)  # the world's origin moves by (s, s, s)
+    return Cameras(cameras.intrinsics.to(dtype), extrinsics, 96, 72), masks, points + shift
+
+
+def moved_by(found: Cameras, cameras: Cameras, points: torch.Tensor) -> torch.Tensor:
+    """Root mean square [V] in pixels that points move by."""
+    pixels = [
+        [project(points, c.intrinsics[v].double(), c.extrinsics[v].double())[0] for v in range(4)]
+        for c in (found, cameras)
+    ]
+    return (torch.stack(pixels[0]) - torch.stack(pixels[1])).square().sum(-1).mean(-1).sqrt()
+
+
+@pytest.mark.parametrize("limit", [1.0, 3.0])
+def test_calibration_errors_move_the_subject_by_their_pixels(limit):
+    """Points of the surface move by up to the limit in each photograph; cameras stay cameras."""
+    cameras, masks, points = ring()
+    errors = []
+    for seed in range(25):
+        found = miscalibrated(cameras, masks, limit, np.random.default_rng(seed))
+        errors.append(moved_by(found, cameras, points))
+        rotation = found.extrinsics[:, :3, :3]
+        torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).double().expand(4, 3, 3))
+        assert (found.intrinsics[:, :2, 2] == cameras.intrinsics[:, :2, 2]).all()
+    errors = torch.cat(errors) / limit
+    assert errors.max() < 1.15  # the corners of the box, not the surface, have the error exactly
+    assert errors.max() > 0.7
+    assert 0.3 < errors.mean() < 0.6
+
+
+def test_calibration_errors_do_not_depend_on_the_worlds_origin():
+    """A world whose origin is a kilometre away has the same errors, up to the rounding of rotations."""
+    results = []
+    for shift in (0.0, 1000.0):
+        cameras, masks, points = ring(shift)
+        found = miscalibrated(cameras, masks, 2.0, np.random.default_rng(3))
+        results.append(moved_by(found, cameras, points))
+    torch.testing.assert_close(*results, rtol=1e-3, atol=0)
+
+
+def test_a_photograph_without_the_subject_is_no_obstacle():
+    """Small sizes may lose a mask: it stays empty, and its camera has an error like others."""
+    cameras, masks, points = ring()
+    masks[1] = False
+    found = miscalibrated(cameras, masks, 2.0, np.random.default_rng(0))
+    assert 0 < moved_by(found, cameras, points)[1] < 2.3
+    assert not imperfect_mask(masks[1].numpy(), 2, 2, 0.2, 1.0, np.random.default_rng(0)).any()
+
+
+def test_cameras_that_look_away_from_one_another_are_refused():
+    """There is no subject whose points could move by pixels."""
+    cameras, masks, _ = ring()
+    turned = cameras.extrinsics.clone()
+    turned[:, [0, 2]] *= -1  # by half a turn
+    with pytest.raises(InputError, match=r"augmentation\.calibration: expected cameras that look at"):
+        miscalibrated(Cameras(cameras.intrinsics, turned, 96, 72), masks, 1.0, np.random.default_rng(0))
