@@ -24,6 +24,7 @@ from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.evaluation.baselines import nearest_view, splatted
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
+from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.types import Batch, Targets
 from ghgs_lit.visualization.pictures import save_png, to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -65,7 +66,8 @@ def main() -> None:
     device = pick_device(config["device"])
     renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
-    batch, _ = Capture.read(options.images, options.cameras).batch(image_size("size", size))
+    batch = Capture.read(options.images, options.cameras).batch(image_size("size", size))
+    batch = Frame.of(batch).enter(batch)  # baselines compute in float32
     hull = partial(hull_depth, hull=VisualHull())
     methods: dict[str, Method] = {
         "nearest view": nearest_view,

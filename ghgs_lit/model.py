@@ -15,6 +15,7 @@ from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
 from ghgs_lit.encoder import FeatureCache, VGGTEncoder
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
@@ -25,7 +26,7 @@ from ghgs_lit.rounds import Rounds, State
 from ghgs_lit.skipping import AutoSkip, auto_skip
 from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, require_fit
-from ghgs_lit.weights.reading import cast
+from ghgs_lit.weights.reading import SHIPPED, cast
 
 #: Stages with weights whose widths follow the encoder's.
 HEADS = ("depth_head", "recalibration", "gaussian_head")
@@ -50,6 +51,8 @@ class GHGS(nn.Module):
         gaussian_head: tokens to Gaussians.
         pad: ``multiple`` gives photographs of any size a black border up to the next multiple of the patch
             size; ``none`` refuses them.
+        frame: ``subject`` gives the stages each scene in metres around its subject, whatever the world's
+            unit, origin and axes (:mod:`ghgs_lit.geometry.frame`); ``world`` as it is.
         check_inputs: refuse values that are not finite or out of range (:func:`check_batch`).
         auto: chooses what the encoder sees of each subject (``skip=auto``); None: it does itself.
         rounds: correct the Gaussians; None: those of the Gaussian head are the result. They need bounds.
@@ -64,12 +67,14 @@ class GHGS(nn.Module):
         recalibration: Recalibration,
         gaussian_head: GaussianHead,
         pad: str = "none",
+        frame: str = "subject",
         check_inputs: bool = True,
         auto: AutoSkip | None = None,
         rounds: Rounds | None = None,
     ):
         super().__init__()
         choice("model.pad", pad, ("none", "multiple"))
+        choice("model.frame", frame, ("subject", "world"))
         has_bounds = not isinstance(bounds, NoBounds)
         expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
         found = f"{type(bounds).__name__} with {depth_head.parameterization}"
@@ -84,7 +89,7 @@ class GHGS(nn.Module):
         self.recalibration = recalibration
         self.rounds = rounds
         self.gaussian_head = gaussian_head
-        self.pad, self.check_inputs, self.auto = pad, check_inputs, auto
+        self.pad, self.frame, self.check_inputs, self.auto = pad, frame, check_inputs, auto
         #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | None = None
         self.precision = "inherit"
@@ -105,12 +110,19 @@ class GHGS(nn.Module):
         return 1 if self.pad == "multiple" else self.encoder.patch_size
 
     def forward(self, batch: Batch) -> Prediction:
-        """Gaussians, depths and points of a batch.
+        """Gaussians, depths and points of a batch, in the world of its cameras.
 
         Raises:
             InputError: :func:`check_batch` refuses the batch.
         """
         check_batch(batch, self.side_multiple, self.check_inputs)
+        if self.frame == "world":
+            return self._predict(batch)
+        frame = Frame.of(batch)
+        return frame.leave(self._predict(frame.enter(batch)), batch.cameras.extrinsics.dtype)
+
+    def _predict(self, batch: Batch) -> Prediction:
+        """:meth:`forward` of a batch in the frame of the stages."""
         # From the photographs: padding invents something at their border.
         bounds = self.bounds(batch)
         padding = pad_to_patches(batch.masks, self.encoder.patch_size) if self.pad == "multiple" else None
@@ -154,8 +166,8 @@ class GHGS(nn.Module):
         """The model that a configuration describes.
 
         Args:
-            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.choices``, ``model.pad``
-                and ``model.check_inputs``; other keys are ignored.
+            config: with the nodes :data:`STAGES`, and, where they are given, ``skip.choices``, ``model.pad``,
+                ``model.frame`` and ``model.check_inputs``; other keys are ignored.
             empty: stages that are built without storage (on the meta device), for weights to be assigned to.
 
         Raises:
@@ -176,6 +188,8 @@ class GHGS(nn.Module):
             unprojection=stage("unprojection"),
             **{name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS},
             pad=options.get("pad", "none"),
+            # Checkpoints from before this option have learned offsets and rotations along the world's axes.
+            frame=options.get("frame", "world"),
             check_inputs=options.get("check_inputs", True),
             auto=auto_skip(config.get("skip") or {}),
             rounds=stage("rounds", channels=config["gaussian_head"]["channels"])
@@ -185,14 +199,14 @@ class GHGS(nn.Module):
 
     @classmethod
     def from_checkpoint(
-        cls, path: str | Path, map_location: Any = "cpu", dtype: torch.dtype | None = None
+        cls, path: str | Path = SHIPPED, map_location: Any = "cpu", dtype: torch.dtype | None = None
     ) -> "GHGS":
         """The model of a checkpoint, in evaluation mode; needs no YAML.
 
         The weights are mapped from the file, not copied.
 
         Args:
-            path: of the checkpoint.
+            path: of the checkpoint; that of the package where none is given.
             map_location: device of the model.
             dtype: of the encoder (None: as in the file); the heads are float32 or wider.
 

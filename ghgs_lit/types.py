@@ -264,12 +264,16 @@ class DepthMaps(_TensorStruct):
 
 @dataclass(frozen=True)
 class Points(_TensorStruct):
-    """World points of pixels and of tokens, in metres. Invalid ones are finite but meaningless."""
+    """World points of pixels and of tokens, in metres. Invalid ones are finite but meaningless.
+
+    ``token_image`` is the image (``b * V + v``) of each token.
+    """
 
     pixels: Float[Tensor, "B V H W 3"]
     valid: Bool[Tensor, "B V H W"]
     tokens: Float[Tensor, "N 3"]
     tokens_valid: Bool[Tensor, " N"]
+    token_image: Int[Tensor, " N"]
 
 
 @dataclass(frozen=True)
@@ -279,7 +283,8 @@ class Gaussians(_TensorStruct):
     ``quaternions`` need not have unit norm; ``scales`` are standard deviations in metres; ``colors`` may have
     any number of channels. ``image`` (``b * V + v``) and ``pixel`` (row-major index) are the input pixel that
     a Gaussian belongs to, None where there is none. ``low_pass`` (px^2) and ``antialiased`` are constants of
-    the image (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for.
+    the image (:class:`ghgs_lit.rendering.RasterSettings`) that they were made for. ``metre`` is the length
+    of a metre in the unit of each element's world (:mod:`ghgs_lit.geometry.frame`); None: that is the metre.
     """
 
     means: Float[Tensor, "N 3"]
@@ -292,6 +297,7 @@ class Gaussians(_TensorStruct):
     pixel: Int[Tensor, " N"] | None = None
     low_pass: float = 0.3
     antialiased: bool = False
+    metre: Float[Tensor, " B"] | None = None
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -306,7 +312,7 @@ class Gaussians(_TensorStruct):
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in dataclasses.fields(self)
-            if isinstance(getattr(self, f.name), Tensor)
+            if f.name != "metre" and isinstance(getattr(self, f.name), Tensor)
         }
         return dataclasses.replace(self, **changes, splits=splits)
 
@@ -317,7 +323,9 @@ class Gaussians(_TensorStruct):
         element %= len(self.splits)
         start = sum(self.splits[:element])
         count = self.splits[element]
-        return self.select(slice(start, start + count), (count,))
+        found = self.select(slice(start, start + count), (count,))
+        metre = None if self.metre is None else self.metre[element : element + 1]
+        return dataclasses.replace(found, metre=metre)
 
 
 @dataclass(frozen=True)
@@ -331,7 +339,8 @@ class Decision:
 
 @dataclass(frozen=True)
 class Prediction(_TensorStruct):
-    """The result of ``model(batch)``; ``depth`` in metres, meaningful where ``depth_valid``.
+    """The result of ``model(batch)``, in the world and the unit of its cameras (metres by convention);
+    ``depth`` is meaningful where ``depth_valid``.
 
     ``decisions`` has one of each element with ``skip=auto``, none otherwise. ``rounds`` are the depths before
     the first round and after each (the last is ``depth_maps``), ``drafts`` the Gaussians before each.

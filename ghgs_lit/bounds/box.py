@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -16,8 +15,9 @@ from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.rays import depths_in_box, pixel_axes, projection_matrices
 from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, silhouettes, votes_outside
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last
-from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, project
+from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: The largest bound, in metres: cameras of absurd sizes overflow.
@@ -98,7 +98,7 @@ def subject_box(
     Returns:
         The corners with the smallest and with the largest coordinates, in metres.
     """
-    center = _center(masks, cameras)
+    center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center)[:, None]
     lower, upper = center - reach, center + reach
     focal = _focal_lengths(cameras).amax(-1)
@@ -145,32 +145,6 @@ def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor
 
 def _focal_lengths(cameras: Cameras) -> Float[Tensor, "B V 2"]:
     return at_least_float32(cameras.intrinsics).diagonal(dim1=-2, dim2=-1)[..., :2]
-
-
-def _center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
-    """The point nearest to the rays through the masks' centroids, by least squares.
-
-    The optical axes take part with a small weight, so that one mask, or none, is enough; a still smaller
-    pull towards the cameras keeps parallel rays solvable.
-    """
-    intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
-    u, v = pixel_axes(cameras)
-    counts = masks.sum((-2, -1))
-    sums = torch.stack(((masks.sum(-2) * u).sum(-1), (masks.sum(-1) * v).sum(-1)), -1)
-    axis = intrinsics[..., :2, 2]
-    centroid = torch.where(counts[..., None] > 0, sums / counts.clamp(min=1)[..., None], axis)
-    rays = torch.stack((centroid, axis), dim=-2)
-    rays = torch.cat((rays, torch.ones_like(rays[..., :1])), -1)
-    to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
-    directions = F.normalize(torch.einsum("bvij,bvrj->bvri", to_world, rays), dim=-1)
-    weights = torch.stack((counts > 0, torch.full_like(counts, 1e-3, dtype=rays.dtype)), -1)
-    identity = torch.eye(3, device=rays.device, dtype=rays.dtype)
-    across = identity - directions[..., :, None] * directions[..., None, :]
-    across = (weights[..., None, None] * across).sum(2)
-    origin = cameras.centers.mean(1)
-    offsets = (cameras.centers - origin[:, None])[..., None]
-    matrix = across.sum(1) + 1e-4 * identity
-    return torch.linalg.solve(matrix, (across @ offsets).sum(1))[..., 0] + origin
 
 
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:

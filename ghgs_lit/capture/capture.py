@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from ghgs_lit.capture.normalization import Normalization, normalization_of
 from ghgs_lit.data.resampling import area_image, area_mask
 from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras
@@ -66,29 +65,27 @@ class Capture:
         require(len(found) == 1, str(images), "one instant (CaptureFolder reads several)", len(found))
         return folder.read(found[0])
 
-    def batch(self, size: tuple[int, int]) -> tuple[Batch, Normalization]:
-        """What a model sees: crops around the subject, of a person's size, about the origin.
+    def batch(self, size: tuple[int, int]) -> Batch:
+        """What a model sees: crops around the subject on a black background, a batch of one element.
+
+        Cameras are in the user's world, in float64, which a world far from its origin needs.
 
         Args:
             size: (height, width) of the crops in pixels.
-
-        Returns:
-            A batch of one element on a black background, and how it lies in the user's world.
         """
         crops = [crop_to_subject(photograph, size) for photograph in self.photographs]
-        normalization = normalization_of(crops)
         images = torch.from_numpy(np.stack([crop.image * crop.mask[..., None] for crop in crops]))
-        extrinsics = np.stack([normalization.extrinsics(crop.extrinsics) for crop in crops])
-        intrinsics = np.stack([crop.intrinsics for crop in crops])
-        cameras = (torch.from_numpy(matrices).float()[None] for matrices in (intrinsics, extrinsics))
-        batch = Batch(
+        cameras = (
+            torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
+            for name in ("intrinsics", "extrinsics")
+        )
+        return Batch(
             images=images.permute(0, 3, 1, 2)[None].float() / 255,
             masks=torch.from_numpy(np.stack([crop.mask for crop in crops]))[None],
             cameras=Cameras(*cameras, *size),
             subjects=(self.name,),
             views=(tuple(crop.name for crop in crops),),
         )
-        return batch, normalization
 
 
 def crop_to_subject(photograph: Photograph, size: tuple[int, int]) -> Photograph:

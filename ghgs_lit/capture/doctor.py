@@ -19,7 +19,6 @@ from ghgs_lit.capture.calibration import (
 )
 from ghgs_lit.capture.consistency import agreements
 from ghgs_lit.capture.folder import CaptureFolder
-from ghgs_lit.capture.normalization import PERSON
 from ghgs_lit.capture.photographs import Pixels
 from ghgs_lit.data.resampling import area_image, area_mask
 from ghgs_lit.data.silhouettes import Silhouette, extent, subject_place
@@ -31,6 +30,8 @@ AGREES, BETTER = 0.9, 0.05
 _SIDE = 320
 # Shares of a photograph between which a principal point is plausible.
 _MIDDLE = (0.3, 0.7)
+#: Largest extents that are taken for a person in metres.
+PERSON = (0.5, 2.5)
 # What photographs are resized by after a calibration.
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "kilometres": 1000.0}

@@ -10,12 +10,13 @@ from typing import Any
 import torch
 
 from ghgs_lit.capture.capture import Capture
-from ghgs_lit.capture.normalization import Normalization
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.reading import SHIPPED, file_of
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,11 @@ class CapturePrediction:
     Attributes:
         batch: what the model saw: crops around the subject, with their cameras.
         prediction: of this batch.
-        normalization: what the model saw it in.
         seconds: run time by stage.
     """
 
     batch: Batch
     prediction: Prediction
-    normalization: Normalization
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -41,13 +40,14 @@ class CapturePrediction:
 
 @torch.no_grad()
 def predict(
-    capture: Capture, model: GHGS | str | Path, size: int | tuple[int, int] | None = None
+    capture: Capture, model: GHGS | str | Path = SHIPPED, size: int | tuple[int, int] | None = None
 ) -> CapturePrediction:
     """The Gaussians of a capture.
 
     Args:
         capture: the photographs.
-        model: a model in evaluation mode, or the path of a checkpoint (kept in memory for further calls).
+        model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
+            one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
             (checkpoints only).
 
@@ -55,19 +55,21 @@ def predict(
         InputError: the checkpoint cannot be used, or the size does not fit the model.
     """
     if not isinstance(model, GHGS):
-        path = Path(model).expanduser()
+        path = file_of(model)
         size = size or trained_size(read_checkpoint(path)["config"])
         model = _model(path, path.stat().st_mtime_ns)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     begin = time.perf_counter()
-    batch, normalization = capture.batch(image_size("size", size))
+    batch = capture.batch(image_size("size", size))
     cropped = time.perf_counter()
     batch = batch.to(next(model.parameters()).device)
-    batch, prediction = normalization.to_user(batch, model(batch))
+    # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
+    frame = Frame.of(batch)
+    prediction = frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds = {"crop": cropped - begin, "predict": time.perf_counter() - cropped}
-    return CapturePrediction(batch, prediction, normalization, seconds)
+    return CapturePrediction(batch, prediction, seconds)
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:

@@ -34,7 +34,7 @@ def run(cfg: DictConfig) -> None:
     safe = config["release"] is not None or config["compat"]["name"] != "release"
     require(safe, "compat", "none where there is no release=<file>", config["compat"]["name"])
     L.seed_everything(config["seed"], workers=True, verbose=False)
-    model = {key: config[key] for key in MODEL_NODES}
+    model = {key: config[key] for key in MODEL_NODES if key in config}
     options = (config[key] for key in ("out", "vggt", "release", "dtype", "depth_head_start"))
     report = import_weights(initial_state(model, config["release"]), model, *options)
     print("\n".join(report), flush=True)

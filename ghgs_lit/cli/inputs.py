@@ -19,6 +19,7 @@ from ghgs_lit.model import GHGS, OPTIONS, STAGES
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.reading import SHIPPED
 
 #: Nodes of the configuration that describe the model; a checkpoint stores these.
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
@@ -87,6 +88,11 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
         return cfg
     if cfg.checkpoint is None:
         raise InputError("data: expected data=<option> where there is no checkpoint; found none")
+    if cfg.checkpoint == SHIPPED:  # its training data would have to be rendered first
+        expected = (
+            "images=<folder> cameras=<file>, or data=<option>, with the weights that come with the package"
+        )
+        raise InputError(f"data: expected {expected}; found neither")
     trained = read_checkpoint(cfg.checkpoint)["config"]
     if "data" not in trained:
         raise InputError(

@@ -114,12 +114,9 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
                 captures.append(pool.submit(folder.read, folder.instants[number]))
             result = predict(capture, model, size)
             seconds = {"read": waited, **result.seconds}
-            scene = result.normalization
             facts = {
                 "checkpoint": config["checkpoint"],
                 "seconds": seconds,
-                "subject_size": scene.size,
-                "scaled_inside_by": scene.scale,
                 **chosen_preset(model, result.prediction),
             }
             start = time.perf_counter()

@@ -264,6 +264,7 @@ KINDS: dict[str, Kind] = {
     "gaussian_head.photo_consistency": FLAG,
     "gaussian_head.pixels": TEXT,
     "model.check_inputs": FLAG,
+    "model.frame": TEXT,
     "model.name": TEXT,
     "model.pad": TEXT,
     "rounds.count": COUNT,

@@ -18,6 +18,7 @@ from ghgs_lit.export.scene import OutputOptions, Scene, options_of, scene_of
 from ghgs_lit.export.splat import to_records
 from ghgs_lit.export.video import write_mp4
 from ghgs_lit.files import write_atomically, write_text_atomically
+from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.rendering import Renderer
@@ -149,6 +150,7 @@ def _report(scene: Scene) -> dict[str, Any]:
         "gaussians_not_finite": scene.dropped,
         "frame": "world of the cameras" if scene.options.up is None else f"up is +{scene.options.up}",
         "up": scene.up.tolist(),
+        "subject_size": None if gaussians.metre is None else HEIGHT * float(gaussians.metre[0]),
         "smallest": means.amin(0).tolist(),
         "largest": means.amax(0).tolist(),
         "depth_pixels": dict(zip(scene.views, valid.flatten(1).sum(1).tolist(), strict=True)),

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
 from ghgs_lit.types import Cameras, Gaussians
 
 AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -23,13 +23,6 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
     return torch.nn.functional.normalize(quaternion, dim=0)
 
 
-def multiply(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """The products ``a b`` of quaternions (w, x, y, z): rotate by ``b``, then by ``a``."""
-    w, v = b[:, :1], b[:, 1:]
-    vector = a[0] * v + w * a[1:] + torch.linalg.cross(a[1:].expand_as(v), v)
-    return torch.cat([a[0] * w - v @ a[1:, None], vector], dim=-1)
-
-
 def rotate_world(
     quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
 ) -> tuple[Gaussians, Cameras]:
@@ -40,7 +33,7 @@ def rotate_world(
     quaternion = quaternion.double()
     rotation = quaternion_to_matrix(quaternion)
     means = gaussians.means.double() @ rotation.to(gaussians.means.device).mT
-    quaternions = multiply(quaternion.to(means.device), gaussians.quaternions.double())
+    quaternions = multiply_quaternions(quaternion.to(means.device), gaussians.quaternions.double())
     extrinsics = cameras.extrinsics.double().clone()
     extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotation.to(extrinsics.device).mT
     return (

@@ -26,3 +26,37 @@ def quaternion_to_matrix(quaternions: Float[Tensor, "*batch 4"]) -> Float[Tensor
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def matrix_to_quaternion(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternions of proper rotations, from the largest of four squares (Shepperd 1978)."""
+    m = [[matrices[..., i, j] for j in range(3)] for i in range(3)]
+    x, y, z = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    xy, xz, yz = m[1][0] + m[0][1], m[0][2] + m[2][0], m[2][1] + m[1][2]
+    a, b, c = m[0][0], m[1][1], m[2][2]
+    rows = (
+        (1 + a + b + c, x, y, z),
+        (x, 1 + a - b - c, xy, xz),
+        (y, xy, 1 - a + b - c, yz),
+        (z, xz, yz, 1 - a - b + c),
+    )
+    table = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    best = table.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    chosen = table.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
+    return chosen / chosen.norm(dim=-1, keepdim=True)
+
+
+def multiply_quaternions(
+    first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """The products ``first second``: rotate by ``second``, then by ``first``; norms are multiplied."""
+    (a, b, c, d), (w, x, y, z) = first.unbind(-1), second.unbind(-1)
+    return torch.stack(
+        (
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ),
+        dim=-1,
+    )

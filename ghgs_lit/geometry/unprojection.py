@@ -51,6 +51,7 @@ class Unprojection:
             valid=depth_maps.valid,
             tokens=points.flatten(0, 1)[index],
             tokens_valid=valid.flatten(0, 1)[index],
+            token_image=tokens.image,
         )
 
     def _release_tokens(self, depth_maps: DepthMaps, patch_size: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
 from ghgs_lit.rendering import gsplat_backend
 from ghgs_lit.rendering.settings import RasterSettings, is_finite_number
 from ghgs_lit.types import Cameras, Gaussians, Rendering
@@ -42,7 +42,8 @@ def render(
         backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
             means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
-        near, far: metres; only Gaussians whose centre has ``near <= z <= far`` are drawn.
+        near, far: metres (see ``gaussians.metre``); only Gaussians whose centre has ``near <= z <= far`` are
+            drawn.
         settings: constants of the image; None for the defaults, or what the Gaussians were made for.
         region: the box to draw (top, left, height, width) in pixels, one for all views or one for each.
             Outside it the image is background and has no gradient; the CPU backend skips that work.
@@ -60,9 +61,10 @@ def render(
     _check_inputs(gaussians, cameras)
     backend = resolve_backend(backend, gaussians.means.device)
     module = importlib.import_module(f"ghgs_lit.rendering.{_MODULES[backend]}")
-    gaussians = _in_one_dtype(gaussians)
-    cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
+    metre = gaussians.metre
     with torch.autocast(gaussians.means.device.type, enabled=False):
+        gaussians, cameras = _in_metres(*_around_cameras(_in_one_dtype(gaussians), cameras))
+        cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
         options = (settings, float(near), float(far))
         regions = None if region is None else _regions(region, cameras)
         if backend == "cpu":
@@ -70,6 +72,9 @@ def render(
         else:
             rendering = module.rasterize(gaussians, cameras, *options)
             rendering = rendering if regions is None else _masked(rendering, regions)
+        if metre is not None:
+            metre = metre.to(rendering.depth)[:, None, None, None, None]
+            rendering = dataclasses.replace(rendering, depth=rendering.depth * metre)
         if is_finite_number(background) and background == 0:
             return rendering
         behind = (1 - rendering.alpha) * _background(background, rendering.image)
@@ -198,7 +203,40 @@ def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
     tensors = {name: at_least_float32(getattr(gaussians, name)) for name in fields}
     is_double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
     dtype = torch.float64 if is_double else torch.float32
-    return Gaussians(**{name: t.to(dtype) for name, t in tensors.items()}, splits=gaussians.splits)
+    tensors = {name: t.to(dtype) for name, t in tensors.items()}
+    return Gaussians(**tensors, splits=gaussians.splits, metre=gaussians.metre)
+
+
+def _of_each(values: Tensor, gaussians: Gaussians) -> Tensor:
+    """``values`` of the elements [B, ...] for each of their Gaussians."""
+    counts = torch.tensor(gaussians.splits, device=values.device)
+    return values.repeat_interleave(counts, dim=0, output_size=len(gaussians))
+
+
+def _around_cameras(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    """Means in float64 relative to each element's first camera: the backends compute in float32."""
+    if gaussians.means.dtype != torch.float64 or 0 in cameras.shape:
+        return gaussians, cameras
+    origin = cameras[:, 0].to(torch.float64).centers.detach()
+    extrinsics = cameras.extrinsics.double()
+    moved = world_to_camera(origin[:, None].expand(*cameras.shape, 3), extrinsics)
+    extrinsics = torch.cat((extrinsics[..., :3, :3], moved[..., None]), -1)
+    extrinsics = torch.cat((extrinsics, cameras.extrinsics[..., 3:, :].double()), -2)
+    means = gaussians.means - _of_each(origin, gaussians)
+    return dataclasses.replace(gaussians, means=means), dataclasses.replace(cameras, extrinsics=extrinsics)
+
+
+def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Cameras]:
+    """A scene in metres, in which near and far are."""
+    if gaussians.metre is None:
+        return gaussians, cameras
+    lengths = _of_each(gaussians.metre.to(gaussians.means), gaussians)[:, None]
+    extrinsics = cameras.extrinsics.clone()
+    extrinsics[..., :3, 3] = extrinsics[..., :3, 3] / gaussians.metre.to(extrinsics)[:, None, None]
+    gaussians = dataclasses.replace(
+        gaussians, means=gaussians.means / lengths, scales=gaussians.scales / lengths, metre=None
+    )
+    return gaussians, dataclasses.replace(cameras, extrinsics=extrinsics)
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor | float:

@@ -8,6 +8,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, write_checkpoint
 from ghgs_lit.weights.reading import cast
 
+_NOWHERE = {"resume": None, "init_from": None}  # paths of the machine that trained it
 _FACTS = ("imported",)  # what :meth:`GHGS.load` reads beside weights and configuration
 
 
@@ -28,4 +29,4 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
     state = cast(lambda: model_state(read_checkpoint(checkpoint)), lambda *_: getattr(torch, dtype))
     require_finite(state, f"{checkpoint} as {dtype}")
     facts = {name: content[name] for name in _FACTS if name in content}
-    write_checkpoint(path, state, content["config"], **facts)
+    write_checkpoint(path, state, {**content["config"], **_NOWHERE}, **facts)

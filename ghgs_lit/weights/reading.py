@@ -26,10 +26,17 @@ FAILED_DOWNLOADS = (
     (b"<html", _WEB_PAGE),
     (b"<?xml", "an XML document, as servers send it for an error"),
 )
+#: The name of the checkpoint that comes with the package (docs/model_card.md), and its file.
+SHIPPED, SHIPPED_FILE = "shipped", Path(__file__).with_name("shipped.ckpt")
 ZIP, PICKLE = b"PK", b"\x80"
 
 #: Bytes of tensors to convert before the file is mapped again.
 _CHUNK = 1 << 28
+
+
+def file_of(path: str | Path) -> Path:
+    """The file of a checkpoint, which may be :data:`SHIPPED`."""
+    return SHIPPED_FILE if str(path) == SHIPPED else Path(path).expanduser()
 
 
 def open_file(path: str | Path, map_location: Any = "cpu") -> Any:
@@ -38,14 +45,14 @@ def open_file(path: str | Path, map_location: Any = "cpu") -> Any:
     Nothing in the file is ever executed (``weights_only=True``).
 
     Args:
-        path: the file.
+        path: the file, or :data:`SHIPPED`.
         map_location: the device of the tensors, as for ``torch.load``.
 
     Raises:
         FileNotFoundError: there is no such file.
         InputError: it has another format, is truncated, or holds code.
     """
-    path = Path(path)
+    path = file_of(path)
     start = _first_bytes(path)
     if start.startswith(ZIP):
         if not zipfile.is_zipfile(path):

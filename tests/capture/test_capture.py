@@ -28,7 +28,7 @@ def test_crops_hold_the_subject_and_their_cameras_follow(tmp_path):
     """A point projects to the same place of the subject before and after the crop."""
     figure = Figure(height=160, width=120)
     capture = Capture.read(tmp_path, figure.write(tmp_path))
-    batch, _ = capture.batch((84, 56))
+    batch = capture.batch((84, 56))
     assert batch.images.shape == (1, 4, 3, 84, 56)
     assert (batch.images[0].movedim(1, -1)[~batch.masks[0]] == 0).all()
     for v, photograph in enumerate(capture.photographs):
@@ -39,8 +39,7 @@ def test_crops_hold_the_subject_and_their_cameras_follow(tmp_path):
         after = np.argwhere(mask)[:, ::-1] + 0.5
         place = (pixel_of(photograph) - before.min(0)) / np.ptp(before, axis=0)
         camera = batch.cameras[0, v]
-        normal = (HEAD[0] - torch.from_numpy(capture.batch((84, 56))[1].origin)).float()
-        pixel = project(normal[None], camera.intrinsics[None], camera.extrinsics[None])[0][0].numpy()
+        pixel = project(HEAD, camera.intrinsics[None], camera.extrinsics[None])[0][0].numpy()
         assert np.abs(place - (pixel - after.min(0)) / np.ptp(after, axis=0)).max() < 0.04
 
 
@@ -50,7 +49,7 @@ def test_a_subject_cut_by_the_border_is_cut_in_the_crop(tmp_path):
     figure.images, figure.masks = figure.images[:, :90], figure.masks[:, :90]
     for camera in figure.cameras.values():
         camera["height"] = 90
-    batch, _ = Capture.read(tmp_path, figure.write(tmp_path)).batch((84, 84))
+    batch = Capture.read(tmp_path, figure.write(tmp_path)).batch((84, 84))
     assert batch.masks[0, :, -1].any(-1).all()
 
 
@@ -63,13 +62,10 @@ def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
     first = Capture.read(tmp_path / "a", Figure().write(tmp_path / "a"))
     other = Capture.read(tmp_path / "b", Figure(scale=scale, origin=origin).write(tmp_path / "b"))
     person, moved = (predict(capture, model, 56) for capture in (first, other))
-    # As large as a person inside: 1.7 of its units, not those of the calibration.
-    inside = moved.normalization.scale * scale
-    assert 0.9 < inside < 1.1
+    assert float(moved.gaussians.metre) == pytest.approx(scale * float(person.gaussians.metre), rel=1e-5)
     expected = person.gaussians.means.double() * scale + torch.tensor(origin).double()
     error = (moved.gaussians.means.double() - expected).norm(dim=-1).median() / scale
-    limit = 0.01 + 2e-7 * max(map(abs, origin)) / scale  # float32 so far from the world's origin
-    assert error < limit
+    assert error < 1e-5
     ratio = (moved.gaussians.scales / scale / person.gaussians.scales).median()
     assert ratio == pytest.approx(1, abs=0.05)
     camera = moved.batch.cameras[0, 0]
@@ -124,13 +120,13 @@ def test_photographs_may_differ_in_size(tmp_path):
     """One camera gives half the size; its intrinsics follow, and the batch is the same but for its grain."""
     figure = Figure()
     path = figure.write(tmp_path)
-    before, _ = Capture.read(tmp_path, path).batch((56, 56))
+    before = Capture.read(tmp_path, path).batch((56, 56))
     small = Image.fromarray(figure.images[1]).resize((48, 64), Image.Resampling.BOX)
     small.save(tmp_path / "cam1.png")
     Image.fromarray(figure.masks[1]).resize((48, 64), Image.Resampling.NEAREST).save(
         tmp_path / "cam1_mask.png"
     )
-    after, _ = Capture.read(tmp_path, path).batch((56, 56))
+    after = Capture.read(tmp_path, path).batch((56, 56))
     assert (before.masks ^ after.masks).float().mean() < 0.03
     np.testing.assert_allclose(before.cameras.intrinsics[0, 1], after.cameras.intrinsics[0, 1], rtol=0.05)
 

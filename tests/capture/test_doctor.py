@@ -8,9 +8,19 @@ from ghgs_lit.capture.consistency import agreements
 from ghgs_lit.capture.doctor import diagnose
 from ghgs_lit.capture.drawing import camera_sheet
 from ghgs_lit.capture.folder import CaptureFolder
-from ghgs_lit.capture.normalization import coarse
+from ghgs_lit.data.resampling import area_mask
+from ghgs_lit.data.silhouettes import Silhouette
 from tests.helpers.figures import Figure
 from tests.helpers.mistakes import ALL, ONE
+
+
+def coarse(photograph, cells):
+    """The silhouette of a photograph in at most ``cells`` along its longer side."""
+    shape = np.array(photograph.mask.shape)
+    size = np.maximum(np.round(shape * min(cells / shape.max(), 1)).astype(int), 1)
+    intrinsics = photograph.intrinsics.copy()
+    intrinsics[:2] *= (size / shape)[::-1, None]
+    return Silhouette(area_mask(photograph.mask, *size.tolist()), intrinsics, photograph.extrinsics)
 
 
 def examine(folder, cameras=None, figure=None):

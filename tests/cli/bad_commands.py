@@ -96,7 +96,7 @@ MISSING = [
     ("evaluate checkpoint={tmp}/none.ckpt", 1, "{tmp}/none.ckpt: expected"),
     ("evaluate checkpoint={ckpt}", 1, "data: expected data=<option>", "{ckpt}"),
     ("evaluate checkpoint={ckpt} data=thuman2 model.pad=multiple", 1, "data.root: expected", "found null"),
-    ("predict", 1, "checkpoint: expected a value", "found none"),
+    ("predict", 1, "data: expected images=<folder> cameras=<file>, or data=<option>", "found neither"),
     ("predict checkpoint={tmp}/none.ckpt", 1, "{tmp}/none.ckpt: expected"),
     (
         "predict checkpoint={ckpt} data=thuman2 model.pad=multiple data.root={tmp}/none",

@@ -274,9 +274,9 @@ def test_predict_reads_the_photographs_of_one_subject(trained, tmp_path, monkeyp
     read = []
     view = Photographs.view
 
-    def recorded(self, name, position, number=0, depth=True):
+    def recorded(self, name, position, number=0, depth=True, size=None):
         read.append((name, position, number))
-        return view(self, name, position, number, depth)
+        return view(self, name, position, number, depth, size)
 
     monkeypatch.setattr(Photographs, "view", recorded)
     path = trained / "checkpoints" / "last.ckpt"

@@ -79,7 +79,7 @@ class Standin(nn.Module):
             colors=batch.images.movedim(2, -1)[masks] + self.shift,
             splits=tuple(masks.flatten(1).sum(1).tolist()),
         )
-        nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
+        nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.int64)
         maps = DepthMaps(depth, masks, torch.ones_like(depth))
         return Prediction(gaussians, depth, masks, Points(pixels, masks, *nothing), maps)
 

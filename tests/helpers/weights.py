@@ -32,7 +32,8 @@ def config(*overrides, tiny=True):
 @cache
 def _composed(overrides):
     composed = compose("import", overrides)
-    return json.dumps({key: OmegaConf.to_container(composed[key], resolve=True) for key in MODEL_NODES})
+    nodes = [key for key in MODEL_NODES if key in composed]
+    return json.dumps({key: OmegaConf.to_container(composed[key], resolve=True) for key in nodes})
 
 
 def import_weights(config, out, vggt, release=None, *args, **kwargs):

@@ -44,7 +44,13 @@ def _example(seed: int = 0, body: bool = True, depths: bool = True):
         gaussians=gaussians,
         depth=depth,
         depth_valid=valid,
-        points=Points(points, valid, torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)),
+        points=Points(
+            points,
+            valid,
+            torch.zeros(0, 3),
+            torch.zeros(0, dtype=torch.bool),
+            torch.zeros(0, dtype=torch.int64),
+        ),
         depth_maps=DepthMaps(depth, valid, torch.ones_like(depth)),
     )
     targets = Targets(

@@ -82,7 +82,11 @@ def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torc
     height, width = 2 * grid[0], 2 * grid[1]
     masks = torch.ones(b, v, height, width, dtype=torch.bool)
     points = Points(
-        torch.zeros(b, v, height, width, 3), masks, torch.randn(n, 3, generator=generator), valid.flatten()
+        torch.zeros(b, v, height, width, 3),
+        masks,
+        torch.randn(n, 3, generator=generator),
+        valid.flatten(),
+        image,
     )
     return tokens, points
 

@@ -97,7 +97,7 @@ def test_clouds_are_the_subjects_points_and_its_body():
     """Clouds belong to one subject, keep their colours and respect the limit."""
     model, batch = make_model().eval(), make_batch(2, 3)
     body = [torch.rand(9, 3), torch.rand(4, 3)]
-    batch = type(batch)(**{**vars(batch), "body_vertices": body})
+    batch = dataclasses.replace(batch, body_vertices=body)
     _, _, prediction = seen(model, batch)
     found = clouds(batch, prediction, 1, limit=50)
     assert list(found) == ["points", "body", "points_and_body"]
@@ -109,7 +109,7 @@ def test_clouds_are_the_subjects_points_and_its_body():
     assert torch.equal(colors[0], batch.images[1].movedim(1, -1)[valid][0])
     assert torch.equal(found["body"][0], body[1])
     assert len(found["points_and_body"][0]) == len(positions) + 4
-    nothing = type(batch)(**{**vars(batch), "masks": torch.zeros_like(batch.masks), "body_vertices": None})
+    nothing = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), body_vertices=None)
     assert clouds(nothing, prediction, 0) == {}
 
 

@@ -1,0 +1,178 @@
+"""A frame of the subject's own: the stages see each scene in metres, upright, around the origin.
+
+Photographs come with any unit and any origin. In float32 a world 1 km away costs 0.1 mm, limits in metres
+mean nothing in millimetres, and an axis-aligned box depends on the world's axes. So a batch is moved, turned
+and scaled on its way in, and its prediction on its way out, both in float64. Nothing here has a gradient but
+what passes through :meth:`Frame.leave`.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.geometry.masks import first_and_last
+from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, world_to_camera
+from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions
+from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
+
+#: Height (or width, if larger) of the subject in its frame, in metres.
+HEIGHT = 1.8
+
+
+@dataclass(frozen=True)
+class Frame:
+    """``world = origin + metre * axes^T point`` for the points of each element, in float64.
+
+    The axes are right, up and back of the first camera, with up the mean of all cameras'; the origin is the
+    subject's middle; ``metre`` is the length of a metre of the frame in the world's unit.
+    """
+
+    origin: Float[Tensor, "B 3"]
+    axes: Float[Tensor, "B 3 3"]
+    metre: Float[Tensor, " B"]
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, batch: Batch) -> "Frame":
+        """The frame of each element, from its masks and cameras alone."""
+        cameras = batch.cameras.to(torch.float64)
+        with torch.autocast(batch.masks.device.type, enabled=False):
+            origin = subject_center(batch.masks, cameras)
+            return cls(origin, _axes(cameras), _size(batch.masks, cameras, origin) / HEIGHT)
+
+    @torch.no_grad()
+    def enter(self, batch: Batch) -> Batch:
+        """The batch as the stages see it: its input cameras are in the frame, in the photographs' precision.
+
+        Targets, true depths and body vertices stay in the world.
+        """
+        cameras, dtype = batch.cameras, at_least_float32(batch.images).dtype
+        extrinsics = cameras.extrinsics.double()
+        moved = extrinsics.clone()
+        with torch.autocast(batch.masks.device.type, enabled=False):
+            moved[..., :3, :3] = extrinsics[..., :3, :3] @ self.axes[:, None].mT
+            moved[..., :3, 3] = _in_cameras(self.origin, extrinsics) / self.metre[:, None, None]
+        inside = Cameras(cameras.intrinsics.to(dtype), moved.to(dtype), cameras.height, cameras.width)
+        return dataclasses.replace(batch, cameras=inside)
+
+    def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
+        """A prediction in the frame as one in the world.
+
+        Args:
+            prediction: of the stages.
+            dtype: of points in the world, where they may need more digits than in the frame: that of its
+                cameras.
+        """
+        dtype = torch.promote_types(dtype, torch.float32)
+        views, points = prediction.depth.shape[1], prediction.points
+        everyone = torch.arange(len(self.metre), device=points.pixels.device)[:, None, None, None]
+        maps = self._maps(prediction.depth_maps)
+        return dataclasses.replace(
+            prediction,
+            gaussians=self._gaussians(prediction.gaussians, views, dtype),
+            depth=maps.depth,
+            points=dataclasses.replace(
+                points,
+                pixels=self._to_world(points.pixels, everyone).to(dtype),
+                tokens=self._to_world(points.tokens, points.token_image // views).to(dtype),
+            ),
+            depth_maps=maps,
+            rounds=tuple(self._maps(found) for found in prediction.rounds),
+            drafts=tuple(self._gaussians(draft, views, dtype) for draft in prediction.drafts),
+        )
+
+    def _maps(self, maps: DepthMaps) -> DepthMaps:
+        metre = self.metre.to(maps.depth)[:, None, None, None]
+        bounds = maps.bounds
+        if bounds is not None:
+            bounds = DepthBounds(bounds.near * metre, bounds.far * metre)
+        return dataclasses.replace(maps, depth=maps.depth * metre, bounds=bounds)
+
+    def _gaussians(self, gaussians: Gaussians, views: int, dtype: torch.dtype) -> Gaussians:
+        element, lengths = gaussians.image // views, self.metre.to(gaussians.scales)
+        turn = matrix_to_quaternion(self.axes.mT).to(gaussians.quaternions)
+        return dataclasses.replace(
+            gaussians,
+            means=self._to_world(gaussians.means, element).to(dtype),
+            quaternions=multiply_quaternions(turn[element], gaussians.quaternions),
+            scales=gaussians.scales * lengths[element, None],
+            metre=lengths if gaussians.metre is None else lengths * gaussians.metre,
+        )
+
+    def _to_world(self, points: Float[Tensor, "*n 3"], element: Tensor) -> Float[Tensor, "*n 3"]:
+        axes = (self.metre[:, None, None] * self.axes)[element].unbind(-2)
+        x, y, z = points.double()[..., None].unbind(-2)
+        return self.origin[element] + x * axes[0] + y * axes[1] + z * axes[2]
+
+
+def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:
+    """The point nearest to the rays through the masks' centroids, by least squares.
+
+    The optical axes take part with a small weight, so that one mask, or none, is enough; a still smaller
+    pull towards the cameras keeps parallel rays solvable.
+    """
+    intrinsics, extrinsics = at_least_float32(cameras.intrinsics), at_least_float32(cameras.extrinsics)
+    v, u = (torch.arange(side, device=masks.device, dtype=intrinsics.dtype) + 0.5 for side in masks.shape[2:])
+    counts = masks.sum((-2, -1))
+    sums = torch.stack(((masks.sum(-2) * u).sum(-1), (masks.sum(-1) * v).sum(-1)), -1)
+    axis = intrinsics[..., :2, 2]
+    centroid = torch.where(counts[..., None] > 0, sums / counts.clamp(min=1)[..., None], axis)
+    rays = torch.stack((centroid, axis), dim=-2)
+    rays = torch.cat((rays, torch.ones_like(rays[..., :1])), -1)
+    to_world = extrinsics[..., :3, :3].mT @ inverse_intrinsics(intrinsics)
+    directions = unit(torch.einsum("bvij,bvrj->bvri", to_world, rays))
+    weights = torch.stack((counts > 0, torch.full_like(counts, 1e-3, dtype=rays.dtype)), -1)
+    identity = torch.eye(3, device=rays.device, dtype=rays.dtype)
+    across = identity - directions[..., :, None] * directions[..., None, :]
+    across = (weights[..., None, None] * across).sum(2)
+    origin = cameras.centers.mean(1)
+    offsets = (cameras.centers - origin[:, None])[..., None]
+    matrix = across.sum(1) + 1e-4 * identity
+    # Never singular; the check of linalg.solve would wait for a GPU.
+    return torch.linalg.solve_ex(matrix, (across @ offsets).sum(1)).result[..., 0] + origin
+
+
+def _in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
+    """One point of each element in all of its cameras' axes."""
+    return world_to_camera(points[:, None].expand(*extrinsics.shape[:2], 3), extrinsics)
+
+
+def _size(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Tensor) -> Float[Tensor, " B"]:
+    """Height or width of the subject, whichever is larger, in the world's unit.
+
+    The median of the views (of two the larger: masks are cut more often than grown), so that one wrong mask
+    does not count. That of a person in metres where no view shows the subject before it.
+    """
+    depth = _in_cameras(center, cameras.extrinsics)[..., 2]
+    sides = []
+    for axis in (0, 1):
+        first, last = first_and_last(masks.any(axis - 2))
+        sides.append((last - first + 1) / cameras.intrinsics[..., axis, axis])
+    known = masks.flatten(2).any(-1) & (depth > 0)
+    sizes = torch.where(known, torch.maximum(*sides) * depth, torch.nan).sort(-1).values
+    size = sizes.gather(1, known.sum(-1, keepdim=True) // 2 % sizes.shape[1])[:, 0]
+    return torch.where(size > 0, size, HEIGHT)
+
+
+def _axes(cameras: Cameras) -> Float[Tensor, "B 3 3"]:
+    """Right, up and back as rows: proper rotations, whatever the extrinsics are."""
+    down, forward = cameras.extrinsics[..., 1, :3], cameras.extrinsics[:, 0, 2, :3]
+    mean = -down.mean(1)
+    # Cameras without a common upright: the first one's.
+    up = unit(torch.where(mean.norm(dim=-1, keepdim=True) > 0.1, mean, -down[:, 0]))
+
+    def level(direction: Tensor) -> Tensor:
+        return direction - (direction * up).sum(-1, keepdim=True) * up
+
+    # Where the first camera looks straight up or down, its own upright is horizontal.
+    back, other = level(-forward), level(-down[:, 0])
+    back = unit(torch.where(back.norm(dim=-1, keepdim=True) > 0.1, back, other))
+    right = unit(torch.linalg.cross(up, back))
+    axes = torch.stack((right, up, back), dim=1)
+    # Rotations of rank 1 or less say nothing.
+    known = (right.norm(dim=-1) > 0)[:, None, None]
+    return torch.where(known, axes, torch.eye(3, device=axes.device, dtype=axes.dtype))

@@ -1,0 +1,143 @@
+"""The frame of the subject: any unit, origin and direction of the world give one and the same scene."""
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from ghgs_lit.geometry.frame import HEIGHT, Frame
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.rendering import render
+from ghgs_lit.types import Batch
+from tests.helpers.models import make_model
+from tests.helpers.scenes import CENTER, make_batch, ring
+
+
+def moved(cameras, scale=1.0, turn=None, shift=(0.0, 0.0, 0.0)):
+    """Cameras of the same photographs in a world that was scaled, turned and shifted, in float64."""
+    turn = torch.eye(3).double() if turn is None else turn
+    extrinsics = cameras.extrinsics.double().clone()
+    rotation = extrinsics[..., :3, :3] @ turn.mT
+    translation = scale * extrinsics[..., :3, 3] - (rotation * torch.tensor(shift).double()).sum(-1)
+    extrinsics[..., :3, :3], extrinsics[..., :3, 3] = rotation, translation
+    return dataclasses.replace(cameras, extrinsics=extrinsics)
+
+
+@functools.cache
+def original(name):
+    """A tiny model, a batch with cameras in float64, and what it predicts and shows of it."""
+    model, batch = make_model(f"model={name}").eval(), make_batch(1, 3)
+    batch = dataclasses.replace(batch, cameras=moved(batch.cameras))
+    with torch.no_grad():
+        prediction = model(batch)
+    return model, batch, prediction, render(prediction.gaussians, batch.cameras)
+
+
+@pytest.mark.parametrize("name", ["paper", "hull"])
+@settings(max_examples=5, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(
+    scale=st.sampled_from([1e-3, 0.03, 1.0, 11.0, 1e3]),
+    turn=st.tuples(*4 * [st.floats(-1, 1)]),
+    away=st.sampled_from([0.0, 1e4, 1e5]),
+)
+def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away):
+    """The box of the bounds had the world's axes, limits were metres, and 100 km cost 11 mm."""
+    model, batch, expected, image = original(name)
+    turn = quaternion_to_matrix(torch.tensor(turn).double())
+    shift = (away * scale, -0.3 * away * scale, 0.1 * away * scale)
+    views = moved(batch.cameras, scale, turn, shift)
+    with torch.no_grad():
+        found = model(dataclasses.replace(batch, cameras=views))
+        shown = render(found.gaussians, views)
+    assert found.gaussians.splits == expected.gaussians.splits
+    # float64 rounds to 1e-11 m at 100 km, which can change the last digit of a camera in float32.
+    limit = 1e-5 + 1e-9 * away
+    back = (found.gaussians.means - torch.tensor(shift).double()) @ turn / scale
+    assert (back - expected.gaussians.means).abs().max() < limit
+    back = (found.points.tokens - torch.tensor(shift).double()) @ turn / scale
+    assert (back - expected.points.tokens).abs().max() < limit
+    assert (found.depth / scale - expected.depth).abs().max() < limit
+    for bound in ("near", "far"):
+        one, other = (getattr(p.depth_maps.bounds, bound) for p in (found, expected))
+        assert (one / scale - other).abs().max() < limit
+    torch.testing.assert_close(found.gaussians.scales / scale, expected.gaussians.scales, rtol=1e-3, atol=0)
+    one, other = (quaternion_to_matrix(p.gaussians.quaternions) for p in (found, expected))
+    assert (turn.mT.float() @ one - other).abs().max() < 1e-3
+    assert (shown.image - image.image).abs().mean() < 2e-5
+    assert (shown.depth / scale - image.depth).abs().mean() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["paper", "hull"])
+def test_the_order_of_the_views_after_the_first_does_not_matter(name):
+    """Gaussians of each view stay, up to rounding."""
+    model, batch, expected, _ = original(name)
+    order = [0, 2, 1]
+    changed = dataclasses.replace(
+        batch, images=batch.images[:, order], masks=batch.masks[:, order], cameras=batch.cameras[:, order]
+    )
+    with torch.no_grad():
+        found = model(changed)
+    assert (found.depth[:, order] - expected.depth).abs().max() < 1e-4
+    for view, place in enumerate(order):
+        one = found.gaussians.means[found.gaussians.image == view]
+        other = expected.gaussians.means[expected.gaussians.image == place]
+        assert (one - other).abs().max() < 1e-4
+
+
+def test_the_subject_is_as_tall_as_a_person_in_its_frame():
+    """In millimetres as in metres: 1.6 m of an ellipsoid become 1.8 m."""
+    batch = make_batch(2, 4, 112, 112)
+    for scale in (1.0, 1e3):
+        frame = Frame.of(dataclasses.replace(batch, cameras=moved(batch.cameras, scale)))
+        assert (frame.metre * HEIGHT / scale - 1.6).abs().max() < 0.1
+        assert (frame.origin / scale - CENTER).abs().max() < 0.06
+        assert frame.enter(batch).cameras.extrinsics.dtype == torch.float32
+
+
+@pytest.mark.parametrize("wrong", ["empty", "one pixel", "noise", "half"])
+@pytest.mark.parametrize("views", [3, 4])
+def test_one_wrong_mask_does_not_change_the_size(views, wrong):
+    batch = make_batch(1, views, 112, 112)
+    masks = batch.masks.clone()
+    if wrong == "noise":
+        masks[0, -1] = torch.rand(masks.shape[2:], generator=torch.Generator().manual_seed(0)) < 0.3
+    elif wrong == "half":
+        masks[0, -1, 56:] = False
+    else:
+        masks[0, -1] = False
+        masks[0, -1, 3, 5] = wrong == "one pixel"
+    found, right = (Frame.of(b).metre for b in (dataclasses.replace(batch, masks=masks), batch))
+    assert float(found / right) == pytest.approx(1, abs=0.25)
+
+
+@pytest.mark.parametrize("change", ["mirrored", "upside down", "looking down", "opposed", "degenerate"])
+def test_axes_are_a_rotation_for_any_cameras(change):
+    """Mirrored extrinsics, rigs upside down and cameras that look straight down have a frame, too."""
+    batch = make_batch(1, 3, 42, 42)
+    cameras = ring(1, 3, 42, 42)
+    rotation = cameras.extrinsics[..., :3, :3].clone()
+    if change == "mirrored":
+        rotation[..., 0, :] *= -1
+    elif change == "upside down":
+        rotation[..., :2, :] *= -1
+    elif change == "looking down":
+        rotation[:] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    elif change == "opposed":
+        rotation[0, 1:] = rotation[0, :1] @ torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    else:
+        rotation[:] = 0
+    cameras.extrinsics[..., :3, :3] = rotation
+    axes = Frame.of(dataclasses.replace(batch, cameras=cameras)).axes
+    torch.testing.assert_close(axes @ axes.mT, torch.eye(3).double()[None], atol=1e-9, rtol=0)
+    assert float(torch.linalg.det(axes)) == pytest.approx(1)
+
+
+def test_an_element_has_the_same_frame_alone():
+    batch = make_batch(2, 4)
+    whole = Frame.of(batch)
+    one = Batch(batch.images[1:], batch.masks[1:], batch.cameras[1:])
+    for name in ("origin", "axes", "metre"):
+        assert torch.equal(getattr(Frame.of(one), name)[0], getattr(whole, name)[1])

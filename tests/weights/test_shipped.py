@@ -1,0 +1,36 @@
+"""The weights that come with the package."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from ghgs_lit import GHGS
+from ghgs_lit.weights.checkpoint import read_checkpoint
+from tests.helpers.verbs import ghgs
+
+CARD = Path(__file__).parents[2] / "docs" / "model_card.md"
+
+
+def test_they_are_what_a_model_without_a_path_has_and_name_no_machine():
+    model, config = GHGS.from_checkpoint(), read_checkpoint("shipped")["config"]
+    assert model.rounds is not None
+    assert not model.training
+    assert not re.search(r"/(tmp|work|home|root)\b", json.dumps(config))
+
+
+def test_their_figures_are_those_of_the_model_card(tmp_path, monkeypatch):
+    """A file that was exchanged, or a model that has changed, must be noticed."""
+    monkeypatch.setenv("GHGS_CACHE", str(tmp_path))
+    arguments = ["checkpoint=shipped", "data=synthetic", "data.people={train: 1, val: 2}"]
+    arguments += ["data.render.positions=[0,2,4,6,8,10,12,14]"]
+    arguments += ["evaluation.targets=[release,midway]", f"hydra.run.dir={tmp_path / 'run'}"]
+    assert ghgs("evaluate", *arguments) == 0
+    rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["rows"]
+    found = {(row["subject"], row["targets"]): row["psnr"] for row in rows}
+    stated = re.findall(r"\| (p\d+) \| ([\d.]+) \| ([\d.]+) \|", CARD.read_text())
+    assert len(stated) == 2
+    for person, release, midway in stated:
+        assert found[person, "release"] == pytest.approx(float(release), abs=0.05)
+        assert found[person, "midway"] == pytest.approx(float(midway), abs=0.05)
