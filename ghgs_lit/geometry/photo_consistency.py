@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry import cpu
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers
+from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
@@ -96,16 +97,12 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
         depth: [n, S].
     """
     points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
-    x, y, z = points.unbind(-1)
+    z = points[..., 2]
     front = z > 0
-    inverse = 2 / torch.where(front, z, 1.0)
-    count, _, height, width = images.shape
-    # The images are the layers of a volume; all points lie in the middle of a layer.
-    layer = ((2 * image + 1) / count - 1).to(depth)[..., None].expand_as(x)
-    grid = torch.stack((x * inverse / width - 1, y * inverse / height - 1, layer), -1)
-    seen = F.grid_sample(images.transpose(0, 1)[None], grid[None], align_corners=False)[0]
-    difference = (seen[:3] - own.T[:, :, None, None]).abs().mean(0)
-    return torch.exp(-difference / TOLERANCE) * seen[3] * front
+    pixels = points[..., :2] / torch.where(front, z, 1.0)[..., None]
+    seen = sample(images, image[..., None].expand(z.shape), pixels)
+    difference = (seen[..., :3] - own[:, None, None]).abs().mean(-1)
+    return torch.exp(-difference / TOLERANCE) * seen[..., 3] * front
 
 
 def _smooth(images: Tensor, masks: Tensor) -> Tensor:

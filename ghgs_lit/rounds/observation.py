@@ -2,10 +2,11 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Gaussians, Rendering
 
@@ -45,17 +46,3 @@ def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[
     values = torch.cat((color - gaussians.colors[:, None], error, mask, alpha, behind), -1)
     is_own = F.one_hot(gaussians.image % views, views)[..., None]
     return torch.cat((torch.where(can_see, values, 0), can_see.to(values), is_own.to(values)), -1)
-
-
-def sample(
-    maps: Float[Tensor, "m c H W"], image: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]
-) -> Float[Tensor, "*n c"]:
-    """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside."""
-    count, _, height, width = maps.shape
-    grid = pixels * (2 / pixels.new_tensor([width, height])) - 1
-    # The maps are the layers of a volume, and all pixels lie in the middle of a layer. Far outside is brought
-    # near: large numbers are not exact.
-    layer = ((2 * image + 1) / count - 1).to(grid)[..., None]
-    grid = torch.cat((grid.clamp(-3, 3), layer), -1).reshape(1, 1, 1, -1, 3)
-    found = F.grid_sample(maps.transpose(0, 1)[None], grid, align_corners=False)
-    return found[0, :, 0, 0].mT.reshape(*image.shape, -1)

@@ -1,14 +1,12 @@
-"""What photographs show of Gaussians, against slow loops and SciPy."""
+"""What photographs show of Gaussians."""
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
-from scipy.ndimage import map_coordinates
 
 from ghgs_lit.geometry.projection import project, unproject_maps
-from ghgs_lit.rounds.observation import CHANNELS, observe, sample
+from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Gaussians
 from tests.helpers.scenes import make_batch
 
@@ -29,22 +27,6 @@ def splats(batch):
         image,
         pixel,
     )
-
-
-def test_sampling_is_bilinear_and_0_outside():
-    generator = torch.Generator().manual_seed(0)
-    maps = torch.rand(5, 2, 9, 7, generator=generator)
-    image = torch.randint(5, (40,), generator=generator)
-    pixels = torch.rand(40, 2, generator=generator) * torch.tensor([7.0, 9.0])
-    found = sample(maps, image, pixels)
-    for n in range(40):
-        place = (pixels[n].flip(0) - 0.5).double().numpy()[:, None]
-        for c in range(2):
-            expected = map_coordinates(
-                np.pad(maps[image[n], c].double().numpy(), 1), place + 1, order=1, mode="constant"
-            )[0]
-            assert abs(found[n, c].item() - expected) < 1e-5
-    assert not sample(maps, image[:2], torch.tensor([[-1e9, 3.0], [3.0, 1e9]])).any()
 
 
 def test_a_gaussian_sees_itself_in_its_own_view():

@@ -1,0 +1,23 @@
+"""Values of maps, against SciPy."""
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+
+from ghgs_lit.geometry.sampling import sample
+
+
+def test_sampling_is_bilinear_and_0_outside():
+    generator = torch.Generator().manual_seed(0)
+    maps = torch.rand(5, 2, 9, 7, generator=generator)
+    image = torch.randint(5, (40,), generator=generator)
+    pixels = torch.rand(40, 2, generator=generator) * torch.tensor([7.0, 9.0])
+    found = sample(maps, image, pixels)
+    for n in range(40):
+        place = (pixels[n].flip(0) - 0.5).double().numpy()[:, None]
+        for c in range(2):
+            expected = map_coordinates(
+                np.pad(maps[image[n], c].double().numpy(), 1), place + 1, order=1, mode="constant"
+            )[0]
+            assert abs(found[n, c].item() - expected) < 1e-5
+    assert not sample(maps, image[:2], torch.tensor([[-1e9, 3.0], [3.0, 1e9]])).any()
