@@ -115,3 +115,13 @@ def test_options_are_checked():
                 "encoder.bounds_input=false",
             )
         )
+
+
+def test_what_padding_added_is_cut_off_every_round():
+    batch = make_batch(1, 2, 50, 50)
+    with torch.no_grad():
+        found = model("model.pad=multiple", "model.frame=world", kick=0.1)(batch)
+    assert torch.equal(found.rounds[-1].depth, found.depth)
+    assert {maps.depth.shape for maps in found.rounds} == {batch.masks.shape}
+    for draft in found.drafts:
+        assert torch.equal(draft.pixel, found.gaussians.pixel)
