@@ -11,10 +11,11 @@ def sample(
 ) -> Float[Tensor, "*n c"]:
     """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside."""
     count, _, height, width = maps.shape
-    grid = pixels * (2 / pixels.new_tensor([width, height])) - 1
+    u, v = pixels.unbind(-1)
     # The maps are the layers of a volume, and all pixels lie in the middle of a layer. Far outside is brought
     # near: large numbers are not exact.
-    layer = ((2 * image + 1) / count - 1).to(grid)[..., None]
-    grid = torch.cat((grid.clamp(-3, 3), layer), -1).reshape(1, 1, 1, -1, 3)
+    layer = ((2 * image + 1) / count - 1).to(pixels)
+    grid = torch.stack(((2 / width * u - 1).clamp(-3, 3), (2 / height * v - 1).clamp(-3, 3), layer), -1)
+    grid = grid.reshape(1, 1, 1, -1, 3)
     found = F.grid_sample(maps.transpose(0, 1)[None], grid, align_corners=False)
     return found[0, :, 0, 0].mT.reshape(*image.shape, -1)
