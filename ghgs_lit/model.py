@@ -13,7 +13,7 @@ from torch import nn
 from ghgs_lit.batch_checks import check_batch
 from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import build
-from ghgs_lit.encoder import FeatureCache, VGGTEncoder
+from ghgs_lit.encoder import FeatureCache, PhotographCache, VGGTEncoder
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.padding import pad_to_patches
@@ -90,8 +90,8 @@ class GHGS(nn.Module):
         self.rounds = rounds
         self.gaussian_head = gaussian_head
         self.pad, self.frame, self.check_inputs, self.auto = pad, frame, check_inputs, auto
-        #: Where tokens of a frozen encoder are looked up and kept; None: they are computed each time.
-        self.feature_cache: FeatureCache | None = None
+        #: Where features of a frozen encoder are looked up and kept; None: they are computed each time.
+        self.feature_cache: FeatureCache | PhotographCache | None = None
         self.precision = "inherit"
 
     @property

@@ -355,6 +355,7 @@ KINDS: dict[str, Kind] = {
     "feature_cache.dtype": TEXT,
     "feature_cache.margin": integer(least=0),
     "feature_cache.max_gb": POSITIVE | NULL,
+    "feature_cache.of": TEXT,
     "feature_cache.tokens": TEXT,
     # evaluation; ghgs table takes one value in place of a list
     "evaluation.pictures": integer(least=0),

@@ -1,6 +1,6 @@
 """Alternating attention inside each view and across all views (VGGT's aggregator)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -85,20 +85,24 @@ class Aggregator(nn.Module):
         return torch.cat((tokens[:1], tokens[1:].expand(views - 1, -1, -1)))
 
     def forward(
-        self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
+        self,
+        images: Float[Tensor, "b v i H W"],
+        kept: KeptPatches,
+        embed: Callable[[Tensor, KeptPatches], Tensor] | None = None,
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
         """Tokens of the layers that are read out.
 
         Args:
             images: normalised images, [B, V, channels, H, W].
             kept: the patches that take part; all others are as if they did not exist.
+            embed: gives the patch tokens; None: ``patch_embed``.
 
         Returns:
             For each layer in ``layers`` the packed tokens after its frame block and after its global block,
             special tokens included; and the patch tokens that entered.
         """
         b, v = images.shape[:2]
-        patches = self.patch_embed(images.flatten(0, 1), kept)
+        patches = (embed or self.patch_embed)(images.flatten(0, 1), kept)
         special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)
         x = kept.join(special, patches)
         rotary = rotary_tables(kept.positions(self.special), self.head_width, x)

@@ -1,12 +1,10 @@
-"""Tokens of a frozen encoder on disk: ablations and sweeps on the same photographs encode them once.
+"""Features of a frozen encoder on disk: ablations, sweeps and epochs encode the same photographs once.
 
-A file's name is the hash of all that its tokens depend on: weights and options of the encoder, photographs,
-masks and bounds where they are read, which tokens are kept, precision and device. Cameras are not among
-them: the encoder does not see them.
+A file's name is the hash of all that its content depends on: weights and options of what computes it, its
+input, which patches are kept, precision and device. Cameras are not among them: no encoder sees them.
 """
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,39 +12,29 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from ghgs_lit.encoder.encoder import VGGTEncoder
+from ghgs_lit.encoder.feature_files import FeatureFiles, Stored, hashed
+from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import choice, require
-from ghgs_lit.files import write_atomically
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Version of the files; raise it when older files must not be read any more.
 LAYOUT = 1
 PLACE = ("image", "row", "column")
-DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
-
-#: Tensors of a file by name, and its metadata.
-Stored = tuple[dict[str, Tensor], dict[str, str]]
 
 
-class FeatureCache:
-    """Reads the tokens of photographs from ``directory``, or computes them and writes them there.
-
-    What comes back is always what the file holds, so that the first run and all others see the same. Files
-    are written atomically: runs may share a directory. A file that cannot be read is written again.
+class FeatureCache(FeatureFiles):
+    """Keeps the encoder's tokens, one file for each ordered choice of views.
 
     Args:
-        directory: created where it does not exist.
+        directory, dtype, max_gb: as of :class:`FeatureFiles`. The tokens come back in the encoder's dtype.
         tokens: ``subject`` keeps patches with a pixel of the subject and ``margin`` patches around them (the
             dense heads see zeros elsewhere: a fifth of the size, slightly different predictions);
             ``all`` keeps every patch: the same predictions as without a cache.
         margin: patches around the subject that are kept.
-        dtype: of the files: ``float32``, ``float16`` or ``bfloat16``. The tokens come back in the encoder's.
-        max_gb: size of all files, 10^9 bytes; beyond it the oldest are deleted. None: no limit.
     """
 
     def __init__(
@@ -57,18 +45,14 @@ class FeatureCache:
         dtype: str = "float32",
         max_gb: float | int | None = None,
     ):
+        super().__init__(directory, dtype, max_gb)
         choice("feature_cache.tokens", tokens, ("subject", "all"))
-        choice("feature_cache.dtype", dtype, tuple(DTYPES))
         require(isinstance(margin, int) and margin >= 0, "feature_cache.margin", "0 or more patches", margin)
-        valid = max_gb is None or (isinstance(max_gb, (int, float)) and max_gb > 0)
-        require(valid, "feature_cache.max_gb", "null or a positive number of gigabytes", max_gb)
-        self.directory, self.tokens, self.margin, self.dtype = Path(directory), tokens, margin, dtype
-        self.limit = None if max_gb is None else int(1e9 * max_gb)
-        self.hits = self.made = self.written = self.deleted = 0
-        # Bytes of all files: other runs may write too, so it is counted again before anything is deleted.
-        self._bytes = 0 if self.limit is None else sum(_size(file) for file in self._files())
-        self._versions: list = []
-        self._hash = ""
+        self.tokens, self.margin = tokens, margin
+
+    @property
+    def content(self) -> str:
+        return "all tokens" if self.tokens == "all" else f"tokens of the subject and {self.margin} around it"
 
     def __call__(
         self,
@@ -79,71 +63,28 @@ class FeatureCache:
         kept: Bool[Tensor, "b v h w"],
     ) -> Tokens:
         """As ``encoder.encode``, without a gradient."""
-        trained = torch.is_grad_enabled() and any(p.requires_grad for p in encoder.parameters())
-        require(not trained, "feature_cache", "a frozen encoder (encoder.trainable=none)", "one that learns")
+        _require_frozen(encoder, "a frozen encoder (encoder.trainable=none)")
         parts = []
         for b in range(len(images)):
             one = slice(b, b + 1)
             own = None if bounds is None else DepthBounds(bounds.near[one], bounds.far[one])
-            parts.append(self._element(encoder, images[one], masks[one], own, kept[one]))
+            inputs = images[one], masks[one], own, kept[one]
+            stored = self.stored(
+                self._key(encoder, *inputs), lambda inputs=inputs: self._made(encoder, *inputs)
+            )
+            parts.append(_tokens(*stored, images.device))
         return parts[0] if len(parts) == 1 else _packed(parts)
 
-    def report(self) -> str:
-        """One line: how many samples were found and encoded, and the size of the cache."""
-        files = self._files()
-        size = sum(map(_size, files))
-        kept = "all tokens" if self.tokens == "all" else f"tokens of the subject and {self.margin} around it"
-        return (
-            f"feature cache {self.directory}: {self.hits} found, {self.made} made"
-            f" ({self.written / 1e6:.1f} MB; {kept}, {self.dtype});"
-            f" {len(files)} files, {size / 1e6:.1f} MB in all"
-            + (f"; {self.deleted} old ones deleted (feature_cache.max_gb)" if self.deleted else "")
-        )
-
-    def _files(self) -> list[Path]:
-        return list(self.directory.glob("*/*.safetensors"))
-
-    def _delete_oldest(self, newest: Path) -> None:
-        """Delete the files that were written first, until a tenth of the limit is free; keep ``newest``."""
-        files = sorted((file for file in self._files() if file != newest), key=_written)
-        self._bytes = _size(newest) + sum(map(_size, files))
-        for file in files:
-            if self._bytes <= 0.9 * self.limit:
-                break
-            self._bytes -= _size(file)
-            file.unlink(missing_ok=True)
-            self.deleted += 1
-
-    def _element(
+    def _made(
         self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
-    ) -> Tokens:
-        key = self._key(encoder, images, masks, bounds, kept)
-        path = self.directory / key[:2] / f"{key}.safetensors"
-        stored = _read(path)
-        if stored is None:
-            with torch.no_grad():
-                tokens = encoder.encode(images, masks, bounds, kept)
-            stored = self._stored(tokens, masks)
-            size = _write(path, *stored)
-            self.written += size
-            self._bytes += size
-            self.made += 1
-            if self.limit is not None and self._bytes > self.limit:
-                self._delete_oldest(path)
-        else:
-            self.hits += 1
-        return _tokens(*stored, images.device)
-
-    def _stored(self, tokens: Tokens, masks: Tensor) -> Stored:
+    ) -> Stored:
         """The tensors and the metadata of a file."""
+        tokens = encoder.encode(images, masks, bounds, kept)
         tokens = tokens if self.tokens == "all" else _around_subject(tokens, masks, self.margin)
-        values = {f"latent_{i}": layer for i, layer in enumerate(tokens.latent)} | {
-            "semantic": tokens.semantic
-        }
-        facts = {name: str(value.dtype).removeprefix("torch.") for name, value in values.items()}
-        tensors = {name: value.to(DTYPES[self.dtype]) for name, value in values.items()}
-        tensors |= {name: getattr(tokens, name).to(torch.int32) for name in PLACE}
-        return {name: tensor.cpu().contiguous() for name, tensor in tensors.items()}, {
+        layers = {f"latent_{i}": layer for i, layer in enumerate(tokens.latent)}
+        tensors, facts = self.in_files_dtype(layers | {"semantic": tokens.semantic})
+        places = {name: getattr(tokens, name).to("cpu", torch.int32).contiguous() for name in PLACE}
+        return tensors | places, {
             **facts,
             "grid": json.dumps(tokens.grid),
             "patch_size": str(tokens.patch_size),
@@ -152,65 +93,85 @@ class FeatureCache:
     def _key(
         self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
     ) -> str:
-        device = images.device.type
-        half = torch.is_autocast_enabled(device) and str(torch.get_autocast_dtype(device))
         stored = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
-        facts = [LAYOUT, encoder.options, self._fingerprint(encoder), stored, device, half]
-        digest = hashlib.sha256(json.dumps(facts, sort_keys=True, default=list).encode())
-        _add(digest, images)
-        _add(digest, kept)
+        facts = [LAYOUT, encoder.options, self.fingerprint(encoder), stored, *_precision(images)]
+        inputs = [images, kept]
         if encoder.mask_input or encoder.bounds_input or self.tokens == "subject":
-            _add(digest, masks)
+            inputs.append(masks)
         if encoder.bounds_input and bounds is not None:
-            _add(digest, bounds.near)
-            _add(digest, bounds.far)
-        return digest.hexdigest()
-
-    def _fingerprint(self, encoder: VGGTEncoder) -> str:
-        """Hash of the encoder's weights, computed again when one has changed."""
-        # A change in place raises a tensor's version; another tensor has another address.
-        state = encoder.state_dict(keep_vars=True)
-        versions = [(t.data_ptr(), t._version, t.dtype) for t in state.values()]
-        if versions != self._versions:
-            digest = hashlib.sha256()
-            for name, tensor in sorted(state.items()):
-                digest.update(name.encode())
-                _add(digest, tensor)
-            self._versions, self._hash = versions, digest.hexdigest()
-        return self._hash
+            inputs += [bounds.near, bounds.far]
+        return hashed(facts, inputs)
 
 
-def open_cache(options: Mapping[str, Any] | None, recalibrated: str) -> FeatureCache | None:
+class PhotographCache(FeatureFiles):
+    """Keeps the patch tokens of single photographs, that is, what enters the aggregator's first block.
+
+    Any choice and order of views finds them again, and the aggregator may learn. Arguments as of
+    :class:`FeatureFiles`.
+    """
+
+    @property
+    def content(self) -> str:
+        return "patch tokens of photographs"
+
+    def __call__(
+        self,
+        encoder: VGGTEncoder,
+        images: Float[Tensor, "b v c H W"],
+        masks: Bool[Tensor, "b v H W"],
+        bounds: DepthBounds | None,
+        kept: Bool[Tensor, "b v h w"],
+    ) -> Tokens:
+        """As ``encoder.encode``, without a gradient of the patch tokens."""
+        embed = encoder.aggregator.patch_embed
+        _require_frozen(embed, "a frozen patch encoder (encoder.trainable=none or last_<n>)")
+        about = [encoder.options["vit"], encoder.patch_size]
+
+        def patches(normalized: Float[Tensor, "n i H W"], _: KeptPatches) -> Float[Tensor, "N c"]:
+            pairs = zip(normalized.split(1), kept.flatten(0, 1).split(1), strict=True)
+            return torch.cat([self._photograph(embed, image, own[None], about) for image, own in pairs])
+
+        return encoder.encode(images, masks, bounds, kept, patches)
+
+    def _photograph(self, embed: nn.Module, image: Tensor, kept: Tensor, about: list) -> Tensor:
+        facts = [LAYOUT, about, self.fingerprint(embed), self.dtype, *_precision(image)]
+
+        def made() -> Stored:
+            return self.in_files_dtype({"patches": embed(image, KeptPatches(kept, image.device))})
+
+        tensors, dtypes = self.stored(hashed(facts, [image, kept]), made)
+        return tensors["patches"].to(image.device, getattr(torch, dtypes["patches"]))
+
+
+def open_cache(options: Mapping[str, Any] | None, recalibrated: str) -> FeatureCache | PhotographCache | None:
     """The cache that the configuration describes.
 
     Args:
         options: the node ``feature_cache``; without a ``directory`` there is no cache.
         recalibrated: ``recalibration.tokens`` of the model; with ``all``, all tokens are kept.
+
+    Raises:
+        InputError: an impossible option.
     """
     if not options or options["directory"] is None:
         return None
+    options = dict(options)
+    of = options.pop("of", "views")
+    choice("feature_cache.of", of, ("views", "photographs"))
+    if of == "photographs":
+        return PhotographCache(options["directory"], options["dtype"], options.get("max_gb"))
     return FeatureCache(**{**options, "tokens": "all" if recalibrated == "all" else options["tokens"]})
 
 
-def _size(file: Path) -> int:
-    """Bytes of a file; 0 where another run has deleted it."""
-    try:
-        return file.stat().st_size
-    except FileNotFoundError:
-        return 0
+def _require_frozen(module: nn.Module, expected: str) -> None:
+    trained = torch.is_grad_enabled() and any(p.requires_grad for p in module.parameters())
+    require(not trained, "feature_cache", expected, "one that learns")
 
 
-def _written(file: Path) -> float:
-    """When a file was written; 0 where another run has deleted it."""
-    try:
-        return file.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0
-
-
-def _add(digest, tensor: Tensor) -> None:
-    digest.update(json.dumps([str(tensor.dtype), list(tensor.shape)]).encode())
-    digest.update(tensor.detach().cpu().contiguous().view(torch.uint8).numpy())
+def _precision(images: Tensor) -> tuple[str, str | bool]:
+    """Device and autocast of a forward pass."""
+    device = images.device.type
+    return device, torch.is_autocast_enabled(device) and str(torch.get_autocast_dtype(device))
 
 
 def _around_subject(tokens: Tokens, masks: Tensor, margin: int) -> Tokens:
@@ -242,21 +203,3 @@ def _tokens(tensors: dict[str, Tensor], facts: dict[str, str], device: torch.dev
     place = {name: values[name] for name in PLACE}
     grid = tuple(json.loads(facts["grid"]))
     return Tokens(latent, values["semantic"], **place, grid=grid, patch_size=int(facts["patch_size"]))
-
-
-def _read(path: Path) -> Stored | None:
-    """The content of a file; None where there is none or it is broken."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata())  # noqa: SIM118
-    except FileNotFoundError:
-        return None
-    except (SafetensorError, OSError) as error:
-        print(f"{path}: expected a whole file of features; {error}; it is written again", flush=True)
-        return None
-
-
-def _write(path: Path, tensors: dict[str, Tensor], facts: dict[str, str]) -> int:
-    """Write a file; returns its bytes."""
-    write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata=facts))
-    return path.stat().st_size

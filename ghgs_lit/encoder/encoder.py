@@ -131,7 +131,7 @@ class VGGTEncoder(nn.Module):
             masks: [B, V, H, W]; read with ``mask_input`` or ``bounds_input``, and where ``tokens`` is not
                 ``all``.
             bounds: read with ``bounds_input``.
-            cache: a :class:`ghgs_lit.encoder.FeatureCache` to look the tokens up in; None: compute them.
+            cache: to look features up in (:mod:`ghgs_lit.encoder.cache`); None: compute them.
             kept: which patches take part; None: those of :meth:`keeps`.
         """
         self._check(images, masks)
@@ -145,10 +145,14 @@ class VGGTEncoder(nn.Module):
         masks: Bool[Tensor, "..."],
         bounds: DepthBounds | None,
         kept: Bool[Tensor, "b v h w"],
+        embed: Callable[[Tensor, KeptPatches], Tensor] | None = None,
     ) -> Tokens:
-        """Compute the tokens of the kept patches of all views; arguments as in :meth:`forward`."""
+        """Compute the tokens of the kept patches of all views; arguments as in :meth:`forward`.
+
+        ``embed`` takes the place of the patch embedding.
+        """
         kept = KeptPatches(kept, images.device)
-        pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
+        pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept, embed)
         return Tokens(
             latent=tuple(_joined(pairs, kept, self.aggregator.special)),
             semantic=patches.detach(),

@@ -20,6 +20,9 @@ WRITTEN = (
     "tensorboard",
 )
 
+#: Keys of ``augmentation`` that change the photographs or masks of the inputs.
+PHOTOGRAPHS_CHANGE = ("exposure", "white_balance", "mask_offset", "mask_ragged", "mask_hole_chance")
+
 
 def check_config(config: Mapping[str, Any]) -> None:
     """Refuse a run that cannot give what it is started for.
@@ -50,14 +53,22 @@ def _require_useful_cache(config: Mapping[str, Any]) -> None:
     """Each order of views is a sample of its own, so random choices of views hardly ever come again."""
     if lookup(config, "feature_cache.directory") is None:
         return
-    frozen = lookup(config, "encoder.trainable") == "none"
+    trainable, views = lookup(config, "encoder.trainable"), lookup(config, "views.training")
+    photographs = lookup(config, "feature_cache.of") == "photographs"
+    frozen = trainable == "none" or (photographs and trainable != "all")
     require(frozen, "feature_cache.directory", "null where the encoder learns", "a directory")
-    fixed = lookup(config, "views.training") == "even"
     require(
-        fixed,
+        photographs or views == "even",
         "feature_cache.directory",
-        "null, or views.training=even, which has few choices of views to keep",
-        f"views.training={lookup(config, 'views.training')}",
+        "null, feature_cache.of=photographs, or views.training=even, which has few choices of views to keep",
+        f"views.training={views}",
+    )
+    changed = [name for name in PHOTOGRAPHS_CHANGE if lookup(config, f"augmentation.{name}")]
+    require(
+        not changed,
+        "feature_cache.directory",
+        "null where each step changes the photographs, which are never found again",
+        ", ".join(f"augmentation.{name}" for name in changed),
     )
 
 

@@ -7,7 +7,7 @@ import os
 import pytest
 import torch
 
-from ghgs_lit.encoder import FeatureCache, VGGTEncoder, open_cache
+from ghgs_lit.encoder import FeatureCache, PhotographCache, VGGTEncoder, open_cache
 from ghgs_lit.errors import InputError
 from ghgs_lit.types import DepthBounds
 from tests.helpers.models import close, make_model
@@ -259,3 +259,70 @@ def test_no_directory_is_no_cache():
     assert open_cache(options, "subject") is None
     assert open_cache(None, "subject") is None
     assert make_model("model=paper").feature_cache is None
+
+
+DINO = {"vit": {"kind": "dinov2", "depth": 2, "heads": 2}, "image_size": 70}
+
+
+@pytest.mark.parametrize("tokens", ["all", "subject"])
+def test_photographs_are_found_in_any_order(tmp_path, tokens):
+    """Training draws views at random: each photograph must be encoded once, with the result of no cache."""
+    encoder, cache = make(tokens=tokens, **DINO), PhotographCache(tmp_path)
+    images, masks = views(b=2, v=3)
+    for order, made in (([0, 1], 4), ([1, 0], 4), ([2, 1], 6)):
+        expected = encoder(images[:, order], masks[:, order])
+        same(encoder(images[:, order], masks[:, order], cache=cache), expected)
+        assert cache.made == made
+    assert cache.hits == 6
+    assert "patch tokens of photographs" in cache.report()
+
+
+def test_photographs_are_encoded_once_where_the_aggregator_learns(tmp_path):
+    """The frozen part comes from disk, the rest gets the gradient that it has without a cache."""
+    encoder, cache = make(trainable="last_1", **DINO), PhotographCache(tmp_path)
+    images, masks = views()
+    gradients = []
+    for used in (None, cache, cache):
+        encoder.zero_grad()
+        encoder(images, masks, cache=used).latent[1].square().sum().backward()
+        gradients.append([p.grad.clone() for p in encoder.parameters() if p.grad is not None])
+    assert (cache.hits, cache.made) == (2, 2)
+    assert len(gradients[0]) > 10
+    for found in gradients[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found, gradients[0], strict=True))
+
+
+@pytest.mark.parametrize("change", ["weight", "image", "kept", "autocast", "aggregator"])
+def test_only_what_a_photograph_depends_on_misses(tmp_path, change):
+    """Another patch encoder or photograph must not be served; other blocks of the aggregator may be."""
+    encoder, cache = make(tokens="subject", **DINO), PhotographCache(tmp_path)
+    images, masks = views()
+    encoder(images, masks, cache=cache)
+    if change == "weight":
+        encoder.aggregator.patch_embed.blocks[0].mlp.fc1.weight[0, 0] += 1e-3
+    elif change == "image":
+        images[0, 1, 2, 3, 4] += 1e-3
+    elif change == "kept":
+        masks[0, 1, 60, 60] = True
+    elif change == "aggregator":
+        encoder.aggregator.frame_blocks[0].mlp.fc1.weight[0, 0] += 1e-3
+    with torch.autocast("cpu", torch.bfloat16, enabled=change == "autocast"):
+        encoder(images, masks, cache=cache)
+    new = {"weight": 2, "image": 1, "kept": 1, "autocast": 2, "aggregator": 0}[change]
+    assert (cache.made, cache.hits) == (2 + new, 2 - new)
+
+
+def test_a_patch_encoder_that_learns_is_refused(tmp_path):
+    """Patch tokens from disk carry no gradient."""
+    with pytest.raises(InputError, match="feature_cache: expected a frozen patch encoder"):
+        make(trainable="all", **DINO)(*views(), cache=PhotographCache(tmp_path))
+
+
+def test_a_cache_is_of_views_or_of_photographs(tmp_path):
+    """A typing error must not choose another cache."""
+    options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "bfloat16", "max_gb": 2}
+    assert isinstance(open_cache({**options, "of": "views"}, "subject"), FeatureCache)
+    cache = open_cache({**options, "of": "photographs"}, "subject")
+    assert (type(cache), cache.dtype, cache.limit) == (PhotographCache, "bfloat16", 2_000_000_000)
+    with pytest.raises(InputError, match=r"feature_cache\.of: expected one of views, photographs"):
+        open_cache({**options, "of": "people"}, "subject")

@@ -61,6 +61,11 @@ def test_a_feature_cache_that_cannot_pay_is_refused():
     with pytest.raises(InputError, match=r"feature_cache\.directory: .*views\.training=even.*any"):
         check_config(config(*frozen, "views.training=any"))
     check_config(config(*frozen, "views.training=even"))
+    photographs = ("feature_cache.of=photographs", "views.training=any")
+    check_config(config(*frozen, *photographs))
+    check_config(config(frozen[0], frozen[2], *photographs, "encoder.trainable=last_1"))
+    with pytest.raises(InputError, match=r"null where each step changes the photographs.*augmentation\.expo"):
+        check_config(config(*frozen, *photographs, "augmentation=captures"))
     with pytest.raises(InputError, match=r"feature_cache\.directory: expected null where the encoder learns"):
         check_config(config("feature_cache.directory=features"))
 
