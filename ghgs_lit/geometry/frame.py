@@ -77,8 +77,8 @@ class Frame:
             depth=maps.depth,
             points=dataclasses.replace(
                 points,
-                pixels=self._to_world(points.pixels, everyone).to(dtype),
-                tokens=self._to_world(points.tokens, points.token_image // views).to(dtype),
+                pixels=self._to_world(points.pixels, everyone, dtype),
+                tokens=self._to_world(points.tokens, points.token_image // views, dtype),
             ),
             depth_maps=maps,
             rounds=tuple(self._maps(found) for found in prediction.rounds),
@@ -97,16 +97,21 @@ class Frame:
         turn = matrix_to_quaternion(self.axes.mT).to(gaussians.quaternions)
         return dataclasses.replace(
             gaussians,
-            means=self._to_world(gaussians.means, element).to(dtype),
+            means=self._to_world(gaussians.means, element, dtype),
             quaternions=multiply_quaternions(turn[element], gaussians.quaternions),
             scales=gaussians.scales * lengths[element, None],
             metre=lengths if gaussians.metre is None else lengths * gaussians.metre,
         )
 
-    def _to_world(self, points: Float[Tensor, "*n 3"], element: Tensor) -> Float[Tensor, "*n 3"]:
-        axes = (self.metre[:, None, None] * self.axes)[element].unbind(-2)
-        x, y, z = points.double()[..., None].unbind(-2)
-        return self.origin[element] + x * axes[0] + y * axes[1] + z * axes[2]
+    def _to_world(
+        self, points: Float[Tensor, "*n 3"], element: Tensor, dtype: torch.dtype
+    ) -> Float[Tensor, "*n 3"]:
+        """In ``dtype`` throughout: that of the way there is no more than the rounding of the result."""
+        axes = (self.metre[:, None, None] * self.axes).to(dtype)[element].unbind(-2)
+        found = self.origin.to(dtype)[element]
+        for coordinate, axis in zip(points.to(dtype)[..., None].unbind(-2), axes, strict=True):
+            found = torch.addcmul(found, coordinate, axis)
+        return found
 
 
 def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Tensor, "B 3"]:

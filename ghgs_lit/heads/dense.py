@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.heads.dpt import DPTHead
+from ghgs_lit.heads.guide import Guide
 from ghgs_lit.heads.window import Span, Window
 from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
@@ -54,7 +55,7 @@ class Part:
 def decode(
     dpt: DPTHead,
     tokens: Tokens,
-    guide: Float[Tensor, "b v k H W"] | None,
+    guide: Guide | None,
     windows: Sequence[Window | None] | None,
 ) -> Iterator[Part]:
     """Maps of the windows of the images, in their order.
@@ -78,7 +79,7 @@ def decode(
     most = b * v if torch.is_grad_enabled() else _LARGEST // (dpt.full_channels * math.prod(size))
     for images in _runs(windows, most):
         window = functools.reduce(Window.hull, windows[images])
-        seen = None if guide is None else guide.flatten(0, 1)[images][None]
+        seen = None if guide is None else tuple(part[images] for part in guide)
         yield Part(images, window, dpt(tokens.of_images(images), seen, window))
 
 

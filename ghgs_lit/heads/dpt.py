@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.heads.guide import GuidePyramid
+from ghgs_lit.heads.guide import Guide, GuidePyramid
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.heads.window import Window, reach
 from ghgs_lit.kernels.linear import linear
@@ -164,7 +164,7 @@ class DPTHead(nn.Module):
     def forward(
         self,
         tokens: Tokens,
-        guide: Float[Tensor, "b v k H W"] | None = None,
+        guide: Guide | None = None,
         window: Window | None = None,
     ) -> Float[Tensor, "bv o h w"]:
         """Raw maps of all images, float32 or wider.
@@ -175,7 +175,7 @@ class DPTHead(nn.Module):
             window: the part of the maps that is computed; None: all.
         """
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
-        expected = "none" if self.guide is None else "a map"
+        expected = "none" if self.guide is None else "maps"
         require((guide is None) == (self.guide is None), "guide", expected, guide is not None)
         rows, columns = tokens.grid[2:]
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
@@ -183,7 +183,7 @@ class DPTHead(nn.Module):
         aspect, s = columns / rows, self.scratch
         if guide is not None:
             targets = (windows.full, windows.fused, windows.levels[0].level)
-            full, half, quarter = self.guide(guide.flatten(0, 1), targets)
+            full, half, quarter = self.guide(guide, targets)
 
         x = None
         # The coarse levels have the large weights, the fine ones the large maps: never hold both.

@@ -18,7 +18,7 @@ from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
-from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
+from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens, true_places
 
@@ -272,9 +272,7 @@ class GaussianHead(nn.Module):
             antialiased=self.antialiased,
         )
 
-    def _guide(
-        self, batch: Batch, points: Points, depth_maps: DepthMaps
-    ) -> Float[Tensor, "B V k H W"] | None:
+    def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
         if self.decoder.guide is None:
             return None
         maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]

@@ -18,10 +18,15 @@ from ghgs_lit.types import Batch
 PHOTO_CHANNELS = 4
 
 
-def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Float[Tensor, "B V k H W"]:
-    """Photographs, masks and further ``maps`` as channels of one map."""
+#: Maps whose channels are a guide's together; they are joined in the window that is read.
+Guide = tuple[Float[Tensor, "n _ H W"], ...]
+
+
+def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
+    """Photographs, masks and further ``maps`` of all images."""
     images = at_least_float32(batch.images)
-    return torch.cat((images, batch.masks.to(images.dtype)[:, :, None], *maps), dim=2)
+    masks = batch.masks.to(images.dtype)[:, :, None]
+    return tuple(part.flatten(0, 1) for part in (images, masks, *maps))
 
 
 class GuidePyramid(nn.Module):
@@ -40,16 +45,14 @@ class GuidePyramid(nn.Module):
         self.to_half = nn.Conv2d(features // 2, features, 3, stride=2, padding=1)
         self.to_quarter = nn.Conv2d(features, features, 3, stride=2, padding=1)
 
-    def forward(
-        self, guide: Float[Tensor, "n c H W"], targets: tuple[Window, Window, Window]
-    ) -> list[Float[Tensor, "n o h w"]]:
+    def forward(self, guide: Guide, targets: tuple[Window, Window, Window]) -> list[Float[Tensor, "n o h w"]]:
         """Maps to add to the head's: at full resolution, and at half and quarter resolution, resized.
 
         Args:
             guide: of whole images.
             targets: windows of the head's maps.
         """
-        whole = Window.whole(tuple(guide.shape[2:]))
+        whole = Window.whole(tuple(guide[0].shape[2:]))
         size = whole.full
         sizes = [whole.coarser(factor).full for factor in (1, 2, 4)]
         needed = [target.sources(n) for target, n in zip(targets, sizes, strict=True)]
@@ -58,7 +61,8 @@ class GuidePyramid(nn.Module):
             (window.grown(1).finer(factor, size) for window, factor in zip(needed, (1, 2, 4), strict=True)),
         )
         seen = seen.coarser(4).finer(4, size)
-        full = F.relu(self.to_full(guide[..., *seen.slices].contiguous(memory_format=torch.channels_last)))
+        parts = [part[..., *seen.slices].permute(0, 2, 3, 1) for part in guide]
+        full = F.relu(self.to_full(torch.cat(parts, -1).permute(0, 3, 1, 2)))  # channels are innermost
         half = F.relu(self.to_half(full))
         maps = (full, half, F.relu(self.to_quarter(half)))
         return [

@@ -91,10 +91,10 @@ def test_a_guide_keeps_images_apart_and_is_local():
     """A guide must act on its own image, near its pixel, and add tensors only where it is used."""
     head = _head(guide_channels=4)
     tokens = _tokens(b=1, v=2, h=2, w=3)
-    guide = torch.rand(1, 2, 4, 28, 42)
+    guide = torch.rand(2, 3, 28, 42), torch.rand(2, 1, 28, 42)
     raw = head(tokens, guide)
-    moved = guide.clone()
-    moved[0, 1, :, 4, 6] += 1
+    moved = tuple(part.clone() for part in guide)
+    moved[1][1, :, 4, 6] += 1
     changed = (head(tokens, moved) - raw).abs().amax(1) > 0
     assert not changed[0].any()
     assert changed[1, 2:7, 4:9].any()

@@ -59,7 +59,7 @@ def test_an_empty_mask_gives_empty_maps():
 def test_pyramid_halves_twice(size):
     """Odd image sides must give maps of the expected sizes."""
     sizes = [size, tuple((n + 1) // 2 for n in size), tuple((n + 3) // 4 for n in size)]
-    full, half, quarter = GuidePyramid(6, 16)(torch.rand(2, 6, *size), tuple(map(Window.whole, sizes)))
+    full, half, quarter = GuidePyramid(6, 16)((torch.rand(2, 6, *size),), tuple(map(Window.whole, sizes)))
     assert full.shape == (2, 8, *sizes[0])
     assert half.shape == (2, 16, *sizes[1])
     assert quarter.shape == (2, 16, *sizes[2])

@@ -33,7 +33,7 @@ def test_a_window_has_the_values_of_the_whole(grid, guided):
     patch = 6 if guided else 14
     size = (patch * grid[0], patch * grid[1])
     tokens = _tokens(1, 1, *grid, patch_size=patch, dtype=torch.float64)
-    guide = torch.rand(1, 1, 3, *size, dtype=torch.float64) if guided else None
+    guide = (torch.rand(1, 3, *size, dtype=torch.float64),) if guided else None
     for seed in range(2):
         head = head_of(guided, seed)
         whole = head(tokens, guide)
