@@ -1,6 +1,7 @@
 """Dense prediction head: four layers of tokens fused from coarse to fine into one map per image."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,14 +14,18 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.guide import Guide, GuidePyramid
 from ghgs_lit.heads.position import add_positions_
-from ghgs_lit.heads.window import Window, reach
+from ghgs_lit.heads.window import Span, Window, reach
 from ghgs_lit.kernels.linear import linear
+from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
 #: Cells of the three finer levels for each patch, along an axis; the coarsest has a cell for two patches.
 CELLS = (4, 2, 1)
 NORM_EPS = 1e-5
+
+#: Values of a map at full resolution that are held at once where no gradient is kept, and least rows.
+_LARGEST, _ROWS = 1 << 21, 8
 
 
 def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
@@ -181,6 +186,7 @@ class DPTHead(nn.Module):
         size = (tokens.patch_size * rows, tokens.patch_size * columns)
         windows = self.windows(window or Window.whole(size), (rows, columns))
         aspect, s = columns / rows, self.scratch
+        full = None
         if guide is not None:
             targets = (windows.full, windows.fused, windows.levels[0].level)
             full, half, quarter = self.guide(guide, targets)
@@ -197,15 +203,38 @@ class DPTHead(nn.Module):
 
         if guide is not None:
             x = x + half
-        x = windows.fused.resize(s.output_conv1(x), windows.full)
-        x = add_positions_(x, aspect, windows.full)
+        x = s.output_conv1(x)
+        finest = functools.partial(self._finest, x, full, windows, aspect)
+        return torch.cat([finest(part) for part in self._parts(x, windows.result)], 2)
+
+    def _finest(
+        self,
+        x: Float[Tensor, "n c h w"],
+        guide: Float[Tensor, "n c h2 w2"] | None,
+        windows: Windows,
+        aspect: float,
+        result: Window,
+    ) -> Float[Tensor, "n o h3 w3"]:
+        """The part ``result`` of the result from the map before the last interpolation."""
+        layers = self.scratch.output_conv2
+        seen = result.grown(reach(layers))
+        x = add_positions_(windows.fused.resize(x, seen), aspect, seen)
         if guide is not None:
-            x = x + full
-        x = s.output_conv2[:-1](x)
+            x = x + windows.full.cut(guide, seen)
+        x = layers[:-1](x)
         # The last projection stays in float32 under autocast: depths and offsets of millimetres depend on it.
-        last = s.output_conv2[-1]
+        last = layers[-1]
         with torch.autocast(x.device.type, enabled=False):
-            return windows.full.cut(_pointwise(last, x.to(last.weight.dtype)), windows.result)
+            return seen.cut(_pointwise(last, x.to(last.weight.dtype)), result)
+
+    def _parts(self, x: Float[Tensor, "n c h w"], window: Window) -> list[Window]:
+        """Rows of a window one after another where no gradient is kept: its maps are the largest."""
+        if torch.is_grad_enabled():
+            return [window]
+        rows, columns = window
+        row = x.shape[0] * x.shape[1] * (columns.stop - columns.start)
+        parts = even_parts(rows.stop - rows.start, max(_ROWS, _LARGEST // row))
+        return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
         """What must be computed for a window of the result, from fine to coarse.

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.heads import dense
+from ghgs_lit.heads import dense, dpt
 from ghgs_lit.heads.dense import decode
 from ghgs_lit.heads.window import Span, Window, subject_windows
 from ghgs_lit.types import extents
@@ -159,3 +159,23 @@ def test_windows_hold_the_subject_and_no_more():
     whole = _windows(CASES["full"])[0]
     assert whole == Window.whole((70, 56))
     assert whole.is_whole
+
+
+@pytest.mark.parametrize("guided", [False, True], ids=["tokens", "guide"])
+@torch.no_grad()
+def test_rows_one_after_another_are_the_rows_at_once(guided, monkeypatch):
+    """The largest maps are held in part, which must not be seen in the result."""
+    patch, grid = (6, (9, 7)) if guided else (14, (4, 3))
+    size = (patch * grid[0], patch * grid[1])
+    tokens = _tokens(1, 2, *grid, patch_size=patch, dtype=torch.float64)
+    guide = (torch.rand(2, 3, *size, dtype=torch.float64),) if guided else None
+    head = head_of(guided, 5)
+    for window in (Window.whole(size), Window(Span(3, 50, size[0]), Span(5, 31, size[1]))):
+        expected = head(tokens, guide, window)
+        monkeypatch.setattr(dpt, "_LARGEST", 1)
+        monkeypatch.setattr(dpt, "_ROWS", 5)
+        assert len(head._parts(expected, window)) > 8
+        found = head(tokens, guide, window)
+        monkeypatch.undo()
+        assert found.shape == expected.shape
+        assert (found - expected).abs().max() <= 1e-12 * expected.abs().max()
