@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 from omegaconf import DictConfig
 
-from ghgs_lit.cli import doctor_cameras, doctor_machine
+from ghgs_lit.cli import doctor_cameras, doctor_machine, doctor_selfcheck
 from ghgs_lit.errors import choice
 
 TASKS: dict[str, Callable[[DictConfig], None]] = {
     "cameras": doctor_cameras.run,
     "machine": doctor_machine.run,
+    "selfcheck": doctor_selfcheck.run,
 }
 
 

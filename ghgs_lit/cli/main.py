@@ -49,7 +49,7 @@ VERBS = {
         "ghgs predict checkpoint=last.ckpt images=photographs cameras=cameras.json masks=masks out=splat",
     ),
     "doctor": (
-        "find out whether cameras and masks fit together, and a configuration this machine",
+        "find out whether cameras and masks fit together, a configuration this machine, a GPU the CPU",
         "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks",
     ),
     "view": (
