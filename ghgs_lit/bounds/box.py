@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.bounds import cpu
+from ghgs_lit.bounds.agreement import RESOLUTION, trusted_views
 from ghgs_lit.bounds.rays import depths_in_box, pixel_axes, projection_matrices
 from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, silhouettes, votes_outside
 from ghgs_lit.errors import require
@@ -28,7 +29,8 @@ _FARTHEST = 1e6
 class SubjectBox:
     """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box.
 
-    A ray that misses the box gets the range of depths of the whole box. Views with an empty mask do not vote.
+    A ray that misses the box gets the range of depths of the whole box. Views with an empty mask do not vote,
+    nor does one whose mask contradicts all others (:func:`ghgs_lit.bounds.agreement.trusted_views`).
 
     Args:
         dilation: of the masks, as a fraction of the image's longer side.
@@ -62,13 +64,27 @@ class SubjectBox:
     def __call__(self, batch: Batch) -> DepthBounds:
         """Bounds of all pixels; reads masks and cameras."""
         with torch.autocast(batch.masks.device.type, enabled=False):
-            coarse = silhouettes(batch, self.resolution, self.dilation)
+            coarse = silhouettes(batch.masks, batch.cameras, self.resolution, self.dilation)
+            voting = self._voting(coarse)
             lower, upper = subject_box(
-                coarse.masks, coarse.cameras, coarse.dilation, self.tolerance, self.cells
+                coarse.masks & voting[..., None, None],
+                coarse.cameras,
+                coarse.dilation,
+                self.tolerance,
+                self.cells,
             )
-            return self._within(batch, coarse, lower - self.margin, upper + self.margin)
+            return self._within(batch, coarse, voting, lower - self.margin, upper + self.margin)
 
-    def _within(self, batch: Batch, coarse: Silhouettes, lower: Tensor, upper: Tensor) -> DepthBounds:
+    def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
+        few = silhouettes(coarse.masks, coarse.cameras, RESOLUTION, self.dilation)
+        center = subject_center(few.masks, few.cameras)
+        # Not the largest: a mask of noise would leave no sample within the subject.
+        reach = _reach(few.masks, few.cameras, center).nanmedian(1).values
+        return trusted_views(few, center, reach, self.tolerance)
+
+    def _within(
+        self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
+    ) -> DepthBounds:
         """Bounds in the box from ``lower`` to ``upper``."""
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
@@ -99,9 +115,9 @@ def subject_box(
         The corners with the smallest and with the largest coordinates, in metres.
     """
     center = subject_center(masks, cameras)
-    reach = _reach(masks, cameras, center)[:, None]
+    reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)
     lower, upper = center - reach, center + reach
-    focal = _focal_lengths(cameras).amax(-1)
+    focal, voting = _focal_lengths(cameras).amax(-1), masks.flatten(2).any(-1)
     for _ in range(2):
         cell = (upper - lower) / cells
         depth = _project_one((lower + upper) / 2, cameras)[1]
@@ -109,7 +125,7 @@ def subject_box(
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius + grow[:, None, None, None])
-        kept = _carve(votes_outside(grown, masks), cameras, lower, cell, cells, tolerance)
+        kept = _carve(votes_outside(grown, voting), cameras, lower, cell, cells, tolerance)
         found = kept.flatten(1).any(-1)[:, None]
         # Along each axis, whether any cell of the slice is kept.
         slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
@@ -148,7 +164,7 @@ def _focal_lengths(cameras: Cameras) -> Float[Tensor, "B V 2"]:
 
 
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
-    """A generous radius of the subject about ``center``, in metres."""
+    """A generous radius [B, V] of the subject about ``center``, as each view shows it or NaN."""
     pixel, depth = _project_one(center, cameras)
     extents = [
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
@@ -156,4 +172,5 @@ def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tenso
     ]
     extent = torch.stack(extents, -1) / _focal_lengths(cameras)
     # More than what is seen: what reaches away from a camera looks smaller than it is.
-    return 1.4 * (extent.norm(dim=-1) * depth.clamp(min=NEAREST)).amax(1).clamp(min=0.05)
+    reach = 1.4 * extent.norm(dim=-1) * depth.clamp(min=NEAREST)
+    return torch.where(masks.flatten(2).any(-1), reach, torch.nan)

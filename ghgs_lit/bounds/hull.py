@@ -36,12 +36,16 @@ class VisualHull(SubjectBox):
 
     least: ClassVar[dict[str, int]] = {**SubjectBox.least, "samples": 2}
 
-    def _within(self, batch: Batch, coarse: Silhouettes, lower: Tensor, upper: Tensor) -> DepthBounds:
+    def _within(
+        self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
+    ) -> DepthBounds:
         box = self._valid(depths_in_box(batch.cameras, lower, upper))
         start = box if coarse.stride == 1 else self._valid(depths_in_box(coarse.cameras, lower, upper))
         # One cell at least: the rays of a cell's pixels run beside the ray of its centre.
         radius, rays = max(coarse.dilation, 1), batch.pixels if coarse.stride == 1 else None
-        hull = hull_bounds(coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays)
+        hull = hull_bounds(
+            coarse.masks, coarse.cameras, start, radius, self.tolerance, self.samples, rays, voting
+        )
         near, far = (_enlarge(x, coarse.stride, batch.masks.shape[-2:]) for x in (hull.near, hull.far))
         return self._valid(DepthBounds(torch.maximum(box.near, near), torch.minimum(box.far, far)))
 
@@ -54,6 +58,7 @@ def hull_bounds(
     tolerance: int = 0,
     samples: int = 48,
     rays: Int[Tensor, " r"] | None = None,
+    voting: Bool[Tensor, "B V"] | None = None,
 ) -> DepthBounds:
     """First and last depth within ``start`` that the dilated masks of the other views allow.
 
@@ -67,8 +72,10 @@ def hull_bounds(
         tolerance: how many other views may say "outside" of a depth that is allowed.
         samples: depths that are tried along each ray.
         rays: indices of the masks' pixels, where they are known.
+        voting: views that may say "outside"; None: those whose mask is not empty.
     """
-    outside = votes_outside(dilate(masks, radius), masks)
+    voting = masks.flatten(2).any(-1) if voting is None else voting
+    outside = votes_outside(dilate(masks, radius), voting)
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
     steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
     directions, matrices = ray_directions(cameras), projection_matrices(cameras)

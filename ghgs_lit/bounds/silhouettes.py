@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int, Shaped, UInt8
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.types import Cameras
 
 #: The least depth at which masks are looked up, in metres; points behind the camera are moved there.
 NEAREST = 1e-4
@@ -25,23 +25,25 @@ class Silhouettes:
     dilation: int
 
 
-def silhouettes(batch: Batch, resolution: int, dilation: float) -> Silhouettes:
-    """The masks of a batch at a resolution that limits the cost of the search.
+def silhouettes(
+    masks: Bool[Tensor, "B V H W"], cameras: Cameras, resolution: int, dilation: float
+) -> Silhouettes:
+    """Masks at a resolution that limits the cost of the search.
 
     Args:
-        batch: masks and cameras are read.
+        masks: of the views.
+        cameras: [B, V], of the masks' size.
         resolution: cells along the longer side of the image, at most.
         dilation: as a fraction of the image's longer side.
     """
-    stride = ceil(max(batch.masks.shape[-2:]) / resolution)
-    masks = batch.masks
+    stride = ceil(max(masks.shape[-2:]) / resolution)
     if stride > 1:
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
     height, width = masks.shape[-2:]
     # Whole cells: the last row and column of them may reach beyond the image.
     full = Cameras(
-        at_least_float32(batch.cameras.intrinsics),
-        at_least_float32(batch.cameras.extrinsics),
+        at_least_float32(cameras.intrinsics),
+        at_least_float32(cameras.extrinsics),
         height * stride,
         width * stride,
     )
@@ -67,12 +69,9 @@ def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tens
     return grown
 
 
-def votes_outside(
-    dilated: Bool[Tensor, "B V h w"], masks: Bool[Tensor, "B V h w"]
-) -> UInt8[Tensor, "B V h w"]:
-    """1 where a view says "outside the subject"; views whose mask is empty do not vote."""
-    votes = masks.flatten(2).any(-1)
-    return (~dilated & votes[..., None, None]).to(torch.uint8)
+def votes_outside(dilated: Bool[Tensor, "B V h w"], voting: Bool[Tensor, "B V"]) -> UInt8[Tensor, "B V h w"]:
+    """1 where a view that votes says "outside the subject"."""
+    return (~dilated & voting[..., None, None]).to(torch.uint8)
 
 
 def look_up(

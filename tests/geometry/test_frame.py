@@ -54,7 +54,7 @@ def test_a_moved_world_moves_the_gaussians_and_no_render(name, scale, turn, away
         shown = render(found.gaussians, views)
     assert found.gaussians.splits == expected.gaussians.splits
     # float64 rounds to 1e-11 m at 100 km, which can change the last digit of a camera in float32.
-    limit = 1e-5 + 1e-9 * away
+    limit = 1e-5 + 2e-9 * away
     back = (found.gaussians.means - torch.tensor(shift).double()) @ turn / scale
     assert (back - expected.gaussians.means).abs().max() < limit
     back = (found.points.tokens - torch.tensor(shift).double()) @ turn / scale

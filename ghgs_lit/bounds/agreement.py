@@ -1,0 +1,71 @@
+"""Whether the masks agree about the subject: a view whose mask contradicts all others has no vote.
+
+Silhouettes of one subject explain one another: each ray of each has a point that all others show (silhouette
+coherence; Hernandez et al., PAMI 2007). Nothing here has a gradient.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.bounds.rays import projection_matrices, ray_directions
+from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, votes_outside
+from ghgs_lit.geometry.projection import world_to_camera
+
+#: Cells along the longer side of the masks, and depths along each ray: gross errors only are looked for.
+RESOLUTION, _SAMPLES = 32, 24
+
+#: Masks agree where the others explain this share of each.
+_SHARE = 0.95
+
+
+def trusted_views(
+    coarse: Silhouettes, center: Float[Tensor, "B 3"], reach: Float[Tensor, " B"], tolerance: int
+) -> Bool[Tensor, "B V"]:
+    """Views that vote about the hull: those that show the subject, but for one that contradicts the others.
+
+    A mask that is cut leaves rays of the others unexplained, one with more than the subject has such rays
+    itself. Where more than :data:`_SHARE` allows is unexplained, the view without which at most half of that
+    is left has no vote. Of two views nobody can tell which one is wrong.
+
+    Args:
+        coarse: masks of at most :data:`RESOLUTION` cells.
+        center: a point in the subject's middle.
+        reach: a generous radius of the subject.
+        tolerance: how many views may say "outside" of a point that is kept.
+    """
+    masks = coarse.masks
+    voting = masks.flatten(2).any(-1)
+    votes = _votes(coarse, voting, center, reach)
+    count = votes.sum(2, keepdim=True)
+    # By all views, and by all but one of them.
+    counts = torch.cat((count, count - votes), 2)
+    hit = (counts <= tolerance).any(-1) & masks[:, :, None]
+    explained = hit.flatten(3).sum(-1) / masks.flatten(2).sum(-1).clamp(min=1)[..., None]
+    # A view that has no vote need not be explained.
+    silent = torch.eye(masks.shape[1] + 1, dtype=torch.bool, device=masks.device)[1:] | ~voting[..., None]
+    agreement = torch.where(silent, 1.0, explained).amin(1)
+    best, suspect = agreement[:, 1:].max(1, keepdim=True)
+    found = agreement[:, :1]
+    wrong = (found < _SHARE) & (2 * (1 - best) < 1 - found) & (voting.sum(1, keepdim=True) > 2)
+    return voting & ~torch.zeros_like(voting).scatter(1, suspect, wrong)
+
+
+def _votes(coarse: Silhouettes, voting: Tensor, center: Tensor, reach: Tensor) -> Tensor:
+    """1 where view ``o`` sees a point on a ray of view ``v`` outside its mask [B, v, o, h, w, S]."""
+    masks, cameras = coarse.masks, coarse.cameras
+    b, v = voting.shape
+    # One cell at least: the rays of a cell's pixels run beside the ray of its centre.
+    outside = votes_outside(dilate(masks, max(coarse.dilation, 1)), voting)
+    matrices = projection_matrices(cameras)
+    middle = world_to_camera(center[:, None].expand(b, v, 3), cameras.extrinsics)[..., 2]
+    steps = (torch.arange(_SAMPLES, device=center.device, dtype=center.dtype) + 0.5) / _SAMPLES * 2 - 1
+    depth = (middle[..., None] + reach[:, None, None] * steps).clamp(min=NEAREST)
+    turn = matrices[..., :3]
+    along = torch.einsum("boij,bvhwj->ibvohw", turn, ray_directions(cameras))
+    origin = (
+        torch.einsum("boij,bvj->ibvo", turn, cameras.centers) + matrices[..., 3].movedim(2, 0)[:, :, None]
+    )
+    pixels = origin[..., None, None, None] + along[..., None] * depth[:, :, None, None, None]
+    image = torch.arange(b * v, device=center.device).view(b, 1, v, 1, 1, 1)
+    return look_up(outside.flatten(0, 1), image, *pixels)
