@@ -17,6 +17,7 @@ from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.heads.window import Span, Window, reach
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.precision import without_float16
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
@@ -172,7 +173,7 @@ class DPTHead(nn.Module):
         guide: Guide | None = None,
         window: Window | None = None,
     ) -> Float[Tensor, "bv o h w"]:
-        """Raw maps of all images, float32 or wider.
+        """Raw maps of all images, float32 or wider; under float16 autocast all of it is computed in float32.
 
         Args:
             tokens: of four layers.
@@ -180,6 +181,10 @@ class DPTHead(nn.Module):
             window: the part of the maps that is computed; None: all.
         """
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
+        with without_float16(tokens.semantic.device.type):
+            return self._maps(tokens, guide, window)
+
+    def _maps(self, tokens: Tokens, guide: Guide | None, window: Window | None) -> Tensor:
         expected = "none" if self.guide is None else "maps"
         require((guide is None) == (self.guide is None), "guide", expected, guide is not None)
         rows, columns = tokens.grid[2:]
@@ -278,6 +283,8 @@ class DPTHead(nn.Module):
     def _project(self, i: int, x: Float[Tensor, "*n c"]) -> Float[Tensor, "*n o"]:
         """Normalised and projected tokens (a 1x1 convolution is a linear layer of tokens)."""
         project = self.projects[i]
+        if not torch.is_autocast_enabled(x.device.type):
+            x = x.to(project.weight.dtype)  # tokens of an encoder under float16 autocast
         return linear(self.norm(x), project.weight.flatten(1), project.bias)
 
 

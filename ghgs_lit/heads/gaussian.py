@@ -20,6 +20,7 @@ from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.window import subject_windows
+from ghgs_lit.kernels.precision import without_float16
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens, true_places
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -40,8 +41,12 @@ def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
 
 
 def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
-    """``mlp(x)``, its last projection in float32 under autocast: offsets of millimetres depend on it."""
-    hidden, last = mlp[:-1](x), mlp[-1]
+    """``mlp(x)``, its last projection in float32 under autocast: offsets of millimetres depend on it.
+
+    Under float16 autocast all of it, as the dense head before it.
+    """
+    with without_float16(x.device.type):
+        hidden, last = mlp[:-1](x), mlp[-1]
     with torch.autocast(x.device.type, enabled=False):
         return at_least_float32(last(hidden.to(last.weight.dtype)))
 

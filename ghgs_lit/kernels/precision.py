@@ -40,3 +40,13 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     if name == "float32":
         return torch.autocast(device.type, enabled=False)
     return torch.autocast(device.type, getattr(torch, name))
+
+
+def without_float16(device: str) -> AbstractContextManager:
+    """No autocast where it is float16, whose largest number a dense head's maps and gradients exceed.
+
+    Args:
+        device: its type.
+    """
+    low = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
+    return torch.autocast(device, enabled=False) if low else nullcontext()

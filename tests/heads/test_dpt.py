@@ -115,6 +115,22 @@ def test_last_projection_is_wide_under_autocast():
     assert (low - exact).abs().max() < 0.03 * exact.abs().max()
 
 
+def test_float16_overflows_no_dense_head():
+    """Maps of a head whose weights have grown exceed 65 504; in float16 every depth was lost."""
+    head, tokens = _head(features=32, hidden=32), _tokens(v=2, h=5, w=5)
+    with torch.no_grad():
+        for name, parameter in head.named_parameters():
+            if not name.startswith("norm"):
+                parameter.mul_(10)
+        exact = head(tokens)
+        half = dataclasses.replace(tokens, latent=tuple(layer.half() for layer in tokens.latent))
+        with torch.autocast("cpu", torch.float16):
+            low = head(half)
+    assert low.dtype == torch.float32
+    assert exact.abs().max() > 65504
+    assert (low - exact).abs().max() < 0.01 * exact.abs().max()
+
+
 @pytest.mark.parametrize("grid", [(1, 1), (3, 1), (2, 2)])
 def test_gradients_under_autocast_hold_no_memory_that_was_not_written(grid):
     """PyTorch's stride of 2 leaves parts of a gradient unset for maps one cell wide: NaN of freed memory."""
