@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import RasterSettings, render
 from tests.helpers.splats import (
     FIELDS,
@@ -208,3 +209,12 @@ def test_antialiased_splats_without_area_vanish():
     rendering.image.sum().backward()
     assert torch.equal(rendering.image, alone.image)
     assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
+
+
+def test_more_splats_in_tiles_than_memory_are_refused_at_once():
+    """60 000 splats that fill the frame take 5 GB with their gradients; one line, before any is allocated."""
+    gaussians = cloud(60_000)
+    full = dataclasses.replace(gaussians, scales=torch.full_like(gaussians.scales, 1e4))
+    full.means.requires_grad_()
+    with pytest.raises(InputError, match=r"cpu: expected .* 4 GiB at most .*4.6 GiB: .* 1019 of each"):
+        render(full, camera_ring(1, 512, 512), "cpu")

@@ -25,6 +25,8 @@ from ghgs_lit.types import Cameras, Gaussians, Rendering
 _RUNS = 8
 # The kernels are compiled once for this number of channels and once for all others.
 _COLORS = 3
+# Bytes of the lists of tiles and their gradients: splats that fill the frame are in every one of its tiles.
+_MEMORY = 1 << 32
 
 
 def rasterize(
@@ -74,8 +76,12 @@ class _Splats:
     reached: np.ndarray
 
 
-def _prepare(plan: Plan, means, quaternions, scales, opacities, colors) -> _Splats:
-    """Project all Gaussians into their views and list the splats of each tile."""
+def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differentiable: bool) -> _Splats:
+    """Project all Gaussians into their views and list the splats of each tile.
+
+    Raises:
+        InputError: the lists, with their gradients where they are needed, would exceed :data:`_MEMORY`.
+    """
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)
@@ -94,7 +100,13 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors) -> _Spla
     tile_starts = np.concatenate(([0], counts.sum(1).reshape(-1).cumsum()))
     slots = np.cumsum(found).reshape(found.shape) - found
     size = int(tile_starts[-1])
-    require(size < 1 << 31, "render", "fewer than 2^31 splats in tiles at once (fewer views)", size)
+    each = 4 * (layout.ENTRY + (layout.gradient_width(colors.shape[1]) if differentiable else 0))
+    require(
+        size * each <= _MEMORY,
+        "renderer.backend=cpu",
+        f"lists of tiles of {_MEMORY / 2**30:g} GiB at most (smaller splats, fewer or smaller views)",
+        f"{size * each / 2**30:.1f} GiB: {size} entries, {size // max(len(means), 1)} of each Gaussian",
+    )
     next_free = tile_starts[:-1].reshape(elements, 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
     entries, entry_starts = np.empty((size, layout.ENTRY), np.int32), np.empty(total, np.int32)
 
@@ -125,7 +137,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quaternions, scales, opacities, colors, plan: Plan):
         arrays = [t.detach().numpy() for t in (means, quaternions, scales, opacities[:, None], colors)]
-        found = _prepare(plan, *arrays)
+        found = _prepare(plan, *arrays, differentiable=any(ctx.needs_input_grad))
         channels, size = colors.shape[1], (plan.height, plan.width)
         image, alpha, depth = (_zeros(*plan.shape, planes, *size) for planes in (channels, 1, 1))
         outputs = [_flat(t) for t in (image, alpha, depth)]
