@@ -106,13 +106,16 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
 
 
 def _smooth(images: Tensor, masks: Tensor) -> Tensor:
-    """Colours averaged over the subject's pixels in 3 x 3, and the mask as a fourth channel."""
-    inside = masks.to(images.dtype)[:, :, None]
-    both = torch.cat((images * inside, inside), 2)
+    """Colours averaged over the subject's pixels in 3 x 3, and the mask as a fourth channel.
+
+    A pixel that is not finite is none of the subject's: it would spread through sums and samples.
+    """
+    inside = (masks & images.sum(2).isfinite())[:, :, None]
+    both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
     for axis in (-2, -1):  # sums of three, several times as fast as an average pool
         both = _sum_of_three(both, axis)
     colors = both[:, :, :3] / torch.where(both[:, :, 3:] > 0, both[:, :, 3:], 1.0)
-    return torch.cat((colors, inside), 2)
+    return torch.cat((colors, inside.to(colors)), 2)
 
 
 def _sum_of_three(values: Tensor, axis: int) -> Tensor:

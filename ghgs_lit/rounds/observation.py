@@ -38,7 +38,8 @@ def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[
     photo, mask = at_least_float32(batch.images), batch.masks[:, :, None]
     maps = (photo, photo - rendering.image, mask.to(photo), rendering.alpha, rendering.depth)
     image = element[:, None] * views + torch.arange(views, device=element.device)
-    found = sample(torch.cat(maps, 2).flatten(0, 1), image, pixels)
+    # A colour that is not finite would reach other elements.
+    found = sample(torch.cat(maps, 2).flatten(0, 1).nan_to_num(), image, pixels)
     color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
     inside = (pixels >= 0).all(-1) & (pixels[..., 0] <= width) & (pixels[..., 1] <= height)
     can_see = ((z > 0) & inside)[..., None]

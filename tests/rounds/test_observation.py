@@ -86,3 +86,15 @@ def test_outside_of_all_images_everything_is_0(means):
     each = observe(dataclasses.replace(one, means=means), batch)
     assert each.isfinite().all()
     assert not each[each[..., 9] == 0][:, :9].any()
+
+
+def test_what_is_not_finite_reaches_no_other_element():
+    """Maps of a batch are sampled as one volume, between whose layers values blend."""
+    batch = make_batch(3, 2)
+    gaussians = splats(batch)
+    expected = observe(gaussians, batch)
+    colors = gaussians.colors.clone()
+    element = gaussians.image // 2
+    colors[element == 1] = torch.nan
+    found = observe(dataclasses.replace(gaussians, colors=colors), batch)
+    torch.testing.assert_close(found[element != 1], expected[element != 1], rtol=0, atol=1e-5)
