@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.stress.families import PLANTED
+from ghgs_lit.stress.families import FAMILIES, PLANTED
 from ghgs_lit.stress.stage import Stage, Values
 
 #: Random roundings of the inputs that estimate the condition number; their size in relative terms.
@@ -144,6 +144,10 @@ def _compare(stage, family, exact, truth, spread, seeds, dtype, shared) -> Cell:
         ratios[name] = _largest(found[name] - value) / (eps * (scale + spread[name] + floor))
     names = list(ratios)
     table = torch.stack([ratios[name].nan_to_num(nan=math.inf, posinf=math.inf) for name in names])
+    lost = (~torch.stack([_largest(found[name]) for name in names]).isfinite()).any(0)
+    if dtype == "float16" and FAMILIES[family].ingredient == "weights":
+        # Weights may take products beyond 65 504, float16's largest number: then the result must say so.
+        table = torch.where(lost, 0.0, table)
     worst, place = table.max(0)
     case = int(worst.argmax())
     gradient = [_largest(found[name]) for name in names if name.startswith("d ")]
@@ -156,7 +160,7 @@ def _compare(stage, family, exact, truth, spread, seeds, dtype, shared) -> Cell:
         error=float(worst[case]),
         median=float(worst.median()),
         budget=stage.factor,
-        nonfinite=float((~torch.stack([_largest(found[n]) for n in names]).isfinite()).any(0).float().mean()),
+        nonfinite=float(lost.float().mean()),
         gradient=float(torch.stack(gradient).amax(0).median()) if gradient else 0.0,
         worst=f"{names[int(place[case])]}, seed {seeds[case]}",
         seconds=shared + time.perf_counter() - started,

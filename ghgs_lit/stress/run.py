@@ -22,9 +22,6 @@ from ghgs_lit.stress.stages import STAGES
 
 Row = dict[str, str | int | float | None]
 
-#: Cases of each family and dtype in a quick run; they say nothing of rare failures.
-_QUICK = 3
-
 
 @dataclass(frozen=True)
 class Task:
@@ -62,7 +59,7 @@ def tasks_of(
             choice(key, name, known)
         chosen.append(tuple(known if names is None else names))
     return [
-        Task(name, family, _QUICK if quick else STAGES[name].seeds, chosen[2])
+        Task(name, family, STAGES[name].quick if quick else STAGES[name].seeds, chosen[2])
         for name in chosen[0]
         for family in chosen[1]
         if STAGES[name].missing(family) is None

@@ -35,6 +35,7 @@ class Stage:
         gradients: inputs whose gradients are compared, too.
         steady: inputs that are not rounded for kappa.
         seeds: cases of each family and dtype in the full run.
+        quick: the same in a quick run, which says nothing of rare failures.
         network: computes in autocast's dtype; all others stay in float32 or wider.
         dtypes: those that the stage has.
         no_dtype: why it has no others.
@@ -56,6 +57,7 @@ class Stage:
     gradients: tuple[str, ...] = ()
     steady: tuple[str, ...] = ()
     seeds: int = 128
+    quick: int = 3
     network: bool = False
     dtypes: tuple[str, ...] = DTYPES
     no_dtype: str = ""

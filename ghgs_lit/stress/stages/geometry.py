@@ -5,10 +5,12 @@ from torch import Generator, Tensor
 
 from ghgs_lit.bounds import SubjectBox, VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
+from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
+from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.stress import inputs
@@ -116,8 +118,12 @@ def _seen(family: str, g: Generator) -> Values:
 
 
 def _bounds(stage: SubjectBox, v: Values) -> Values:
-    """Bounds of the subject's pixels, and how far the true surface lies outside them."""
-    found, masks = stage(batch_of(v)), v["masks"]
+    """Bounds of the subject's pixels as the model asks for them, in the subject's frame, whose limits are in
+    metres; and how far the true surface lies outside them."""
+    batch, masks = batch_of(v), v["masks"]
+    frame = Frame.of(batch)
+    found, metre = stage(frame.enter(batch)), frame.metre.to(v["truth"])[:, None, None, None]
+    found = DepthBounds(found.near * metre, found.far * metre)
     outside = torch.relu(found.near - v["truth"]) + torch.relu(v["truth"] - found.far)
     seen = masks & (v["truth"] > 0)
     return {
@@ -136,6 +142,44 @@ def _bounds_slowly(v: Values) -> Values:
 def _cells(v: Values) -> Tensor:
     """Bounds are decisions on a grid of cells: one cell of 1/20 of the subject's depth may differ."""
     return torch.full((len(v["images"]),), 0.05 / (100 * torch.finfo(torch.float32).eps))
+
+
+def _frame_inputs(family: str, g: Generator) -> Values:
+    found = scene(family, g, 3, _SIZE)
+    return {**found, "points": inputs.normal(g, 16, 3)}
+
+
+def _frame(v: Values) -> Values:
+    """Cameras in the subject's frame, and points of the frame in the world."""
+    batch = batch_of(v)
+    frame = Frame.of(batch)
+    element = torch.arange(len(v["points"]))[:, None]
+    world = frame._to_world(v["points"], element, v["points"].dtype)
+    return {"extrinsics": frame.enter(batch).cameras.extrinsics, "world": world}
+
+
+def _sample_inputs(family: str, g: Generator) -> Values:
+    found = _project_inputs(family, g)
+    return {**found, "maps": inputs.images(family, g, 3, _SIZE, _SIZE)}
+
+
+def _places(v: Values) -> Tensor:
+    """Pixels of points, far outside where they are behind the camera."""
+    pixels, z = project(v["points"], *inputs.matrices(v["lenses"], v["poses"]))
+    return torch.where(z[..., None] > 0, pixels, 1e9)
+
+
+def _sample(v: Values) -> Values:
+    image = torch.arange(len(v["maps"]))[:, None].expand(v["points"].shape[:2])
+    return {"values": sample(v["maps"], image, _places(v))}
+
+
+def _sample_slowly(v: Values) -> Values:
+    """Every pixel times its share of the place."""
+    places = _places(v).clamp(-2, _SIZE + 2)
+    centers = torch.arange(_SIZE) + 0.5
+    across, down = (torch.relu(1 - (places[..., axis, None] - centers).abs()) for axis in (0, 1))
+    return {"values": torch.einsum("nph,npw,nchw->npc", down, across, v["maps"])}
 
 
 def _photo_inputs(family: str, g: Generator) -> Values:
@@ -237,6 +281,17 @@ STAGES = (
         "decisions on a grid: one cell may differ (kappa), the true surface must be inside", _bounds_slowly,
         steady=("truth", "middle", "images"), seeds=32, kappa=_cells, excluded=_OUTSIDE_FRAME,
         silent="cameras that are not finite are refused before this stage",
+    ),
+    Stage(
+        "subject frame", ("cameras", "masks"), _frame_inputs, _frame, 20,
+        "all of it in float64, rounded once", gradients=("points",), steady=("truth", "middle", "images"),
+        excluded=_OUTSIDE_FRAME, silent="cameras that are not finite are refused before this stage",
+    ),
+    Stage(
+        "samples of maps", ("cameras", "points", "images"), _sample_inputs, _sample, 20,
+        "a mean of four pixels; their shares lose the digits of a pixel's place (kappa)", _sample_slowly,
+        steady=("middle",), seeds=64,
+        excluded={n: "its callers clean their maps" for n in ("nan", "inf")},
     ),
     Stage(
         "photo-consistency", ("cameras", "images", "masks"), _photo_inputs, _photo, 100,
