@@ -46,6 +46,7 @@ FAMILIES = {
     "equal_depths": Family("depths", "all depths equal"),
     "behind": Family("points", "points behind the camera"),
     "on_camera": Family("points", "points 1e-6 from the camera's centre"),
+    "beside": Family("points", "points beside the frame, whose splats reach into it"),
     "far": Family("points", "points 1e6 m away"),
     "duplicates": Family("points", "all points twice"),
     "collapsed": Family("points", "all points at one place"),

@@ -85,6 +85,11 @@ def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor 
     center = -rotation.mT @ translation
     if family == "behind":
         return center - rotation[2] * uniform(g, 0.1, 3, count, 1) + 0.1 * normal(g, count, 3)
+    if family == "beside":
+        around = uniform(g, 0, 2 * math.pi, count, 1)
+        across = rotation[0] * around.cos() + rotation[1] * around.sin()
+        depth = uniform(g, 0.7, 1.5, count, 1)
+        return center + depth * (rotation[2] + uniform(g, 0.7, 1.2, count, 1) * across)
     if family == "on_camera":
         return center + 1e-6 * (rotation[2] * uniform(g, 0.5, 1, count, 1) + 0.2 * normal(g, count, 3))
     return found

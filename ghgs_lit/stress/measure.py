@@ -13,8 +13,8 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.stress.families import FAMILIES, PLANTED
 from ghgs_lit.stress.stage import Stage, Values
 
-#: Random roundings of the inputs that estimate the condition number; their size in relative terms.
-_ROUNDINGS, _STEP = 4, torch.finfo(torch.float32).eps
+#: Size of the random roundings of the inputs that estimate the condition number, in relative terms.
+_STEP = torch.finfo(torch.float32).eps
 
 
 @dataclass(frozen=True)
@@ -102,19 +102,23 @@ def measure(
 
 
 def _spread(reference, exact: Values, truth: Values, stage: Stage) -> Values:
-    """How far each output of the reference moves where the inputs are rounded at random, over the step."""
+    """How far each output of the reference moves where the inputs are rounded at random, over the rounding.
+
+    Two roundings are of one step. The other two are opposite and as large as the budget: a decision that
+    falls within it (a ray that grazes a box) jumps for one of them.
+    """
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
-    for k in range(_ROUNDINGS):
-        g = torch.Generator().manual_seed(k)
+    for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
+        g, step = torch.Generator().manual_seed(seed), size * _STEP
         moved = {}
         for name, value in exact.items():
             moved[name] = value
             if value.is_floating_point() and name not in stage.steady:
                 signs = 1 - 2 * torch.randint(2, value.shape, generator=g)
-                moved[name] = value * (1 + _STEP * signs)
+                moved[name] = value * (1 + step * signs)
         found = evaluate(reference, moved, stage.gradients, "float64")
         for name, value in truth.items():
-            spread[name] = torch.maximum(spread[name], _largest(found[name] - value) / _STEP)
+            spread[name] = torch.maximum(spread[name], _largest(found[name] - value) / abs(step))
     return spread
 
 

@@ -64,14 +64,26 @@ def _unproject_slowly(v: Values) -> Values:
 def _rays_inputs(family: str, g: Generator) -> Values:
     rig = _rig(family, g, size=4)
     half = 0.7 * inputs.UNITS.get(family, 1.0)
-    return {**rig, "half": half + inputs.uniform(g, 0, 0.1 * half, 3)}
+    half = half + inputs.uniform(g, 0, 0.1 * half, 3)
+    cameras = Cameras(*inputs.matrices(rig["lenses"], rig["poses"]), 4, 4)
+    inner, outer = (_hits(cameras, rig["middle"], half * share) for share in (0.9, 1.1))
+    return {**rig, "half": half, "clear": inner == outer}
+
+
+def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
+    """Which rays hit a box."""
+    directions, centers = ray_directions(cameras), cameras.centers[:, None, None]
+    faces = [(middle + sign * half - centers) / directions for sign in (-1, 1)]
+    return torch.minimum(*faces).amax(-1) < torch.maximum(*faces).amin(-1)
 
 
 def _rays(v: Values) -> Values:
+    """Rays, and where those meet the box that neither graze nor barely miss it: that is a decision."""
     cameras = cameras_of(v, 4)
     with torch.autocast("cpu", enabled=False):  # as in the stage
         bounds = depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
-        return {"directions": ray_directions(cameras), "near": bounds.near, "far": bounds.far}
+        near, far = (torch.where(v["clear"], x, 0.0) for x in (bounds.near, bounds.far))
+        return {"directions": ray_directions(cameras), "near": near, "far": far}
 
 
 def scene(family: str, g: Generator, views: int, size: int, target: bool = False) -> Values:
@@ -189,7 +201,8 @@ def _photo_inputs(family: str, g: Generator) -> Values:
 
 
 def _photo(v: Values) -> Values:
-    return {"agreement": photo_consistency(batch_of(v), DepthBounds(v["near"], v["far"]), 3)}
+    """What is left to full agreement: a share of 1, however small the agreement is."""
+    return {"disagreement": 1 - photo_consistency(batch_of(v), DepthBounds(v["near"], v["far"]), 3)}
 
 
 def _tokens_inputs(family: str, g: Generator) -> Values:
@@ -219,13 +232,13 @@ def _padding(v: Values) -> Values:
     padding = pad_to_patches(v["masks"], 4)
     padded = padding.pad_batch(batch_of(v))
     cameras, images = padded.cameras, padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
-    moved, _ = project(v["middle"][:, None], cameras.intrinsics, cameras.extrinsics)
+    moved, _ = project(v["middle"][:, None].expand(-1, 2, -1), cameras.intrinsics, cameras.extrinsics)
     corner = torch.tensor([padding.left, padding.top])
     return {"images": images, "masks": padding.cut(padded.masks).to(images), "pixel": moved + corner}
 
 
 def _padding_slowly(v: Values) -> Values:
-    pixel, _ = project(v["middle"][:, None], *inputs.matrices(v["lenses"], v["poses"]))
+    pixel, _ = project(v["middle"][:, None].expand(-1, 2, -1), *inputs.matrices(v["lenses"], v["poses"]))
     return {"images": v["images"], "masks": v["masks"].to(v["images"]), "pixel": pixel}
 
 
@@ -306,7 +319,7 @@ STAGES = (
     Stage(
         "padding", ("cameras", "images", "masks"), _padding_inputs, _padding, 10,
         "copies, and a principal point that moves by whole pixels", _padding_slowly,
-        gradients=("images",), steady=("truth",),
+        gradients=("images",), steady=("truth", "poses"),
     ),
     Stage(
         "undistortion", ("cameras",), _lens_inputs, _lens, 50,

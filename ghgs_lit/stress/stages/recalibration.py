@@ -198,7 +198,7 @@ STAGES = (
         "distances of differences: three squares and a root", _distances_slowly, seeds=48,
         excluded={
             **{n: "takes points, no camera" for n in ("wide", "long", "skewed", "mirrored", "degenerate")},
-            **{n: "relative to a camera" for n in ("behind", "on_camera")},
+            **{n: "relative to a camera" for n in ("behind", "on_camera", "beside")},
         },
         silent="a point that is not finite is nobody's neighbour while there are others",
     ),

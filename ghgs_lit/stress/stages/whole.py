@@ -122,7 +122,7 @@ def _pipeline(name: str) -> Stage:
     return Stage(
         f"pipeline {name}", ("cameras", "images", "masks", "weights"), _inputs,
         lambda v: _predict(name, v), 100, _NETWORK,
-        steady=("truth", "middle", "target", "target_lenses", "target_poses"), seeds=20, quick=2,
+        steady=("truth", "middle", "target", "target_lenses", "target_poses"), seeds=20, quick=1,
         network=True, kappa=_far, excluded=_SMALL, refused=("out_of_range",),
         silent="what the model does not read is not in its output",
     )  # fmt: skip

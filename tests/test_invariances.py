@@ -1,0 +1,104 @@
+"""What must not change a result beyond rounding: the number of threads, and the precision of products."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from ghgs_lit.encoder import cpu
+from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.kernels.compile import processor_features
+from ghgs_lit.metrics.functional import ssim
+from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
+from ghgs_lit.recalibration.recalibration import neighbor_cosines
+from ghgs_lit.types import DepthBounds
+from tests.helpers.literal_recalibration import literal_recalibration
+from tests.helpers.models import close, make_model
+from tests.helpers.scenes import make_batch
+
+
+@pytest.mark.parametrize("name", ["paper", "recurrent"])
+def test_two_threads_predict_what_one_does(name):
+    """Sums may be taken in another order, nothing else."""
+    model, batch, before = (
+        make_model(f"model={name}").eval(),
+        make_batch(2, 3, 56, 42),
+        torch.get_num_threads(),
+    )
+    found = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            with torch.no_grad():
+                found.append(model(batch))
+    finally:
+        torch.set_num_threads(before)
+    close(found[1].gaussians, found[0].gaussians)
+    assert (found[1].depth - found[0].depth).abs().max() <= 1e-5 * found[0].depth.abs().max()
+
+
+def attention(g):
+    q, k, v = (torch.randn(2, 3, 200, 64, generator=g) for _ in range(3))
+
+    def ours(dtype):
+        return cpu.attend(*(x.to(dtype) for x in (q, k, v)))
+
+    def plain(dtype):
+        return F.scaled_dot_product_attention(*(x.to(dtype) for x in (q, k, v))).transpose(1, 2)
+
+    return ours, plain
+
+
+def recalibration(g):
+    block = SemanticAttention(64, 2, "product_clamped")
+    x, points, semantic = (torch.randn(300, n, generator=g) for n in (64, 3, 16))
+    near = nearest_neighbors(points, torch.zeros(300, dtype=torch.long), 8, "all")
+
+    @torch.no_grad()
+    def ours(dtype):
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            return block(x, [near], [neighbor_cosines(semantic, near)])
+
+    @torch.no_grad()
+    def plain(dtype):
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            return literal_recalibration(block, x, points, semantic, 8)
+
+    return ours, plain
+
+
+def sweep(g):
+    """Against images and bounds in bfloat16: half a pixel in bfloat16 is a different colour."""
+    batch = make_batch(1, 3, 56, 56)
+    bounds = DepthBounds(batch.depths - 0.1, batch.depths + 0.1)
+
+    def ours(dtype):
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            return photo_consistency(batch, bounds, 3)
+
+    def plain(dtype):
+        rounded = DepthBounds(*((x.to(dtype).float()) for x in (bounds.near, bounds.far)))
+        return photo_consistency(batch, rounded, 3)
+
+    return ours, plain
+
+
+def similarity(g):
+    image, target = (torch.rand(2, 3, 40, 40, generator=g) for _ in range(2))
+
+    def ours(dtype):
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            return ssim(image, target)
+
+    return ours, lambda dtype: ssim(image.to(dtype).float(), target.to(dtype).float())
+
+
+HALF = pytest.mark.skipif("avx512bf16" not in processor_features(), reason="no products in bfloat16")
+
+
+@pytest.mark.parametrize("case", [pytest.param(attention, marks=HALF), recalibration, sweep, similarity])
+def test_mixed_precision_costs_at_most_twice_what_it_costs_pytorch(case):
+    """``max|out - ref|`` of the same function in plain PyTorch at that dtype, and 1e-5 of ``max|ref|``."""
+    ours, plain = case(torch.Generator().manual_seed(0))
+    expected = plain(torch.float32)
+    allowed = 2 * (plain(torch.bfloat16).float() - expected).abs().max() + 1e-5 * expected.abs().max()
+    assert (ours(torch.bfloat16).float() - expected).abs().max() <= allowed
