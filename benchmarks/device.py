@@ -1,12 +1,12 @@
-"""What a GPU would be asked for, by stage: operator calls, and waits of the host. No GPU is needed.
+"""What a GPU would be asked for, by stage: calls, launches (calls that are no views), waits of the host.
 
-Counted on the pretend device of the tests. A GPU starves where calls are many and small, and it idles where
-the host waits for a value. A list that is copied to the device makes the host wait, too.
+Counted on the pretend device of the tests, without a GPU. A GPU starves where calls are many and small, and
+it idles where the host waits for a value. A list that is copied to the device makes the host wait, too.
 
     python benchmarks/device.py                          # vggt_nano, two elements of four views of 140 x 140
     python benchmarks/device.py --lines model=paper      # which lines wait; with overrides of `ghgs train`
 
-Rendering is left out: it is one call of gsplat for each element.
+Rendering is left out: it is one call of gsplat for a batch.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from ghgs_lit.training import Optimization
 from ghgs_lit.types import Batch, Rendering
 from tests.helpers.pretend_device import DEVICE, Log, pretend_device
 
-Counts = dict[str, tuple[int, int]]
+Counts = dict[str, tuple[int, int, int]]
 
 
 class CountingProbe:
@@ -38,13 +38,13 @@ class CountingProbe:
     def __init__(self, log: Log):
         self.log = log
         self.counts: Counts = {}
-        self._open: list[tuple[int, int]] = []
+        self._open: list[tuple[int, int, int]] = []
 
     def begin(self, stage: str) -> None:
         self._open.append(self._so_far())
 
     def end(self, stage: str) -> None:
-        numbers = zip(self.counts.get(stage, (0, 0)), self._so_far(), self._open.pop(), strict=True)
+        numbers = zip(self.counts.get(stage, (0, 0, 0)), self._so_far(), self._open.pop(), strict=True)
         self.counts[stage] = tuple(old + now - before for old, now, before in numbers)
 
     @contextmanager
@@ -53,8 +53,8 @@ class CountingProbe:
         yield
         self.end(stage)
 
-    def _so_far(self) -> tuple[int, int]:
-        return self.log.calls.total(), self.log.waits.total()
+    def _so_far(self) -> tuple[int, int, int]:
+        return self.log.calls.total(), self.log.launches, self.log.waits.total()
 
 
 def forward(model: GHGS, batch: Batch, log: Log) -> Counts:
@@ -98,10 +98,10 @@ def step(
 
 
 def show(title: str, found: list[Counts], sizes: list[int]) -> None:
-    heads = "".join(f"{f'batch {size}':>16}" for size in sizes)
-    print(f"\n{title:24}{heads}\n{'':24}" + f"{'calls':>9}{'waits':>7}" * len(sizes))
+    heads = "".join(f"{f'batch {size}':>26}" for size in sizes)
+    print(f"\n{title:24}{heads}\n{'':24}" + f"{'calls':>9}{'launches':>10}{'waits':>7}" * len(sizes))
     for name in found[0]:
-        print(f"{name:24}" + "".join(f"{counts[name][0]:9}{counts[name][1]:7}" for counts in found))
+        print(f"{name:24}" + "".join("{:9}{:10}{:7}".format(*counts[name]) for counts in found))
 
 
 def main() -> None:

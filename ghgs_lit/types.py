@@ -144,6 +144,13 @@ class Batch(_TensorStruct):
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
 
+    def once(self, function: Callable[["Batch"], _T]) -> _T:
+        """``function`` of this batch, computed at its first use; several stages need the same."""
+        known = self.__dict__.setdefault("_known", {})
+        if function not in known:
+            known[function] = function(self)
+        return known[function]
+
     @cached_property
     def extents(self) -> list["Extent"]:
         """Of the subject in each image ``b * V + v``; the host waits for a GPU when they are first read."""

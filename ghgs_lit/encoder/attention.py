@@ -12,10 +12,10 @@ from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.rope import Rotary, rotate
 from ghgs_lit.errors import require
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.parts import at_once, even_parts
 
-#: Values of queries or keys that are rotated at once without a gradient (bounds memory).
-_ROTATED = 1 << 18
+#: Values of queries or keys that are rotated at once without a gradient (bounds memory), and on a GPU.
+_ROTATED, _GPU_ROTATED = 1 << 18, 1 << 25
 
 
 class Attention(nn.Module):
@@ -54,7 +54,8 @@ class Attention(nn.Module):
             return norm(x)
         if torch.is_grad_enabled():
             return rotate(norm(x), rotary)
-        for heads in even_parts(len(x), _ROTATED // x[0].numel()):
+        most = at_once(x.device, _ROTATED, _GPU_ROTATED)
+        for heads in even_parts(len(x), most // x[0].numel()):
             x[heads] = rotate(norm(x[heads]), rotary)
         return x
 

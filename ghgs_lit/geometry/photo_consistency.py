@@ -48,9 +48,7 @@ def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V 
     b, v, height, width = batch.masks.shape
     near, far = at_least_float32(bounds.near), at_least_float32(bounds.far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
-    colors = _smooth(batch.images.to(near), batch.masks)
-    turn, shift, facing = (relation.to(near) for relation in _relations(batch.cameras))
-    compared = ~(facing < WIDEST)
+    colors, turn, shift, compared = (x.to(near) if x.is_floating_point() else x for x in batch.once(_views))
     if cpu.is_supported(near, far):
         result = cpu.sweep(colors, batch.masks, near, far, turn, shift, compared, shares, TOLERANCE)
         return result.permute(0, 1, 4, 2, 3)
@@ -62,6 +60,13 @@ def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V 
         depth = low + (high - low) * shares
         result[some] = _best_match(some, depth, colors, turn, shift, compared)
     return result.view(b, v, height, width, steps).permute(0, 1, 4, 2, 3)
+
+
+def _views(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What does not depend on depths: smooth colours, relations of the views, and which are compared."""
+    turn, shift, facing = _relations(batch.cameras)
+    colors = _smooth(batch.images.to(at_least_float32(batch.images).dtype), batch.masks)
+    return colors, turn, shift, ~(facing < WIDEST)
 
 
 def _best_match(

@@ -31,12 +31,10 @@ def pixel_centers(height: int, width: int, like: Tensor, stride: int = 1) -> Flo
 
 
 def inverse_intrinsics(intrinsics: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """``K^-1`` in closed form, for a K that is upper triangular (a skew is allowed) and ends with 1."""
+    """``K^-1`` by substitution, for a K that is upper triangular (a skew is allowed) and ends with 1."""
     intrinsics = at_least_float32(intrinsics)
-    (fx, skew, cx), (_, fy, cy), _ = (row.unbind(-1) for row in intrinsics.unbind(-2))
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    rows = (1 / fx, -skew / fx / fy, (skew * (cy / fy) - cx) / fx, zero, 1 / fy, -cy / fy, zero, zero, one)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    identity = torch.eye(3, dtype=intrinsics.dtype, device=intrinsics.device)
+    return torch.linalg.solve_triangular(intrinsics, identity.expand_as(intrinsics), upper=True)
 
 
 def unproject(

@@ -1,6 +1,5 @@
 """Directions of vectors of any length."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,10 +18,10 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     x = at_least_float32(x)
     largest = x.detach().abs().amax(-1, keepdim=True)
     is_zero = largest == 0
-    scaled = x / torch.where(is_zero, 1.0, largest)
+    scaled = x / largest.masked_fill(is_zero, 1.0)
     # The argument is chosen, not the result: a root at 0 would have an infinite gradient.
-    squared = torch.where(is_zero, 1.0, scaled.square().sum(-1, keepdim=True))
-    direction = torch.where(is_zero, 0.0, scaled * squared.rsqrt())
+    squared = scaled.square().sum(-1, keepdim=True).masked_fill(is_zero, 1.0)
+    direction = (scaled * squared.rsqrt()).masked_fill(is_zero, 0.0)
     if least == 0:
         return direction
     share = (largest * squared.detach().sqrt() / least).clamp(max=1)

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
@@ -19,6 +20,8 @@ SIMILARITIES = ("product", "product_clamped", "log", "none")
 
 #: Tokens computed at once without a gradient; in half precision a smaller number is as fast on a CPU.
 _ROWS, _HALF_ROWS = 424, 256
+#: Scores of all tokens that are held on a CPU, and values of neighbours that are gathered at once.
+_SCORES, _GATHERED = 1 << 26, 1 << 25
 
 
 class SemanticAttention(nn.Module):
@@ -110,7 +113,7 @@ class SemanticAttention(nn.Module):
             normed = self.norm1(x[rows])
             return at_least_float32(torch.cat((k_proj(normed), v_proj(normed)), dim=-1))
 
-        k, v = _in_parts(keys_values, len(x)).chunk(2, dim=-1)
+        k, v = _in_parts(keys_values, len(x), x.device).chunk(2, dim=-1)
 
         def recalibrate(rows: slice) -> Float[Tensor, "m C"]:
             near = Neighbors(neighbors.index[rows], neighbors.valid[rows])
@@ -120,7 +123,7 @@ class SemanticAttention(nn.Module):
             # One expression: the input of each layer is freed before the next layer runs.
             return residual + mlp_out(self.mlp[1](mlp_in(self.norm2(residual))))
 
-        return _in_parts(recalibrate, len(x))
+        return _in_parts(recalibrate, len(x), x.device)
 
     def _attend(
         self,
@@ -135,8 +138,44 @@ class SemanticAttention(nn.Module):
             if cpu.is_supported(q, self.num_heads, neighbors.index.shape[1]):
                 changes = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
                 return cpu.attend(q, k, v, self.num_heads, neighbors.index, neighbors.valid, *changes)
+            if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
+                return self._attend_gathered(q, k, v, neighbors, cosines)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
             return self._attend_dense(q, k, v, neighbors, cosines).transpose(0, 1).flatten(1)
+
+    def _attend_gathered(
+        self,
+        q: Float[Tensor, "m i"],
+        k: Float[Tensor, "n i"],
+        v: Float[Tensor, "n i"],
+        neighbors: Neighbors,
+        cosines: Float[Tensor, "m k"] | None,
+    ) -> Float[Tensor, "m i"]:
+        """Eq. 3 with the keys and values of neighbours: nothing is as large as the square of the tokens.
+
+        Where one part is not enough, a gradient computes each part a second time.
+        """
+        factor, bias = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
+
+        def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, valid: Tensor, *change: Tensor) -> Tensor:
+            factor, bias = (x[..., None] for x in change)
+            near = (q[:, None] * k[index]).unflatten(-1, (self.num_heads, -1)).sum(-1)
+            logits = near * (q.shape[1] // self.num_heads) ** -0.5 * factor + bias
+            weights = logits.masked_fill(~valid[..., None], float("-inf")).softmax(1)
+            values = v[index].unflatten(-1, (self.num_heads, -1))
+            return (weights[..., None] * values).sum(1).flatten(1)
+
+        rows = even_parts(len(q), _GATHERED // max(1, neighbors.index.shape[1] * q.shape[1]))
+        found = []
+        for part in rows:
+            inputs = (q[part], k, v, *(x[part] for x in (neighbors.index, neighbors.valid, factor, bias)))
+            again = len(rows) > 1 and torch.is_grad_enabled()
+            found.append(
+                checkpoint(attend, *inputs, use_reentrant=False, preserve_rng_state=False)
+                if again
+                else attend(*inputs)
+            )
+        return found[0] if len(found) == 1 else torch.cat(found)
 
     def _attend_dense(
         self,
@@ -178,10 +217,12 @@ def _cast_once(linear: nn.Linear) -> Callable[[Tensor], Tensor]:
     return partial(F.linear, weight=linear.weight.to(dtype), bias=linear.bias.to(dtype))
 
 
-def _in_parts(function: Callable[[slice], Tensor], count: int) -> Float[Tensor, "count _"]:
-    """``function`` of all rows; without a gradient a part of them at a time, to bound memory."""
+def _in_parts(
+    function: Callable[[slice], Tensor], count: int, device: torch.device
+) -> Float[Tensor, "count _"]:
+    """``function`` of all rows; on a CPU without a gradient a part of them at a time, to bound memory."""
     most = _HALF_ROWS if torch.is_autocast_enabled("cpu") else _ROWS
-    if torch.is_grad_enabled() or count <= most:
+    if torch.is_grad_enabled() or count <= most or device.type != "cpu":
         return function(slice(None))
     result = None
     for rows in even_parts(count, most):

@@ -1,19 +1,23 @@
 """Exact nearest neighbours among the tokens of one batch element (paper, section 3.3)."""
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.parts import at_once, even_parts
 
 MODES = ("all", "other_views", "mixed")
 
-#: Number of distances that are held at once: bounds memory, and keeps a block in a CPU's cache.
-_BLOCK = 1 << 17
+#: Number of distances that are held at once: bounds memory, and keeps a block in a CPU's cache. On a GPU they
+#: and their keys take 200 MB.
+_BLOCK, _GPU_BLOCK = 1 << 17, 1 << 23
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,16 @@ class Neighbors:
 
     index: Int[Tensor, "n k"]
     valid: Bool[Tensor, "n k"]
+
+    @classmethod
+    def join(cls, elements: Sequence["Neighbors"]) -> "Neighbors":
+        """Those of all tokens of a batch, as indices among all of them; too few get invalid ones."""
+        k = max(found.index.shape[1] for found in elements)
+        starts = itertools.accumulate((len(found.index) for found in elements), initial=0)
+        return cls(
+            torch.cat([widened(e.index + start, k) for e, start in zip(elements, starts, strict=False)]),
+            torch.cat([widened(found.valid, k) for found in elements]),
+        )
 
 
 @torch.no_grad()
@@ -58,12 +72,17 @@ def nearest_neighbors(
     # Filled, not concatenated: small results between freed distances would keep that memory occupied.
     index = torch.empty(n, k, dtype=torch.int64, device=points.device)
     valid = torch.empty_like(index, dtype=torch.bool)
-    for rows in even_parts(n, _BLOCK // max(n, 1)):
+    for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(n, 1)):
         distance = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
         ranks = None if places is None else _turns(places, view, views, rows)
         part = _nearest_to_block(distance, ranks, view, rows, k, mode)
         index[rows], valid[rows] = part.index, part.valid
     return Neighbors(index, valid)
+
+
+def widened(table: Tensor, k: int) -> Tensor:
+    """A table of neighbours [n, _] with ``k`` columns; the new ones are 0."""
+    return table if table.shape[1] == k else F.pad(table, (0, k - table.shape[1]))
 
 
 def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor, "m n"]:

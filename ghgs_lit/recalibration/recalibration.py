@@ -10,14 +10,14 @@ from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.parts import at_once, even_parts
 from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.attention import SemanticAttention
-from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
+from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors, widened
 from ghgs_lit.types import Points, Tokens, true_places
 
 #: Number of cosines that are held at once (bounds memory).
-_COSINES = 1 << 21
+_COSINES, _GPU_COSINES = 1 << 21, 1 << 25
 
 NEIGHBORHOODS = ("xyz", "image_plane", "feature")
 
@@ -89,6 +89,10 @@ class Recalibration(nn.Module):
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)
             cosines = [neighbor_cosines(*pair) for pair in zip(semantic, neighbors, strict=True)]
+        if takes_part.device.type != "cpu" and batch_size > 1:  # fewer calls
+            neighbors = [Neighbors.join(neighbors)]
+            k = neighbors[0].index.shape[1]
+            cosines = cosines and [torch.cat([widened(found, k) for found in cosines])]
         layers = []
         for layer in tokens.latent:
             found = self.block(part(layer), neighbors, cosines).to(layer.dtype)
@@ -130,6 +134,7 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
         # Allocated first: after the features it would keep their memory occupied once they are freed.
         cosines = semantic.new_empty(neighbors.index.shape)
         directions = unit(semantic)
-        for rows in even_parts(len(directions), _COSINES // max(1, len(directions))):
+        most = at_once(semantic.device, _COSINES, _GPU_COSINES)
+        for rows in even_parts(len(directions), most // max(1, len(directions))):
             torch.gather(linear(directions[rows], directions), 1, neighbors.index[rows], out=cosines[rows])
     return cosines

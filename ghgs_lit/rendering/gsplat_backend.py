@@ -60,33 +60,27 @@ def rasterize(
         require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)
     rasterization = load()
     channels = gaussians.colors.shape[1]
-    elements = [
-        _element(rasterization, gaussians[b], cameras[b], settings, near, far)
-        for b in range(len(gaussians.splits))
-    ]
-    nothing = gaussians.means.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
-    image, depth, alpha = (torch.stack(elements) if elements else nothing).split((channels, 1, 1), dim=2)
+    if len(gaussians) == 0 or 0 in cameras.shape:
+        # Stays part of the graph, so that a batch of empty elements can be differentiated.
+        nothing = (gaussians.means.sum() + gaussians.colors.sum()).float()
+        drawn = nothing * nothing.new_zeros(*cameras.shape, channels + 2, cameras.height, cameras.width)
+    else:
+        drawn = _drawn(rasterization, gaussians, cameras, settings, near, far)
+    image, depth, alpha = drawn.split((channels, 1, 1), dim=2)
     return Rendering(image=image, alpha=alpha, depth=depth)
 
 
-def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near, far) -> Tensor:
-    """All views of one batch element, [T, C + 2, h, w]: colours, expected depth, alpha."""
-    channels = gaussians.colors.shape[1]
-    if len(gaussians) == 0 or cameras.shape[0] == 0:
-        # Stays part of the graph, so that a batch of empty elements can be differentiated.
-        nothing = gaussians.means.sum() + gaussians.colors.sum()
-        return nothing.float() * torch.zeros(
-            cameras.shape[0], channels + 2, cameras.height, cameras.width, device=gaussians.means.device
-        )
-    safe = _sanitized(gaussians)
+def _drawn(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near, far) -> Tensor:
+    """All views of all elements, [B, T, C + 2, h, w]: colours, expected depth, alpha. One call of gsplat."""
+    means, quaternions, scales, opacities, colors = _sanitized(*_side_by_side(gaussians))
     # Opacities above the limit keep their gradient, as they do beside the middle of a splat elsewhere.
-    opacities = safe.opacities - (safe.opacities - settings.alpha_max).clamp(min=0).detach()
+    opacities = opacities - (opacities - settings.alpha_max).clamp(min=0).detach()
     values, alpha, _ = rasterization(
-        means=safe.means,
-        quats=safe.quaternions,
-        scales=safe.scales,
+        means=means,
+        quats=quaternions,
+        scales=scales,
         opacities=opacities,
-        colors=safe.colors,
+        colors=colors,
         viewmats=cameras.extrinsics.float(),
         Ks=cameras.intrinsics.float(),
         width=cameras.width,
@@ -98,29 +92,44 @@ def _element(rasterization, gaussians: Gaussians, cameras: Cameras, settings, ne
         packed=False,
         rasterize_mode="antialiased" if settings.antialiased else "classic",
     )
-    return torch.cat((values, alpha), dim=-1).permute(0, 3, 1, 2)
+    return torch.cat((values, alpha), dim=-1).movedim(-1, -3)
 
 
-def _sanitized(gaussians: Gaussians) -> Gaussians:
-    """Float32 Gaussians that gsplat draws as this project defines them.
+def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
+    """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in float32.
+
+    Elements with fewer Gaussians than others get some of zeros: their opacity of 0 is not drawn.
+    """
+    names = ("means", "quaternions", "scales", "opacities", "colors")
+    fields = [getattr(gaussians, name).float() for name in names]
+    if len(gaussians.splits) == 1:
+        return tuple(field[None] for field in fields)
+    fields[3] = fields[3][:, None]
+    packed = torch.cat(fields, dim=-1).split(gaussians.splits)
+    padded = torch.nn.utils.rnn.pad_sequence(packed, batch_first=True)
+    means, quaternions, scales, opacities, colors = padded.split([f.shape[1] for f in fields], dim=-1)
+    return means, quaternions, scales, opacities[..., 0], colors
+
+
+def _sanitized(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
+) -> tuple[Tensor, ...]:
+    """The same that gsplat draws as this project defines them.
 
     gsplat's kernels square quaternions in float32 and do not expect NaN or infinity. So quaternions are
     normalised, the zero quaternion becomes the identity, and a Gaussian whose geometry or opacity is not
     finite becomes invisible.
     """
-    means, scales, opacities = gaussians.means.float(), gaussians.scales.float(), gaussians.opacities.float()
-    quaternions = gaussians.quaternions.float()
-    geometry = torch.cat((means, quaternions, scales, opacities[:, None]), dim=-1)
+    geometry = torch.cat((means, quaternions, scales, opacities[..., None]), dim=-1)
     is_finite = geometry.isfinite().all(-1)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], device=means.device)
+    identity = torch.nn.functional.pad(means.new_ones(1), (0, 3))
     largest = quaternions.abs().amax(-1, keepdim=True).detach()
-    is_rotated = is_finite[:, None] & (largest > 0)
+    is_rotated = is_finite[..., None] & (largest > 0)
     scaled = torch.where(is_rotated, quaternions, identity) / torch.where(is_rotated, largest, 1)
-    return Gaussians(
-        means=torch.where(is_finite[:, None], means, 0),
-        quaternions=torch.nn.functional.normalize(scaled, dim=-1),
-        scales=torch.where(is_finite[:, None], scales, 1),
-        opacities=torch.where(is_finite, opacities, 0),
-        colors=gaussians.colors.float(),
-        splits=gaussians.splits,
+    return (
+        torch.where(is_finite[..., None], means, 0),
+        torch.nn.functional.normalize(scaled, dim=-1),
+        torch.where(is_finite[..., None], scales, 1),
+        torch.where(is_finite, opacities, 0),
+        colors,
     )

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
@@ -39,6 +40,23 @@ _WAITING = (
     "aten::unique_consecutive",
     "aten::unique_dim",
     "aten::_unique2",
+)
+#: Operators that only describe memory: the device has nothing to do.
+_WITHOUT_WORK = (
+    *(
+        "view",
+        "_unsafe_view",
+        "select",
+        "slice",
+        "expand",
+        "permute",
+        "transpose",
+        "unsqueeze",
+        "squeeze",
+        "t",
+    ),
+    *("split", "split_with_sizes", "unbind", "alias", "as_strided", "detach", "diagonal", "unfold"),
+    *("empty", "empty_strided", "empty_like", "new_empty"),
 )
 _INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_unsafe_index")
 
@@ -63,10 +81,18 @@ class Log:
         self.calls: Counter[tuple[str, str]] = Counter()
         self.waits: Counter[tuple[str, str]] = Counter()
 
+    @property
+    def launches(self) -> int:
+        """Number of calls that start work on the device: all but views and new memory."""
+        return sum(
+            n for (name, _), n in self.calls.items() if name.removeprefix("aten::") not in _WITHOUT_WORK
+        )
+
     def add(self, name: str, reason: str | None) -> None:
         """Note a call and, with a ``reason``, a wait."""
         line = _line() if self.by_line else ""
-        self.calls[name, line] += 1
+        if not _inside_attention:
+            self.calls[name, line] += 1
         if reason is not None:
             self.waits[reason, line] += 1
 
@@ -83,6 +109,28 @@ def _line() -> str:
 
 
 _logs: list[Log] = []
+_inside_attention: list[bool] = []
+
+
+@contextmanager
+def _attention_is_one_call() -> Iterator[None]:
+    """CUDA has one kernel for it, which is found for all that this package asks."""
+    attention = functional.scaled_dot_product_attention
+
+    def counted(*args, **kwargs):
+        for log in _logs:
+            log.add("aten::scaled_dot_product_attention", None)
+        _inside_attention.append(True)
+        try:
+            return attention(*args, **kwargs)
+        finally:
+            _inside_attention.pop()
+
+    functional.scaled_dot_product_attention = counted
+    try:
+        yield
+    finally:
+        functional.scaled_dot_product_attention = attention
 
 
 class _Backend(_DummyBackendModule):
@@ -148,7 +196,7 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
     log = Log(by_line)
     _logs.append(log)
     try:
-        with _Mode():
+        with _Mode(), _attention_is_one_call():
             yield log
     finally:
         _logs.remove(log)

@@ -16,7 +16,7 @@ from ghgs_lit.recalibration import (
     SemanticAttention,
     nearest_neighbors,
 )
-from ghgs_lit.recalibration.neighbors import MODES
+from ghgs_lit.recalibration.neighbors import MODES, Neighbors
 from ghgs_lit.recalibration.recalibration import neighbor_cosines
 from ghgs_lit.types import Points, Tokens
 from tests.helpers.scenes import CASES, fixture
@@ -386,3 +386,34 @@ def test_impossible_options_are_refused(options, key):
     """Impossible options are refused with their key."""
     with pytest.raises(InputError, match=key):
         make(**options)
+
+
+@pytest.mark.parametrize("similarity", SIMILARITIES)
+def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, monkeypatch):
+    """The path of a GPU and of many tokens, in one part and in several, computed again for the gradient."""
+    torch.manual_seed(0)
+    block = SemanticAttention(64, 2, similarity).double()
+    inputs = [torch.randn(40, 16, dtype=torch.float64, requires_grad=True) for _ in range(3)]
+    near = nearest_neighbors(torch.rand(40, 3), torch.arange(40) % 3, 9, "other_views")
+    near.valid[:, 5:] = False
+    cosines = None if similarity == "none" else torch.rand(40, 9, dtype=torch.float64) * 2 - 1
+
+    def results():
+        out = block._attend(*inputs, near, cosines)
+        return out, *torch.autograd.grad(out.square().sum(), inputs)
+
+    expected = results()
+    monkeypatch.setattr("ghgs_lit.recalibration.attention._SCORES", 0)
+    for most in (1 << 25, 9 * 16 * 7):
+        monkeypatch.setattr("ghgs_lit.recalibration.attention._GATHERED", most)
+        for a, b in zip(results(), expected, strict=True):
+            torch.testing.assert_close(a, b)
+
+
+def test_neighbors_of_elements_are_joined_with_invalid_ones_where_there_are_fewer():
+    """Indices count the tokens of all elements."""
+    elements = [nearest_neighbors(torch.rand(n, 3), torch.zeros(n, dtype=torch.int64), 4) for n in (6, 3)]
+    found = Neighbors.join(elements)
+    assert torch.equal(found.index[:6], elements[0].index)
+    assert torch.equal(found.index[6:, :3], elements[1].index + 6)
+    assert found.valid.sum(1).tolist() == [4] * 6 + [3] * 3

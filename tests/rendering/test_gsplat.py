@@ -90,19 +90,31 @@ def _documented_rasterization(
     """A replacement for gsplat's ``rasterization``, as documented, that draws by the reference."""
     assert (render_mode, packed) == ("RGB+ED", False)
     assert all(torch.isfinite(t).all() for t in (means, quats, scales, opacities))
-    torch.testing.assert_close(quats.norm(dim=-1), torch.ones(len(quats)))
-    gaussians = Gaussians(means, quats, scales, opacities, colors, splits=(len(means),))
+    batch, count = means.shape[:2]
+    assert quats.shape == (batch, count, 4)
+    assert opacities.shape == (batch, count)
+    assert viewmats.shape[:1] == Ks.shape[:1] == (batch,)
+    torch.testing.assert_close(quats.norm(dim=-1), torch.ones(batch, count))
+    fields = (x.flatten(0, 1) for x in (means, quats, scales, opacities, colors))
+    gaussians = Gaussians(*fields, splits=(count,) * batch)
     settings = RasterSettings(low_pass=eps2d, antialiased=rasterize_mode == "antialiased")
-    views = Cameras(Ks[None], viewmats[None], height, width)
-    drawn = reference.rasterize(gaussians, views, settings, near_plane, far_plane)
-    values = torch.cat((drawn.image, drawn.depth), dim=2)[0].permute(0, 2, 3, 1)
-    return values, drawn.alpha[0].permute(0, 2, 3, 1), {}
+    drawn = reference.rasterize(
+        gaussians, Cameras(Ks, viewmats, height, width), settings, near_plane, far_plane
+    )
+    values = torch.cat((drawn.image, drawn.depth), dim=2).permute(0, 1, 3, 4, 2)
+    return values, drawn.alpha.permute(0, 1, 3, 4, 2), {}
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
-    """gsplat gets finite, normalised input, and its output is read as documented."""
-    monkeypatch.setattr(gsplat_backend, "load", lambda: _documented_rasterization)
+    """gsplat gets finite, normalised input, and its output is read as documented; once for a batch."""
+    calls = []
+
+    def rasterization(**arguments):
+        calls.append(arguments["means"].shape)
+        return _documented_rasterization(**arguments)
+
+    monkeypatch.setattr(gsplat_backend, "load", lambda: rasterization)
     gaussians, views = cloud(40, splits=(15, 0, 25)), camera_ring(2, 20, 30, batch=3)
     gaussians.quaternions[3] = 0
     gaussians.quaternions[4] *= 1e-25
@@ -113,6 +125,7 @@ def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
     wanted = render(gaussians, views, "cpu", settings=settings, near=0.5, far=20.0)
     for name in ("image", "alpha", "depth"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4)
+    assert calls == [(3, 25, 3)]
     found.image.sum().backward()
     assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
 
