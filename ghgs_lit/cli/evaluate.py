@@ -25,6 +25,7 @@ from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.refinement import Refinement
 from ghgs_lit.runs.results import METHOD, read_results
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -54,7 +55,8 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
         if "global_step" in checkpoint:
             facts["training"] = {"steps": checkpoint["global_step"]}
         facts["parameters"] = {"total": sum(p.numel() for p in model.parameters())}
-        methods["model"] = ModelMethod(model.to(device).eval(), renderer)
+        refinement = Refinement(config["refine"], renderer) if config["refine"] else None
+        methods["model"] = ModelMethod(model.to(device).eval(), renderer, refinement)
     splats = config["splats"]
     for name in names:
         methods[name] = baseline(

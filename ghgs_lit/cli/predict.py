@@ -30,6 +30,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.export import output_options, write_prediction
 from ghgs_lit.export.video import write_mp4
 from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.refinement import Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
@@ -84,6 +85,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
         torch.cuda.synchronize()
     facts = {"checkpoint": config["checkpoint"], "seconds": {"predict": time.perf_counter() - begin}}
     facts |= chosen_preset(model, prediction)
+    prediction = refined(prediction, batch, renderer, config["refine"], facts)
     write(directory, batch, prediction, renderer, options, facts)
 
 
@@ -113,19 +115,19 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             if number < len(folder.instants):
                 captures.append(pool.submit(folder.read, folder.instants[number]))
             result = predict(capture, model, size)
-            seconds = {"read": waited, **result.seconds}
             facts = {
                 "checkpoint": config["checkpoint"],
-                "seconds": seconds,
+                "seconds": {"read": waited, **result.seconds},
                 **chosen_preset(model, result.prediction),
             }
+            prediction = refined(result.prediction, result.batch, renderer, config["refine"], facts)
             start = time.perf_counter()
             place = directory / name if several else directory
-            write(place, result.batch, result.prediction, renderer, options, facts)
+            write(place, result.batch, prediction, renderer, options, facts)
             if several and "mp4" in options.formats:
                 camera = fixed_camera(capture).to(device) if number == 1 else camera
-                pictures.append(to_uint8(renderer(result.gaussians, camera).image[0, 0]))
-            for stage, value in (seconds | {"write": time.perf_counter() - start}).items():
+                pictures.append(to_uint8(renderer(prediction.gaussians, camera).image[0, 0]))
+            for stage, value in (facts["seconds"] | {"write": time.perf_counter() - start}).items():
                 totals[stage] = totals.get(stage, 0.0) + value
     if pictures:
         write_mp4(pictures, directory / "instants.mp4", options.fps)
@@ -143,6 +145,21 @@ def load(config: dict[str, Any]) -> tuple[GHGS, Renderer, torch.device]:
     model.load(config["checkpoint"])
     model.precision = config["precision"]
     return model.to(device).eval(), renderer, device
+
+
+def refined(
+    prediction: Prediction, batch: Batch, renderer: Renderer, steps: int, facts: dict[str, Any]
+) -> Prediction:
+    """The prediction after ``steps`` of optimisation; notes and prints what they gained."""
+    if steps == 0:
+        return prediction
+    begin, refinement = time.perf_counter(), Refinement(steps, renderer)
+    gaussians = refinement(prediction.gaussians, batch)
+    facts["seconds"] = {**facts["seconds"], "refine": time.perf_counter() - begin}
+    report = refinement.report(prediction.gaussians, gaussians, batch)
+    facts["refine"] = dataclasses.asdict(report)
+    print(report, flush=True)
+    return dataclasses.replace(prediction, gaussians=gaussians)
 
 
 def chosen_preset(model: GHGS, prediction: Prediction) -> dict[str, str]:

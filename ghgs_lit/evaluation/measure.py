@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
+from ghgs_lit.refinement import Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Rendering
@@ -45,14 +46,18 @@ Method = Callable[[Batch], Estimate]
 
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model and the renderer of its Gaussians."""
+    """A model, the renderer of its Gaussians, and what refines them before (None: nothing)."""
 
     model: nn.Module
     renderer: Renderer
+    refinement: Refinement | None = None
 
     def __call__(self, batch: Batch) -> Estimate:
         prediction = self.model(batch)
-        rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
+        gaussians = prediction.gaussians
+        if self.refinement is not None:
+            gaussians = self.refinement(gaussians, batch)
+        rendering = self.renderer(gaussians, batch.targets.cameras)
         return Estimate(
             rendering.image,
             prediction.depth,

@@ -1,0 +1,151 @@
+"""Gaussians of a prediction, optimised until their renders are the input photographs.
+
+A prediction is near enough that a few steps suffice, and every change is bounded, so that what no photograph
+shows stays as predicted. Photographs that are reproduced say nothing of other views (with wrong geometry they
+are reproduced, too), so :meth:`Refinement.report` holds one out. To stop where that one is best was worse
+than a fixed number of steps: fewer inputs want fewer steps.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
+from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
+
+Renderer = Callable[..., Rendering]
+
+#: Largest changes: of a mean along each axis, in footprints of its pixel; of the logarithm of a scale; of the
+#: logit of an opacity; of a colour.
+LIMITS = {"means": 1.0, "scales": 1.0, "opacities": 2.0, "colors": 0.05}
+#: Step of Adam on arguments of tanh.
+RATE = 0.02
+#: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
+WEIGHTS = (0.8, 0.2, 0.1)
+
+BeforeAfter = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Report:
+    """PSNR in dB before and after: of the inputs, and of one that was held out (of three or more)."""
+
+    steps: int
+    inputs: BeforeAfter
+    held_out: BeforeAfter | None
+
+    def __str__(self) -> str:
+        line = f"refine: {self.steps} steps; inputs {{:.2f}} -> {{:.2f}} dB".format(*self.inputs)
+        if self.held_out is None:
+            return line
+        return line + "; an input held out {:.2f} -> {:.2f} dB".format(*self.held_out)
+
+
+class Refinement:
+    """``refinement(gaussians, batch)``: the same Gaussians, nearer to the photographs.
+
+    Args:
+        steps: of the optimiser, 1 or more.
+        renderer: draws the inputs, with gradients.
+    """
+
+    def __init__(self, steps: int, renderer: Renderer):
+        require(steps >= 1, "refine", "1 or more steps", steps)
+        self.steps, self.renderer = steps, renderer
+
+    def __call__(self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None) -> Gaussians:
+        """The refined Gaussians.
+
+        Args:
+            gaussians: predicted from ``batch``, each at a pixel of an input.
+            batch: photographs, masks and cameras.
+            views: numbers of the photographs that take part; None: all.
+
+        Raises:
+            InputError: Gaussians that belong to no pixel.
+        """
+        require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
+        views = range(batch.images.shape[1]) if views is None else views
+        with torch.autocast(batch.images.device.type, enabled=False), torch.enable_grad():
+            gaussians = gaussians.detach()
+            photographs, silhouettes, cameras = _of_views(batch, views)
+            footprint = _footprints(gaussians, batch)
+            raw = {name: torch.zeros_like(getattr(gaussians, name), requires_grad=True) for name in LIMITS}
+            # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
+            optimizer = torch.optim.Adam(raw.values(), lr=RATE, betas=(0.9, 0.95), eps=1e-15)
+            for _ in range(self.steps):
+                drawn = self.renderer(_changed(gaussians, raw, footprint), cameras, background=0.0)
+                loss = _loss(drawn, photographs, silhouettes)
+                optimizer.zero_grad()
+                loss.backward()
+                optimizer.step()
+            return _changed(gaussians, raw, footprint).detach()
+
+    def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch) -> Report:
+        """What refinement gained; to hold out the last input takes as long as refinement.
+
+        Args:
+            gaussians, refined: before and after.
+            batch: one element, of which they were predicted.
+        """
+        views = list(range(batch.images.shape[1]))
+        inputs = tuple(self._psnr(found, batch, views) for found in (gaussians, refined))
+        held_out = None
+        if len(views) > 2:
+            *seen, hidden = views
+            kept = gaussians.image != hidden
+            others = gaussians.select(kept, (int(kept.sum()),))
+            both = others, self(others, batch, seen)
+            held_out = tuple(self._psnr(found, batch, [hidden]) for found in both)
+        return Report(self.steps, inputs, held_out)
+
+    @torch.no_grad()
+    def _psnr(self, gaussians: Gaussians, batch: Batch, views: Sequence[int]) -> float:
+        photographs, _, cameras = _of_views(batch, views)
+        drawn = self.renderer(gaussians, cameras, background=0.0).image
+        return float(psnr(drawn.flatten(0, 1).clamp(0, 1), photographs.flatten(0, 1)).mean())
+
+
+def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
+    """Photographs on black, masks and cameras of some views."""
+    views = list(views)
+    masks = batch.masks[:, views, None].to(at_least_float32(batch.images).dtype)
+    return batch.images[:, views] * masks, masks, batch.cameras[:, views]
+
+
+def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
+    """Size [N, 1] of each Gaussian's pixel where it is, in the unit of the world."""
+    extrinsics, intrinsics = batch.cameras.extrinsics.flatten(0, 1), batch.cameras.intrinsics.flatten(0, 1)
+    image, dtype = gaussians.image, gaussians.means.dtype
+    depth = world_to_camera(gaussians.means, extrinsics.to(dtype)[image])[:, 2]
+    focal = intrinsics.to(dtype).diagonal(dim1=-2, dim2=-1)[:, :2].prod(-1).sqrt()[image]
+    return (depth / focal)[:, None]
+
+
+def _changed(gaussians: Gaussians, raw: dict[str, Tensor], footprint: Tensor) -> Gaussians:
+    """Gaussians with bounded changes; none where ``raw`` is 0."""
+    change = {name: LIMITS[name] * torch.tanh(value) for name, value in raw.items()}
+    # Of opacities 0 and 1, which no step could leave.
+    logit = torch.logit(gaussians.opacities.clamp(1e-4, 1 - 1e-4))
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means + footprint * change["means"],
+        scales=gaussians.scales * change["scales"].exp(),
+        opacities=torch.sigmoid(logit + change["opacities"]),
+        colors=gaussians.colors + change["colors"],
+    )
+
+
+def _loss(drawn: Rendering, photographs: Tensor, silhouettes: Tensor) -> Tensor:
+    l1, dissimilar, outline = WEIGHTS
+    structure = ssim(drawn.image.flatten(0, 1), photographs.flatten(0, 1), padding="valid").mean()
+    return (
+        l1 * (drawn.image - photographs).abs().mean()
+        + dissimilar * (1 - structure)
+        + outline * (drawn.alpha - silhouettes).abs().mean()
+    )
