@@ -50,27 +50,32 @@ class _Halving(nn.Conv2d):
 
 
 class ResidualUnit(nn.Module):
-    """``r + conv2(relu(conv1(r)))`` with ``r = relu(x)``: published weights expect a rectified skip."""
+    """``s + conv2(relu(conv1(relu(x))))`` with ``s = relu(x)``, or ``s = x`` without a rectified skip.
 
-    def __init__(self, features: int):
+    Published weights expect a rectified skip. In training it can die: where all channels of a sum of levels
+    are negative, nothing from the tokens reaches the result any more, nor any gradient the tokens.
+    """
+
+    def __init__(self, features: int, rectified_skip: bool = True):
         super().__init__()
         self.conv1 = _conv3(features, features)
         self.conv2 = _conv3(features, features)
+        self.rectified_skip = rectified_skip
 
     def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
         rectified = F.relu(x)
         # In place: no gradient needs the result of a convolution.
-        return self.conv2(F.relu_(self.conv1(rectified))).add_(rectified)
+        return self.conv2(F.relu_(self.conv1(rectified))).add_(rectified if self.rectified_skip else x)
 
 
 class Fusion(nn.Module):
     """Add a finer level to the coarser result, refine, resize; the coarsest block has no level to add."""
 
-    def __init__(self, features: int, joins: bool):
+    def __init__(self, features: int, joins: bool, rectified_skip: bool):
         super().__init__()
         if joins:
-            self.resConfUnit1 = ResidualUnit(features)
-        self.resConfUnit2 = ResidualUnit(features)
+            self.resConfUnit1 = ResidualUnit(features, rectified_skip)
+        self.resConfUnit2 = ResidualUnit(features, rectified_skip)
         self.out_conv = nn.Conv2d(features, features, 1)
 
     def forward(
@@ -88,11 +93,13 @@ class Fusion(nn.Module):
 class Scratch(nn.Module):
     """Everything after the resize layers, under its published names."""
 
-    def __init__(self, out_channels: Sequence[int], features: int, hidden: int, output_dim: int):
+    def __init__(
+        self, out_channels: Sequence[int], features: int, hidden: int, output_dim: int, rectified_skip: bool
+    ):
         super().__init__()
         for i, channels in enumerate(out_channels, start=1):
             setattr(self, f"layer{i}_rn", _conv3(channels, features, bias=False))
-            setattr(self, f"refinenet{i}", Fusion(features, joins=i < LEVELS))
+            setattr(self, f"refinenet{i}", Fusion(features, i < LEVELS, rectified_skip))
         self.output_conv1 = _conv3(features, features // 2)
         self.output_conv2 = nn.Sequential(
             _conv3(features // 2, hidden), nn.ReLU(), nn.Conv2d(hidden, output_dim, 1)
@@ -133,6 +140,7 @@ class DPTHead(nn.Module):
         hidden: channels before the last convolution (32 as published).
         guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
             sharp; 0: none, as published.
+        rectified_skip: of each :class:`ResidualUnit`, as published.
     """
 
     def __init__(
@@ -143,6 +151,7 @@ class DPTHead(nn.Module):
         output_dim: int,
         hidden: int = 32,
         guide_channels: int = 0,
+        rectified_skip: bool = True,
     ):
         super().__init__()
         require(features % 8 == 0, "features", "a multiple of 8", features)
@@ -164,7 +173,7 @@ class DPTHead(nn.Module):
                 _Halving(c3, c3, 3, stride=2, padding=1),
             )
         )
-        self.scratch = Scratch(out_channels, features, hidden, output_dim)
+        self.scratch = Scratch(out_channels, features, hidden, output_dim, rectified_skip)
         self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 
     def forward(

@@ -17,6 +17,7 @@ from tests.helpers.models import config
 OLD = OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[1] / "fixtures" / "old_configs.yaml"))
 #: Keys of today that a model of before has no value for, and that change none of its numbers.
 NEW = ("model.check_inputs", "skip.budget_db", "skip.max_rel_diff")
+NEW += ("depth_head.dpt.rectified_skip", "gaussian_head.dpt.rectified_skip")
 NEW += ("gaussian_head.low_pass", "gaussian_head.antialiased", "model.frame")
 TODAY = {
     "demo": ["experiment=demo"],

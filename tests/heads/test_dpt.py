@@ -68,15 +68,28 @@ def test_tokens_that_were_not_kept_are_blank():
     torch.testing.assert_close(fewer[kept], full[kept])
 
 
-def test_residual_unit_rectifies_its_skip():
+@pytest.mark.parametrize("rectified", [True, False])
+def test_residual_unit_rectifies_its_skip(rectified):
     """Published weights expect a rectified skip, and the input must stay unchanged."""
-    block = ResidualUnit(8)
+    block = ResidualUnit(8, rectified)
     nn.init.zeros_(block.conv2.weight)
     nn.init.zeros_(block.conv2.bias)
     x = torch.randn(1, 8, 3, 3)
     kept = x.clone()
-    torch.testing.assert_close(block(x), x.clamp(min=0))
+    torch.testing.assert_close(block(x), x.clamp(min=0) if rectified else x)
     assert torch.equal(x, kept)
+
+
+@pytest.mark.parametrize("rectified", [True, False])
+def test_what_a_rectified_skip_lets_die_lives_without(rectified):
+    """Where a sum of levels is negative, tokens must still reach the result, and gradients the tokens."""
+    head = _head(rectified_skip=rectified)
+    for level in (1, 2, 3):
+        nn.init.constant_(getattr(head.scratch, f"refinenet{level + 1}").out_conv.bias, -100.0)
+    tokens = _tokens(b=1, v=1, h=2, w=3)
+    layers = [layer.requires_grad_() for layer in tokens.latent]
+    head(tokens).square().sum().backward()
+    assert all(layer.grad.any() == (not rectified) for layer in layers)
 
 
 def test_pointwise_is_the_convolution():
