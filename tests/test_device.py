@@ -17,6 +17,7 @@ from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.model import GHGS
+from ghgs_lit.refinement import Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import StepTime
@@ -156,7 +157,7 @@ def test_batches_are_copied_there_without_a_wait():
 
 
 def test_everything_is_measured_there(tmp_path):
-    """The model and all baselines with all metrics and pictures: the rows are those of the CPU."""
+    """The model, refined too, and all baselines, with all metrics and pictures: rows are those of the CPU."""
     metrics = ImageMetrics(regions=("image", "box", "subject"), lpips="off")
 
     def rows(device):
@@ -165,6 +166,7 @@ def test_everything_is_measured_there(tmp_path):
 
         methods = {name: baseline(name, REFERENCE, build) for name in BASELINES}
         methods["model"] = ModelMethod(build().eval(), REFERENCE)
+        methods["refined"] = ModelMethod(build().eval(), REFERENCE, Refinement(1, REFERENCE))
         found = []
         for name, method in methods.items():
             found += measure(method, name, [full_batch()], metrics.to(device), device, tmp_path, 1)
