@@ -309,6 +309,12 @@ class Gaussians(_TensorStruct):
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    @property
+    def is_finite(self) -> Bool[Tensor, " N"]:
+        """Which Gaussians have finite numbers only; no renderer draws the others."""
+        fields = (self.means, self.quaternions, self.scales, self.opacities[:, None], self.colors)
+        return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
+
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
         """The Gaussians at ``index`` (a slice, a mask or indices).
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from ghgs_lit.metrics import ImageMetrics, depth_error_mm
 from ghgs_lit.refinement import Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
-from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Rendering
+from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Prediction, Rendering
 from ghgs_lit.visualization.pictures import save_png, sheet
 
 Renderer = Callable[[Gaussians, Cameras], Rendering]
@@ -31,6 +32,7 @@ class Estimate:
         depth: depths of the inputs [B, V, H, W], metres.
         depth_valid: where they are defined [B, V, H, W].
         gaussians: number of Gaussians of each element [B].
+        not_finite: number of Gaussians and of depths of the subject of each element [B] that are not finite.
         decisions: what ``skip=auto`` chose for each element [B].
     """
 
@@ -38,6 +40,7 @@ class Estimate:
     depth: Tensor | None = None
     depth_valid: Tensor | None = None
     gaussians: tuple[int, ...] | None = None
+    not_finite: tuple[int, ...] | None = None
     decisions: tuple[Decision, ...] = ()
 
 
@@ -63,8 +66,21 @@ class ModelMethod:
             prediction.depth,
             prediction.depth_valid,
             prediction.gaussians.splits,
+            not_finite(batch, prediction),
             prediction.decisions,
         )
+
+
+def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:
+    """Gaussians and depths of each subject that are not finite; a warning names subjects with any."""
+    splats = (~prediction.gaussians.is_finite).split(prediction.gaussians.splits)
+    depths = (batch.masks & ~prediction.depth_valid).flatten(1).sum(1)
+    counts = tuple((torch.stack([found.sum() for found in splats]) + depths).tolist())
+    names = batch.subjects or tuple(map(str, range(len(counts))))
+    lost = [f"{name}: {count}" for name, count in zip(names, counts, strict=True) if count]
+    if lost:
+        warnings.warn(f"Gaussians and depths that are not finite: {', '.join(lost)}", stacklevel=3)
+    return counts
 
 
 def _depth_error(batch: Batch, estimate: Estimate, element: int) -> float | None:
@@ -86,6 +102,8 @@ def _rows(batch: Batch, estimate: Estimate, metrics: ImageMetrics) -> list[Row]:
         shared = {"depth_error_mm": _depth_error(batch, estimate, element)}
         if estimate.gaussians is not None:
             shared["gaussians"] = estimate.gaussians[element]
+        if estimate.not_finite is not None and estimate.not_finite[element]:
+            shared["not_finite"] = estimate.not_finite[element]
         if estimate.decisions:
             about["skip"] = estimate.decisions[element].preset
             shared["encoder_products"] = estimate.decisions[element].products

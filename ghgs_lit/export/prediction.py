@@ -140,6 +140,7 @@ def write_prediction(
 def _report(scene: Scene) -> dict[str, Any]:
     """Counts and checks of a scene; PSNR in dB in the box of the subject says how the inputs are met."""
     gaussians, valid = scene.gaussians, scene.depth_valid
+    lost = scene.masks & ~valid
     image = scene.renderer(gaussians, scene.cameras[None]).image[0].clamp(0, 1)
     quality = psnr(image, scene.images, box_of(scene.masks)).tolist()
     means = gaussians.means if len(gaussians) else gaussians.means.new_full((1, 3), torch.nan)
@@ -153,6 +154,7 @@ def _report(scene: Scene) -> dict[str, Any]:
         "subject_size": None if gaussians.metre is None else HEIGHT * float(gaussians.metre[0]),
         "smallest": means.amin(0).tolist(),
         "largest": means.amax(0).tolist(),
+        "depths_not_finite": dict(zip(scene.views, lost.flatten(1).sum(1).tolist(), strict=True)),
         "depth_pixels": dict(zip(scene.views, valid.flatten(1).sum(1).tolist(), strict=True)),
         "depth_png_unit": depth_unit(float(torch.where(valid, scene.depth, 0).max())),
         "psnr_box_of_inputs": dict(zip(scene.views, quality, strict=True)),

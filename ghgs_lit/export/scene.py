@@ -125,10 +125,7 @@ def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: 
     count = len(batch.images)
     require(count == 1, "write_prediction", "a batch of one subject", count)
     cameras, gaussians = batch.cameras[0], prediction.gaussians.detach()
-    finite = torch.stack(
-        [getattr(gaussians, f).flatten(1).isfinite().all(1) for f in ("means", "quaternions", "scales")]
-        + [gaussians.colors.isfinite().all(1), gaussians.opacities.isfinite()]
-    ).all(0)
+    finite = gaussians.is_finite
     kept = int(finite.sum())
     dropped = len(gaussians) - kept
     gaussians = gaussians.select(finite, (kept,)) if dropped else gaussians

@@ -1,6 +1,7 @@
 """Measuring methods, target protocols, and the verbs from end to end on rendered boxes."""
 
 import csv
+import dataclasses
 import json
 import os
 import subprocess
@@ -8,13 +9,14 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from PIL import Image
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, measure_all
+from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, measure_all, not_finite
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.export.ply import read_ply
 from ghgs_lit.metrics import ImageMetrics, psnr
@@ -22,6 +24,8 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.synthesis.datamodules import ScansDataModule
+from tests.helpers.models import make_model
+from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer
 from tests.helpers.verbs import ghgs
 
@@ -53,6 +57,18 @@ def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
     assert rows[0]["psnr"] == pytest.approx(100)
     assert rows[0]["flip"] == 0
     assert rows[0]["depth_error_mm"] is None
+
+
+def test_what_is_not_finite_is_counted_and_named():
+    """No renderer draws it, and no depth error counts it."""
+    batch = dataclasses.replace(make_batch(2, 3), subjects=("anna", "ben"))
+    with torch.no_grad():
+        prediction = make_model("model=hull").eval()(batch)
+    assert not_finite(batch, prediction) == (0, 0)
+    prediction.gaussians.scales[-2:, 0] = torch.nan
+    prediction.depth_valid[1][batch.masks[1]] &= torch.arange(int(batch.masks[1].sum())) > 2
+    with pytest.warns(UserWarning, match="not finite: ben: 5"):
+        assert not_finite(batch, prediction) == (0, 5)
 
 
 def test_the_hash_of_a_configuration_ignores_the_order_of_keys():
