@@ -21,3 +21,16 @@ def test_sampling_is_bilinear_and_0_outside():
             )[0]
             assert abs(found[n, c].item() - expected) < 1e-5
     assert not sample(maps, image[:2], torch.tensor([[-1e9, 3.0], [3.0, 1e9]])).any()
+
+
+def test_no_pixels_have_no_values():
+    """A batch without a Gaussian is observed like any other."""
+    assert sample(torch.rand(2, 5, 4, 4), torch.zeros(0, 3).long(), torch.zeros(0, 3, 2)).shape == (0, 3, 5)
+
+
+def test_double_precision_is_kept():
+    """The map was chosen by a number in single precision: some of the next one came along."""
+    maps = torch.zeros(3, 1, 4, 4, dtype=torch.float64)
+    maps[1] = 1
+    found = sample(maps, torch.tensor([0, 2]), torch.full((2, 2), 2.0, dtype=torch.float64))
+    assert found.abs().max() < 1e-12
