@@ -18,6 +18,7 @@ from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import CONFIDENCES
 from ghgs_lit.heads.depth import bounded_depth
+from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.heads.gaussian import FootprintAttributes
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
@@ -114,6 +115,23 @@ def token_places() -> list[Row]:
     return rows
 
 
+def residual() -> Row:
+    """How far the result, and the gradient of what comes in, are from those of nothing."""
+    found = []
+    for rectified in (True, False):
+        torch.manual_seed(0)
+        unit = ResidualUnit(8, rectified)
+        x = (-1 - torch.rand(1, 8, 6, 6)).requires_grad_()
+        difference = (unit(x) - unit(2 * x)).detach().abs().mean()
+        (gradient,) = torch.autograd.grad(unit(x).sum(), x)
+        found.append(f"{float(difference):.2g}, gradient {float(gradient.abs().mean()):.2g}")
+    return (
+        "W10", "`r + conv2(relu(conv1(r)))`, `r = relu(x)`, where all of x is negative; x against 2 x",
+        f"differ by {found[0]}: in training, heads lost levels for good",
+        f"`rectified_skip: false` (`model=hull`, `recurrent`): {found[1]}",
+    )  # fmt: skip
+
+
 def neighbours() -> list[Row]:
     g = torch.Generator().manual_seed(0)
     points = torch.tensor([1000.0, 0.0, 0.0]) + 0.3 * torch.randn(1024, 3, generator=g)
@@ -198,7 +216,15 @@ def intrinsics() -> Row:
 
 
 def main() -> None:
-    rows = [*inverse_depth(), outlier(), similarity(), *token_places(), *neighbours(), *attributes()]
+    rows = [
+        *inverse_depth(),
+        outlier(),
+        similarity(),
+        *token_places(),
+        residual(),
+        *neighbours(),
+        *attributes(),
+    ]
     rows += [*metrics(), rotary(), intrinsics()]
     print("| | plain formula and case | gives | here |\n|---|---|---|---|")
     for row in rows:
