@@ -41,8 +41,7 @@ DEFECTS = (
     ),
     Defect(
         "a mask on the result, not the argument", "geometry/vectors.py",
-        "torch.where(is_zero, 1.0, scaled.square().sum(-1, keepdim=True))",
-        "scaled.square().sum(-1, keepdim=True)", "unit vectors",
+        "keepdim=True).masked_fill(is_zero, 1.0)", "keepdim=True)", "unit vectors",
     ),
     Defect(
         "a Jacobian without its clamp", "rendering/cpu/projection.py", "geometry.clamped(view, x, y)", "x, y",
