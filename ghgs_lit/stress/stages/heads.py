@@ -92,7 +92,7 @@ def _dpt_inputs(family: str, g: Generator) -> Values:
 
 
 def _head() -> DPTHead:
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
         return DPTHead(32, 8, (4, 8, 8, 8), 3).requires_grad_(False)
 

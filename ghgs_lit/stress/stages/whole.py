@@ -25,7 +25,7 @@ _TINY += ("encoder.vit.channels=8", "recalibration.k=4", "recalibration.num_head
 @cache
 def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
     """A tiny model that has left its initial state, in both precisions."""
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         model = GHGS.from_config(resolve(compose("train", [f"model={name}", *_TINY])))
         for parameter in model.parameters():
