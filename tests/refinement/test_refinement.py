@@ -75,10 +75,11 @@ def test_changes_are_bounded():
 def test_the_input_that_is_held_out_takes_no_part(monkeypatch):
     """Neither its photograph nor its own splats: else it would say nothing of other views."""
     splats, inputs, _ = scene(size=28)
-    refinement, seen = Refinement(2, RENDERER), []
+    refinement, seen, drawn = Refinement(2, RENDERER), [], []
 
     def watched(self, gaussians, batch, views):
         seen.append((list(views), set(gaussians.image.tolist())))
+        drawn.append(gaussians)
         return 0.0
 
     monkeypatch.setattr(Refinement, "_psnr", watched)
@@ -89,6 +90,7 @@ def test_the_input_that_is_held_out_takes_no_part(monkeypatch):
     assert torch.equal(refinement(kept, inputs, [0, 1, 2]).means, expected.means)
     refinement.report(splats, splats, inputs)
     assert seen == [([0, 1, 2, 3], {0, 1, 2, 3})] * 2 + [([3], {0, 1, 2})] * 2
+    assert torch.equal(drawn[-1].means, expected.means)
 
 
 def test_two_inputs_are_refined_without_one_that_is_held_out():
