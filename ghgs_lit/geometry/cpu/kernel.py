@@ -1,6 +1,5 @@
 """The plane sweep of one pixel after the other (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
 
-import math
 from functools import cache
 
 import numpy as np
@@ -33,34 +32,49 @@ def _blend(values, at, below, down, right):
 
 
 @helper
-def _agreement(colors, own, start, height, width, x, y, best, rate):
-    """Agreement of pixel ``own`` with an image at the position (x, y) among its pixels, at least ``best``."""
-    # Nothing is seen outside; NaN is outside, too.
-    if not (x > -ONE and x < np.float32(width) and y > -ONE and y < np.float32(height)):
-        return best
-    left, top = np.float32(math.floor(x)), np.float32(math.floor(y))
-    right, down = x - left, y - top
-    line = np.uint64(width + 2) * CHANNELS
-    at = start + np.uint64(np.int64(top) + 1) * line + np.uint64(np.int64(left) + 1) * CHANNELS
+def _project(ray, shift, low, length, shares, height, width, pixels, rights, downs):
+    """Where the points of a ray lie in an image: index among its pixels, and the way to the next pixels.
+
+    What lies outside the image, behind it or nowhere (NaN) is put into its rim, where nothing is seen.
+    """
+    for s in range(len(shares)):
+        depth = low + length * shares[s]
+        z = ray[2] * depth + shift[2]
+        x, y = (ray[0] * depth + shift[0]) / z - HALF, (ray[1] * depth + shift[1]) / z - HALF
+        seen = (z > ZERO) & (x > -ONE) & (x < np.float32(width)) & (y > -ONE) & (y < np.float32(height))
+        x, y = x if seen else -ONE, y if seen else -ONE
+        left, top = np.floor(x), np.floor(y)
+        rights[s], downs[s] = x - left, y - top
+        pixels[s] = (np.int32(top) + np.int32(1)) * np.int32(width + 2) + np.int32(left) + np.int32(1)
+
+
+@helper
+def _compare(colors, own, at, line, right, down):
+    """Difference of pixel ``own`` and what lies between four pixels from ``at``; how much is seen there."""
     seen = _blend(colors, at + INSIDE, line, down, right)
-    # The agreement is no larger than the share of the subject.
-    if seen <= best:
-        return best
     difference = abs(_blend(colors, at + RED, line, down, right) - colors[own + RED])
     difference += abs(_blend(colors, at + GREEN, line, down, right) - colors[own + GREEN])
     difference += abs(_blend(colors, at + BLUE, line, down, right) - colors[own + BLUE])
-    found = np.exp(-difference * rate) * seen
-    return found if found > best else best
+    return difference, seen
 
 
 def _sweep_rows(
     colors, masks, near, far, turn, shift, compared, shares, tolerance, out, element, view, first, last
 ):
-    """Write rows ``first`` to ``last`` of ``out[element, view]``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
+    """Write rows ``first`` to ``last`` of ``out[element, view]``; see :func:`ghgs_lit.geometry.cpu.sweep`.
+
+    The arithmetic of all depths of a pixel comes before their colours: without a branch, it is vectorized.
+    """
     views, height, width = masks.shape[1], masks.shape[2], masks.shape[3]
     count = len(shares)
-    size = np.uint64((height + 2) * (width + 2)) * CHANNELS
+    line = np.uint64(width + 2) * CHANNELS
+    size = np.uint64(height + 2) * line
     rate = ONE / (THREE * tolerance)
+    pixels = np.empty(count, np.int64)
+    # Allocated one by one: of rows of one array, the compiler does not know that they never overlap.
+    rights, downs = np.empty(count, np.float32), np.empty(count, np.float32)
+    differences, seen = np.empty(count, np.float32), np.empty(count, np.float32)
+    best = np.empty(count, np.float32)
     for row in range(first, last):
         v = np.float32(row) + HALF
         for column in range(width):
@@ -71,20 +85,23 @@ def _sweep_rows(
             own = np.uint64(element * views + view) * size + place
             low = near[element, view, row, column]
             length = far[element, view, row, column] - low
+            best[:] = ZERO
             for other in range(views):
                 if other == view or not compared[element, view, other]:
                     continue
                 m, t = turn[element, view, other], shift[element, view, other]
-                rx = m[0, 0] * u + m[0, 1] * v + m[0, 2]
-                ry = m[1, 0] * u + m[1, 1] * v + m[1, 2]
-                rz = m[2, 0] * u + m[2, 1] * v + m[2, 2]
+                ray = (
+                    m[0, 0] * u + m[0, 1] * v + m[0, 2],
+                    m[1, 0] * u + m[1, 1] * v + m[1, 2],
+                    m[2, 0] * u + m[2, 1] * v + m[2, 2],
+                )
+                moved = (t[0], t[1], t[2])
+                _project(ray, moved, low, length, shares, height, width, pixels, rights, downs)
                 start = np.uint64(element * views + other) * size
                 for s in range(count):
-                    depth = low + length * shares[s]
-                    z = rz * depth + t[2]
-                    if z > ZERO:
-                        x, y = (rx * depth + t[0]) / z - HALF, (ry * depth + t[1]) / z - HALF
-                        best = out[element, view, row, column, s]
-                        out[element, view, row, column, s] = _agreement(
-                            colors, own, start, height, width, x, y, best, rate
-                        )
+                    at = start + np.uint64(pixels[s]) * CHANNELS
+                    differences[s], seen[s] = _compare(colors, own, at, line, rights[s], downs[s])
+                for s in range(count):
+                    found = np.exp(-differences[s] * rate) * seen[s]
+                    best[s] = found if found > best[s] else best[s]
+            out[element, view, row, column] = best
