@@ -24,7 +24,9 @@ class KeptPatches:
 
     def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):
         _, _, height, width = self.grid = tuple(kept.shape)
-        self._counts = kept.cpu().flatten(2).sum(-1)  # the lengths below are needed as numbers
+        kept_here = kept.cpu()  # the lengths and the box below are needed as numbers
+        self._counts = kept_here.flatten(2).sum(-1)
+        self._lines = kept_here.any(3).flatten(0, 1).any(0), kept_here.any(2).flatten(0, 1).any(0)
         total = int(self._counts.sum())
         is_whole = total == kept.numel()
         self.index = torch.arange(total, device=device) if is_whole else true_places(kept.to(device), total)
@@ -39,6 +41,10 @@ class KeptPatches:
     def element_lengths(self, special: int) -> list[int]:
         """Tokens of all views of each batch element, with ``special`` special ones in each view."""
         return (self._counts + special).sum(1).tolist()
+
+    def box(self, margin: int) -> tuple[slice, slice]:
+        """Rows and columns of patches around those that are kept in any image; one patch at least."""
+        return tuple(_around(line, margin) for line in self._lines)
 
     def select(self, patches: Float[Tensor, "n p c"]) -> Float[Tensor, "N c"]:
         """The kept ones among the tokens of all patches."""
@@ -77,3 +83,9 @@ class KeptPatches:
     def _places(self, special: int) -> Int[Tensor, " N"]:
         """Of the kept patches among packed tokens."""
         return torch.arange(len(self.index), device=self.index.device) + (self.image + 1) * special
+
+
+def _around(line: Bool[Tensor, " n"], margin: int) -> slice:
+    """From the first to the last one, with a margin as far as the line goes; without any, the first place."""
+    places = line.nonzero()[:, 0].tolist() or [0]
+    return slice(max(places[0] - margin, 0), min(places[-1] + 1 + margin, len(line)))

@@ -30,6 +30,10 @@ class ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
+#: Patches around those that are kept, on which these depend: one is mixed in, it sees a part of the next.
+_REACH = 2
+
+
 class ConvStem(nn.Module):
     """Overlapping convolutions: with them a small encoder learns edges and the silhouette much sooner.
 
@@ -45,6 +49,7 @@ class ConvStem(nn.Module):
 
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):
         super().__init__()
+        self.patch_size = patch_size
         layers, rest, outputs = [], patch_size, min(channels, width)
         while rest % 2 == 0:
             layers += [
@@ -59,6 +64,9 @@ class ConvStem(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
-        x = self.reduce(images)
+        box = kept.box(_REACH)
+        rows, columns = box
+        seen = (slice(part.start * self.patch_size, part.stop * self.patch_size) for part in box)
+        x = self.reduce(images[..., *seen])
         x = x + self.mix(F.gelu(self.mix_norm(x)))
-        return self.norm(kept.select(rearrange(x, "n c h w -> n (h w) c")))
+        return self.norm(x.movedim(1, -1)[kept.image, kept.row - rows.start, kept.column - columns.start])

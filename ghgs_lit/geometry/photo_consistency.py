@@ -50,7 +50,9 @@ def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V 
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     colors, turn, shift, compared = (x.to(near) if x.is_floating_point() else x for x in batch.once(_views))
     if cpu.is_supported(near, far):
-        result = cpu.sweep(colors, batch.masks, near, far, turn, shift, compared, shares, TOLERANCE)
+        result = cpu.sweep(
+            batch.once(_padded), batch.masks, near, far, turn, shift, compared, shares, TOLERANCE
+        )
         return result.permute(0, 1, 4, 2, 3)
     result = near.new_zeros(b * v * height * width, steps)
     pixels = batch.pixels
@@ -67,6 +69,10 @@ def _views(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     turn, shift, facing = _relations(batch.cameras)
     colors = _smooth(batch.images.to(at_least_float32(batch.images).dtype), batch.masks)
     return colors, turn, shift, ~(facing < WIDEST)
+
+
+def _padded(batch: Batch) -> Tensor:
+    return cpu.padded(batch.once(_views)[0])
 
 
 def _best_match(

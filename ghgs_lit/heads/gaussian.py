@@ -20,6 +20,7 @@ from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.window import subject_windows
+from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.precision import without_float16
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens, true_places
 
@@ -36,7 +37,7 @@ def _logit(probability: float) -> float:
 def _mlp(sizes: Sequence[int], activation: type[nn.Module]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
-        layers += [nn.Linear(inputs, outputs), activation()]
+        layers += [Linear(inputs, outputs), activation()]
     return nn.Sequential(*layers[:-1])
 
 

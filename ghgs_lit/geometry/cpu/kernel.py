@@ -1,15 +1,18 @@
 """The plane sweep of one pixel after the other (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
 
+import math
 from functools import cache
 
 import numpy as np
 from numba.core import types
 
+from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
 ZERO, HALF, ONE, THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
 # Unsigned: a signed index is compared with 0 at each access.
-RED, GREEN, BLUE, INSIDE, CHANNELS = (np.uint64(x) for x in range(5))
+INSIDE, CHANNELS = np.uint64(3), np.uint64(4)
 
 FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
 MASKS, PAIRS = types.Array(types.boolean, 4, "C"), types.Array(types.boolean, 3, "C")
@@ -21,14 +24,6 @@ def sweep_rows():
     """The compiled :func:`_sweep_rows`."""
     maps = (FLOATS[1], MASKS, FLOATS[4], FLOATS[4], FLOATS[5], FLOATS[4], PAIRS, FLOATS[1])
     return kernel_for(_sweep_rows, *maps, types.float32, FLOATS[5], *[NUMBER] * 4)
-
-
-@helper
-def _blend(values, at, below, down, right):
-    """Bilinear value between four pixels: ``at`` and the next one, and those ``below`` floats behind them."""
-    above = values[at] * (ONE - right) + values[at + CHANNELS] * right
-    under = values[at + below] * (ONE - right) + values[at + below + CHANNELS] * right
-    return above * (ONE - down) + under * down
 
 
 @helper
@@ -49,13 +44,27 @@ def _project(ray, shift, low, length, shares, height, width, pixels, rights, dow
 
 
 @helper
-def _compare(colors, own, at, line, right, down):
-    """Difference of pixel ``own`` and what lies between four pixels from ``at``; how much is seen there."""
-    seen = _blend(colors, at + INSIDE, line, down, right)
-    difference = abs(_blend(colors, at + RED, line, down, right) - colors[own + RED])
-    difference += abs(_blend(colors, at + GREEN, line, down, right) - colors[own + GREEN])
-    difference += abs(_blend(colors, at + BLUE, line, down, right) - colors[own + BLUE])
-    return difference, seen
+def _compare(colors, own, at, line, right, down, columns):
+    """Difference of pixel ``own`` and what lies between four pixels from ``at``; how much is seen there.
+
+    A line's two pixels are loaded at once; ``columns`` holds their channels on the way down to the next line.
+    """
+    above, below = memory.load_anywhere(colors, at), memory.load_anywhere(colors, at + line)
+    memory.store(columns, 0, simd.fma(below - above, down, above))
+    difference = ZERO
+    for channel in range(INSIDE):
+        color = columns[channel] + right * (columns[channel + CHANNELS] - columns[channel])
+        difference += abs(color - colors[own + channel])
+    return difference, columns[INSIDE] + right * (columns[INSIDE + CHANNELS] - columns[INSIDE])
+
+
+@helper
+def _keep_best(best, differences, seen, rate):
+    """``best = max(best, seen 2^(-rate difference))``."""
+    for s in range(0, len(best), LANES):
+        exponent = memory.load(differences, s) * simd.full(rate)
+        agreement = memory.load(seen, s) * simd.exp2_minus(simd.minimum(simd.full(EXP2_LIMIT), exponent))
+        memory.store(best, s, simd.maximum(memory.load(best, s), agreement))
 
 
 def _sweep_rows(
@@ -69,12 +78,16 @@ def _sweep_rows(
     count = len(shares)
     line = np.uint64(width + 2) * CHANNELS
     size = np.uint64(height + 2) * line
-    rate = ONE / (THREE * tolerance)
-    pixels = np.empty(count, np.int64)
-    # Allocated one by one: of rows of one array, the compiler does not know that they never overlap.
-    rights, downs = np.empty(count, np.float32), np.empty(count, np.float32)
-    differences, seen = np.empty(count, np.float32), np.empty(count, np.float32)
-    best = np.empty(count, np.float32)
+    rate = np.float32(math.log2(math.e)) / (THREE * tolerance)
+    padded = -(-count // LANES) * LANES
+    pixels, rights, downs = (
+        np.empty(count, np.int64),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+    )
+    differences, seen, best = simd.aligned(padded), simd.aligned(padded), simd.aligned(padded)
+    columns = simd.aligned(LANES)
+    differences[:], seen[:] = ZERO, ZERO
     for row in range(first, last):
         v = np.float32(row) + HALF
         for column in range(width):
@@ -100,8 +113,6 @@ def _sweep_rows(
                 start = np.uint64(element * views + other) * size
                 for s in range(count):
                     at = start + np.uint64(pixels[s]) * CHANNELS
-                    differences[s], seen[s] = _compare(colors, own, at, line, rights[s], downs[s])
-                for s in range(count):
-                    found = np.exp(-differences[s] * rate) * seen[s]
-                    best[s] = found if found > best[s] else best[s]
-            out[element, view, row, column] = best
+                    differences[s], seen[s] = _compare(colors, own, at, line, rights[s], downs[s], columns)
+                _keep_best(best, differences, seen, rate)
+            out[element, view, row, column] = best[:count]
