@@ -19,7 +19,7 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 
 setup: $(BIN)/.installed ## Create the virtual environment with pinned versions
 
-demo: setup ## Generate people, train the four ablations, evaluate with 3, 4, 5 views, print the table
+demo: setup ## A person from four photographs; then train the four ablations, print the table
 	PATH="$(abspath $(BIN)):$$PATH" bash scripts/demo.sh
 
 test: setup ## Run the whole test suite (CPU)
