@@ -46,6 +46,7 @@ NOT_RUN = [
     (r"ghgs train .*hydra/launcher=ray", "needs the extra `ray`"),
     (r"ghgs train .*hydra/sweeper=optuna", "needs the extra `optuna`"),
     (r"ghgs stress dump=", "needs a training step that was not finite"),
+    (r"ghgs (evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python benchmarks/half_precision", "takes an hour"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),

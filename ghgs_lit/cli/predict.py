@@ -77,7 +77,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     options, (model, renderer, device) = output_options(config), load(config)
     data = build_data(config)
     check_size(data, model)
-    data.prepare_data()
+    data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
     begin = time.perf_counter()
     prediction = model(dataclasses.replace(batch, targets=None))

@@ -46,6 +46,11 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
     return epochs * length + steps * trainer.accumulate_grad_batches
 
 
+def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
+    several = targets if isinstance(targets, Sequence) and not isinstance(targets, str) else (targets,)
+    return [from_config(TargetProtocol, "targets", protocol) for protocol in several]
+
+
 class PhotographsDataModule(LightningDataModule):
     """Batches of a data set. A subclass names its ``dataset_type``, and nothing else.
 
@@ -90,12 +95,15 @@ class PhotographsDataModule(LightningDataModule):
         """What readers of results must know about how the data was read."""
         return {**self.dataset.facts, "resampling": self.options.resampling}
 
-    def prepare_data(self) -> None:
-        self.dataset.prepare()
+    def prepare_data(self, splits: Sequence[str] = PHASES) -> None:
+        """Make what ``splits`` need and is missing."""
+        for split in splits:
+            choice("split", split, self.dataset.split_names)
+        self.dataset.prepare(splits)
 
     def builder(self, phase: str) -> BatchBuilder:
-        """Builds batches of ``train`` or ``val``; made on first use."""
-        choice("split", phase, PHASES)
+        """Builds batches of a split; made on first use."""
+        choice("split", phase, self.dataset.split_names)
         if phase not in self._builders:
             o, reader = self.options, self.dataset.reader(phase)
             inputs = targets = Photographs(reader, o.size, o.cache_images_mb, o.resampling)
@@ -150,27 +158,29 @@ class PhotographsDataModule(LightningDataModule):
             views: number of inputs (None: the view protocol's).
             targets: a protocol or its mapping, or several, whose targets a sample has one after another
                 (None: this module's).
-            split: ``train`` or ``val``.
+            split: one of the data set's.
             batch_size: samples of a batch (None: this module's).
         """
-        targets = self.targets if targets is None else targets
-        several = targets if isinstance(targets, Sequence) and not isinstance(targets, str) else (targets,)
-        protocols = [from_config(TargetProtocol, "targets", protocol) for protocol in several]
+        protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.builder(split), specs, batch_size or self.options.batch_size)
         return self._loader(batches)
 
     def evaluation_batch(
-        self, subject: str, split: str = "val", views: int | None = None, targets: Targets | None = None
+        self,
+        subject: str,
+        split: str = "val",
+        views: int | None = None,
+        targets: Targets | Sequence[Targets] | None = None,
     ) -> Batch:
         """The sample of one subject; nothing of others is read. Arguments as for :meth:`evaluation_loader`.
 
         Args:
             subject: its name.
             split, views: whose inputs.
-            targets: a protocol or its mapping; None: the batch has no targets.
+            targets: a protocol or its mapping, or several; None: the batch has no targets.
         """
-        protocols = [] if targets is None else [from_config(TargetProtocol, "targets", targets)]
+        protocols = [] if targets is None else _protocols(targets)
         available = {subject: self.subjects(split)[subject]}
         return self.builder(split).batch(self._evaluation_samples(available, protocols, views))
 

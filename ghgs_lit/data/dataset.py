@@ -48,8 +48,13 @@ class DataSet(ABC):
         """Whether there are subjects of a phase; data without ``train`` can be evaluated."""
         return True
 
-    def prepare(self) -> None:
-        """Make what training needs and is missing; called once, before any process reads."""
+    @property
+    def split_names(self) -> tuple[str, ...]:
+        """Names of the splits that can be read: ``train``, ``val``, and further ones for evaluation."""
+        return PHASES
+
+    def prepare(self, splits: Sequence[str] = PHASES) -> None:
+        """Make what these splits need and is missing; called once, before any process reads."""
         return
 
     def inspections(self) -> Sequence[Callable[[], None]]:
@@ -67,6 +72,10 @@ class DataSet(ABC):
     def facts(self) -> dict[str, str]:
         """What readers of results must know about how the files are read."""
         return {"name": self.name}
+
+    def split_facts(self, split: str) -> dict[str, str]:
+        """What they must know about a split."""
+        return {"split": split}
 
     @property
     def folder(self) -> Path:

@@ -75,7 +75,7 @@ class Rendered(DataSet):
         return None
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
-        names, limit, further = self.subject_names(phase), self.limit[phase], self.further_bodies()
+        names, limit, further = self.subject_names(phase), self.limit.get(phase), self.further_bodies()
         return Layout(self.folder, phase, names, limit, self.pixel_centers, self.body_models, further, strict)
 
 

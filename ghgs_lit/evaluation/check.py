@@ -6,7 +6,6 @@ from typing import Any
 from ghgs_lit.config import build
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import TargetProtocol
 from ghgs_lit.errors import choice, require
 from ghgs_lit.evaluation.protocols import target_protocols
@@ -35,8 +34,8 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
     }
     build(config["metrics"], "metrics")
     split = evaluation["split"]
-    choice("evaluation.split", split, PHASES)
-    data.prepare_data()
+    choice("evaluation.split", split, data.dataset.split_names)
+    data.prepare_data([split])
     require(len(data.subjects(split)) > 0, f"evaluation.split={split}", "a subject or more", "none")
     for count in views:
         for protocol in protocols.values():

@@ -17,7 +17,7 @@ from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_re
 from ghgs_lit.runs.terminal import print_uncut
 
 #: Metrics that are printed, with their decimals.
-PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1}
+PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
 #: What readers must know about the subjects of a split.
 SPLITS = {
     "train": "the subjects that were trained on",
@@ -70,7 +70,7 @@ def measure_and_write(
     source = provenance(
         config,
         seed=config["seed"],
-        data={**data.facts, "split": evaluation["split"]},
+        data={**data.facts, **data.dataset.split_facts(evaluation["split"])},
         protocol={
             "metrics": metrics.protocol,
             "views": evaluation["views"],

@@ -4,8 +4,8 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +16,7 @@ from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import Split, split_names
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis import bench, people
 from ghgs_lit.synthesis.jobs import RenderSettings, Source, SyntheticSource, identity, render_people
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
@@ -71,15 +71,32 @@ class Synthetic(_Renderable):
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         set_fields(self, root=str(Path(cache).expanduser() / f"synthetic-{key}"))
 
+    @property
+    def split_names(self) -> tuple[str, ...]:
+        return (*PHASES, bench.SPLIT)
+
+    def split_facts(self, split: str) -> dict[str, str]:
+        return super().split_facts(split) | (bench.facts() if split == bench.SPLIT else {})
+
     def subject_names(self, phase: str) -> list[str]:
+        if phase == bench.SPLIT:
+            return bench.names()
         first = 0 if phase == "train" else self.FIRST_VAL
         return [f"p{first + i:07d}" for i in range(self.people[phase])]
 
-    def prepare(self) -> None:
-        """Render the people that the cache lacks."""
-        names = {phase: self.subject_names(phase) for phase in PHASES}
+    def prepare(self, splits: Sequence[str] = PHASES) -> None:
+        """Render the people of ``splits`` that the cache lacks.
+
+        Raises:
+            InputError: the people of ``bench`` are not those of its definition (:mod:`.bench`).
+        """
+        if bench.SPLIT in splits:
+            bench.check_settings(asdict(self))
+        names = {phase: self.subject_names(phase) for phase in splits}
         source, seed = SyntheticSource(self.people_seed), self.people_seed
         render_people(Path(self.root), names, source, self.rig, self.render, seed, self.render_workers)
+        if bench.SPLIT in splits:
+            bench.check_photographs(self.reader(bench.SPLIT))
 
     def check_targets(self, targets: TargetProtocol) -> None:
         needed = {RING_VIEW} | targets.view_numbers
