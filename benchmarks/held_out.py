@@ -14,15 +14,14 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from ghgs_lit import GHGS, Capture
-from ghgs_lit.bounds import VisualHull
 from ghgs_lit.capture.predict import trained_size
 from ghgs_lit.cli.inputs import build_renderer, pick_device
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.evaluation.baselines import nearest_view, splatted
+from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.refinement import Refinement
@@ -50,11 +49,6 @@ def held_out(batch: Batch) -> Iterator[Batch]:
         )
 
 
-def hull_depth(batch: Batch, hull: VisualHull) -> Tensor:
-    """Where the rays of the inputs enter the visual hull, metres; 0 outside the subject."""
-    return hull(batch).near * batch.masks
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("images", type=Path)
@@ -70,10 +64,9 @@ def main() -> None:
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
     batch = Capture.read(options.images, options.cameras).batch(image_size("size", size))
     batch = Frame.of(batch).enter(batch)  # baselines compute in float32
-    hull = partial(hull_depth, hull=VisualHull())
     methods: dict[str, Method] = {
         "nearest view": nearest_view,
-        "visual hull": partial(splatted, depth_of=hull, renderer=renderer),
+        "visual hull": partial(splatted, depth_of=hull_depth, renderer=renderer),
     }
     refinement = Refinement(options.refine, renderer) if options.refine else None
     for path in options.checkpoints:

@@ -1,4 +1,4 @@
-"""``ghgs benchmark``: run time against error of every preset, and how cost grows."""
+"""``ghgs benchmark``: run time against error of every preset and of other methods, and how cost grows."""
 
 import itertools
 import math
@@ -16,8 +16,10 @@ from ghgs_lit.benchmark.board import write_board
 from ghgs_lit.benchmark.machine import in_words, machine_facts
 from ghgs_lit.benchmark.measure import record_cases, threads
 from ghgs_lit.benchmark.page import to_page
+from ghgs_lit.benchmark.peers import tables_of as tables_of_peers
 from ghgs_lit.benchmark.plot import draw_presets, draw_scaling, save_png
 from ghgs_lit.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of, presets_of, readers_of_skip
+from ghgs_lit.cli.benchmark_peers import peers
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
@@ -29,24 +31,29 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.training.loggers import hyperparameters
 from ghgs_lit.types import Batch
+from ghgs_lit.weights.reading import SHIPPED
 
-TASKS = ("presets", "scaling")
+TASKS = ("presets", "peers", "scaling")
 
 
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the results last. Exit code 1 where a preset breaks its budget."""
     directory = output_dir()
     choice("task", cfg.task, TASKS)
-    cfg = with_trained_data(cfg) if cfg.task == "presets" else cfg
+    if cfg.task == "peers" and cfg.checkpoint is None:
+        cfg.checkpoint = SHIPPED
+    cfg = cfg if cfg.task == "scaling" else with_trained_data(cfg)
     config = save_config(cfg, directory)
     _check(config)
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     with threads(config["threads"]):
-        cases = _cases(config, readers_of_skip(cfg), device)
-        content = (
-            _presets(cases, config, device) if cfg.task == "presets" else _scaling(cases, config, device)
-        )
+        if cfg.task == "peers":
+            content = peers(cfg, config, directory, device)
+        else:
+            cases = _cases(config, readers_of_skip(cfg), device)
+            measured = _presets if cfg.task == "presets" else _scaling
+            content = measured(cases, config, device)
         content = {"task": config["task"], "machine": machine_facts(device), **content}
     path = _write(directory, content, config)
     announce(path)
@@ -63,10 +70,10 @@ def _check(config: dict[str, Any]) -> None:
         require(isinstance(value, int) and value >= least, f"timing.{key}", f"at least {least}", value)
     names = config["presets"]
     require(isinstance(names, list) and bool(names), "presets", "a list with a name", names)
-    count = config["subjects"]
-    require(isinstance(count, int) and count >= 1, "subjects", "at least 1", count)
     count = config["threads"]
     require(count is None or (isinstance(count, int) and count >= 1), "threads", "at least 1, or null", count)
+    for key in ("vs", "knobs") if config["task"] == "peers" else ():
+        require(config[key] is None, key, "null with task=peers", config[key])
     if config["checkpoint"] is None:
         require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
         return
@@ -99,9 +106,9 @@ def _cases(config: dict[str, Any], readers: dict[str, str], device: torch.device
 def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
     """Measure presets on data."""
     data = build_data(config)
-    data.prepare_data()
+    data.prepare_data([config["split"]])
     loader = data.evaluation_loader(split=config["split"])
-    number = math.ceil(config["subjects"] / data.options.batch_size)
+    number = config["subjects"] and math.ceil(config["subjects"] / data.options.batch_size)
     batches: list[Batch] = [batch.to(device) for batch in itertools.islice(loader, number)]
     if batches[0].targets is None:
         raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")
@@ -159,7 +166,12 @@ def _weights(config: dict[str, Any], cases: list[Case]) -> str:
 
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
     """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
+    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
+    if content["task"] == "peers":
+        tables = tables_of_peers(rows)
+        report.print_tables(tables)
+        return report.write_numbers(directory, {**content, "provenance": source}, tables)
     if content["task"] == "presets":
         tables, drawing = report.tables_of(rows), draw_presets(rows, *words)
     else:
@@ -172,5 +184,4 @@ def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> 
     notes = report.notes_of(content)
     write_text_atomically(directory / "benchmark.html", to_page(drawing, tables, notes))
     write_board(directory, rows, png, hyperparameters(config, choices(), overrides()))
-    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
     return report.write_numbers(directory, {**content, "provenance": source}, tables)

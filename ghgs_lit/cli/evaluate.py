@@ -6,9 +6,7 @@ import lightning.pytorch as L
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import (
-    MODEL_NODES,
     build_data,
-    build_renderer,
     check_size,
     choices,
     model_of,
@@ -16,18 +14,15 @@ from ghgs_lit.cli.inputs import (
     with_chosen_targets,
     with_trained_data,
 )
+from ghgs_lit.cli.methods import baselines_of, trained_method
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.encoder import open_cache
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
 from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.refinement import Refinement
 from ghgs_lit.runs.results import METHOD, read_results
-from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
@@ -37,31 +32,17 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
         config: of the verb; its model is that of the checkpoint where there is one.
         device: where the methods run.
     """
-    names = config["baselines"]
-    names = list(BASELINES) if names == "all" else [names] if isinstance(names, str) else names
-    path, renderer = config["checkpoint"], build_renderer(config, device)
-    if path is None and not names:
+    path = config["checkpoint"]
+    if path is None and not config["baselines"]:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
     methods: dict[str, Method] = {}
     facts: dict[str, Any] = {"checkpoint": path}
     if path is not None:
-        model = GHGS.from_config(config, empty=STAGES)
-        model.load(path)
-        model.precision = config["precision"]
+        methods["model"], found = trained_method(config, device)
+        model = methods["model"].model
         model.feature_cache = open_cache(config["feature_cache"], model.recalibration.tokens)
-        checkpoint = read_checkpoint(path)
-        facts["checkpoint_config"] = checkpoint["config"]
-        facts["model_config"] = {node: config[node] for node in MODEL_NODES if node in config}
-        if "global_step" in checkpoint:
-            facts["training"] = {"steps": checkpoint["global_step"]}
-        facts["parameters"] = {"total": sum(p.numel() for p in model.parameters())}
-        refinement = Refinement(config["refine"], renderer) if config["refine"] else None
-        methods["model"] = ModelMethod(model.to(device).eval(), renderer, refinement)
-    splats = config["splats"]
-    for name in names:
-        methods[name] = baseline(
-            name, renderer, lambda: GHGS.from_config(config).to(device), splats["sigma"], splats["opacity"]
-        )
+        facts |= found
+    methods |= baselines_of(config["baselines"], config, device)
     return methods, facts
 
 

@@ -1,4 +1,4 @@
-"""Gaussians of a prediction, optimised until their renders are the input photographs.
+"""Gaussians of the inputs' pixels, optimised until their renders are the input photographs.
 
 A prediction is near enough that a few steps suffice, and every change is bounded, so that what no photograph
 shows stays as predicted. Photographs that are reproduced say nothing of other views (with wrong geometry they
@@ -7,7 +7,8 @@ than a fixed number of steps: fewer inputs want fewer steps.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -20,11 +21,23 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
 
-#: Largest changes: of a mean along each axis, in footprints of its pixel; of the logarithm of a scale; of the
-#: logit of an opacity; of a colour.
-LIMITS = {"means": 1.0, "scales": 1.0, "opacities": 2.0, "colors": 0.05}
-#: Step of Adam on arguments of tanh.
-RATE = 0.02
+
+@dataclass(frozen=True)
+class Change:
+    """How far a value may go, and the step of Adam while it is near its start."""
+
+    limit: float
+    rate: float
+
+
+#: Of a mean along each axis, in footprints of its pixel; of the logarithm of a scale; of the logit of an
+#: opacity; of a colour. Near enough to a prediction that what no photograph shows stays as predicted.
+NEAR = {
+    "means": Change(1.0, 0.02),
+    "scales": Change(1.0, 0.02),
+    "opacities": Change(2.0, 0.04),
+    "colors": Change(0.05, 0.001),
+}
 #: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
 WEIGHTS = (0.8, 0.2, 0.1)
 
@@ -52,11 +65,13 @@ class Refinement:
     Args:
         steps: of the optimiser, 1 or more.
         renderer: draws the inputs, with gradients.
+        changes: by name, what may change: of a mean in footprints of its pixel, of the logarithm of a scale,
+            of the logit of an opacity, of a unit quaternion, of a colour. Others stay.
     """
 
-    def __init__(self, steps: int, renderer: Renderer):
+    def __init__(self, steps: int, renderer: Renderer, changes: Mapping[str, Change] = NEAR):
         require(steps >= 1, "refine", "1 or more steps", steps)
-        self.steps, self.renderer = steps, renderer
+        self.steps, self.renderer, self.changes = steps, renderer, changes
 
     def __call__(self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None) -> Gaussians:
         """The refined Gaussians.
@@ -69,22 +84,46 @@ class Refinement:
         Raises:
             InputError: Gaussians that belong to no pixel.
         """
+        return deque(self.states(gaussians, batch, views), maxlen=1).pop()
+
+    def states(
+        self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None
+    ) -> Iterator[Gaussians]:
+        """The Gaussians before the first step and after each; arguments and errors as for a call."""
         require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
         views = range(batch.images.shape[1]) if views is None else views
-        with torch.autocast(batch.images.device.type, enabled=False), torch.enable_grad():
-            gaussians = gaussians.detach()
-            photographs, silhouettes, cameras = _of_views(batch, views)
-            footprint = _footprints(gaussians, batch)
-            raw = {name: torch.zeros_like(getattr(gaussians, name), requires_grad=True) for name in LIMITS}
-            # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
-            optimizer = torch.optim.Adam(raw.values(), lr=RATE, betas=(0.9, 0.95), eps=1e-15)
-            for _ in range(self.steps):
-                drawn = self.renderer(_changed(gaussians, raw, footprint), cameras, background=0.0)
-                loss = _loss(drawn, photographs, silhouettes)
+        gaussians = gaussians.detach()
+        photographs, silhouettes, cameras = _of_views(batch, views)
+        footprint = _footprints(gaussians, batch)
+        raw = {name: torch.zeros_like(getattr(gaussians, name), requires_grad=True) for name in self.changes}
+        # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
+        groups = [{"params": [raw[name]], "lr": change.rate} for name, change in self.changes.items()]
+        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95), eps=1e-15)
+        yield gaussians
+        for _ in range(self.steps):
+            with torch.autocast(footprint.device.type, enabled=False), torch.enable_grad():
+                drawn = self.renderer(self._changed(gaussians, raw, footprint), cameras, background=0.0)
                 optimizer.zero_grad()
-                loss.backward()
+                _loss(drawn, photographs, silhouettes).backward()
                 optimizer.step()
-            return _changed(gaussians, raw, footprint).detach()
+            yield self._changed(gaussians, raw, footprint).detach()
+
+    def _changed(self, gaussians: Gaussians, raw: dict[str, Tensor], footprint: Tensor) -> Gaussians:
+        """Gaussians with bounded changes; none where ``raw`` is 0."""
+        change = {
+            name: allowed.limit * torch.tanh(raw[name] / allowed.limit)
+            for name, allowed in self.changes.items()
+        }
+        changed = {name: getattr(gaussians, name) + value for name, value in change.items()}
+        if "means" in change:
+            changed["means"] = gaussians.means + footprint * change["means"]
+        if "scales" in change:
+            changed["scales"] = gaussians.scales * change["scales"].exp()
+        if "opacities" in change:
+            # Of opacities 0 and 1, which no step could leave.
+            logit = torch.logit(gaussians.opacities.clamp(1e-4, 1 - 1e-4))
+            changed["opacities"] = torch.sigmoid(logit + change["opacities"])
+        return dataclasses.replace(gaussians, **changed)
 
     def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch) -> Report:
         """What refinement gained; to hold out the last input takes as long as refinement.
@@ -125,20 +164,6 @@ def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
     depth = world_to_camera(gaussians.means, extrinsics.to(dtype)[image])[:, 2]
     focal = intrinsics.to(dtype).diagonal(dim1=-2, dim2=-1)[:, :2].prod(-1).sqrt()[image]
     return (depth / focal)[:, None]
-
-
-def _changed(gaussians: Gaussians, raw: dict[str, Tensor], footprint: Tensor) -> Gaussians:
-    """Gaussians with bounded changes; none where ``raw`` is 0."""
-    change = {name: LIMITS[name] * torch.tanh(value) for name, value in raw.items()}
-    # Of opacities 0 and 1, which no step could leave.
-    logit = torch.logit(gaussians.opacities.clamp(1e-4, 1 - 1e-4))
-    return dataclasses.replace(
-        gaussians,
-        means=gaussians.means + footprint * change["means"],
-        scales=gaussians.scales * change["scales"].exp(),
-        opacities=torch.sigmoid(logit + change["opacities"]),
-        colors=gaussians.colors + change["colors"],
-    )
 
 
 def _loss(drawn: Rendering, photographs: Tensor, silhouettes: Tensor) -> Tensor:

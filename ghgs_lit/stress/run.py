@@ -1,19 +1,16 @@
 """All cases of a run: divided among processes, written as they end, and not computed twice."""
 
-import json
 import os
-import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
 import torch
 
-import ghgs_lit
 from ghgs_lit.errors import choice
+from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.progress import track
 from ghgs_lit.stress.families import FAMILIES
 from ghgs_lit.stress.measure import measure
@@ -66,16 +63,6 @@ def tasks_of(
     ]
 
 
-@cache
-def code_digest() -> str:
-    """Of the sources of the package: cells of other code are not taken over."""
-    sources = sorted(Path(ghgs_lit.__file__).parent.rglob("*.py"))
-    digest = 0
-    for path in sources:
-        digest = zlib.crc32(path.read_bytes(), digest)
-    return f"{digest:08x}"
-
-
 def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
     """The rows of all tasks; those that ``journal`` has already are read from it.
 
@@ -84,16 +71,11 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
         journal: a file of one line for each task, which is written as the tasks end.
         workers: processes; 0: this one.
     """
-    done = _read(journal)
+    done = Journal(journal)
+    done.say_done([_key(task) for task in tasks], "families")
     left = [task for task in tasks if _key(task) not in done]
-    if len(left) < len(tasks):
-        print(f"{journal}: {len(tasks) - len(left)} of {len(tasks)} families are done already", flush=True)
-    journal.parent.mkdir(parents=True, exist_ok=True)
-    with journal.open("a") as file:
-        for task, rows in track(_Sized(_results(left, workers), len(left)), "stages and families"):
-            file.write(json.dumps({"key": _key(task), "code": code_digest(), "rows": rows}) + "\n")
-            file.flush()
-            done[_key(task)] = rows
+    for task, rows in track(_Sized(_results(left, workers), len(left)), "stages and families"):
+        done.add(_key(task), rows)
     return [row for task in tasks for row in done[_key(task)]]
 
 
@@ -113,19 +95,6 @@ class _Sized:
 
 def _key(task: Task) -> str:
     return "/".join((task.stage, task.family, str(task.seeds), ",".join(task.dtypes)))
-
-
-def _read(journal: Path) -> dict[str, list[Row]]:
-    """Rows by key; lines of other code, and a last line that was cut off, are left out."""
-    found = {}
-    for line in journal.read_text().splitlines() if journal.exists() else ():
-        try:
-            entry = json.loads(line)
-        except ValueError:
-            continue
-        if entry["code"] == code_digest():
-            found[entry["key"]] = entry["rows"]
-    return found
 
 
 def _results(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, list[Row]]]:

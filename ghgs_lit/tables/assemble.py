@@ -19,6 +19,9 @@ NO_FIGURE = "-"
 BASELINES = {
     "black": "Black image",
     "nearest_view": "Nearest input view",
+    "hull": "Splats on the visual hull",
+    "photo_depth": "Splats at the photo-consistent depth",
+    "per_scene": "Per-scene 3DGS",
     "body_depth": "Splats at the body's mean depth",
     "true_depth": "Splats at the true depth",
     "untrained": "Untrained model",

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
+from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, Cameras, Targets
 from tests.helpers.cameras import camera_ring
 
@@ -45,6 +46,14 @@ def ellipsoid(cameras, center=CENTER, radii=RADII):
     root = b * b - a * c
     mask = root > 0
     return mask, torch.where(mask, (-b - root.clamp(min=0).sqrt()) / a, 0).float()
+
+
+def painted_ellipsoid(cameras):
+    """An ellipsoid whose colour is a smooth function of the place on its surface, and its depth."""
+    masks, depths = ellipsoid(cameras)
+    points = unproject_maps(depths, cameras)
+    colors = 0.5 + 0.4 * torch.sin(6 * points + torch.tensor([0.0, 1.0, 2.0]))
+    return colors.movedim(-1, -3) * masks[..., None, :, :], masks, depths
 
 
 def make_batch(batch=1, views=3, height=56, width=56, **kwargs):

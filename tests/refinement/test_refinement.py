@@ -7,32 +7,23 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import splats_at
-from ghgs_lit.geometry.projection import unproject_maps, world_to_camera
+from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.metrics.functional import psnr
 from ghgs_lit.refinement import Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
-from tests.helpers.scenes import ellipsoid, ring
+from tests.helpers.scenes import painted_ellipsoid, ring
 
 RENDERER = Renderer("cpu")
-
-
-def photographs(cameras):
-    """An ellipsoid whose colour is a smooth function of the place on its surface, and its depth."""
-    masks, depths = ellipsoid(cameras)
-    points = unproject_maps(depths, cameras)
-    colors = 0.5 + 0.4 * torch.sin(6 * points + torch.tensor([0.0, 1.0, 2.0]))
-    return colors.movedim(-1, -3) * masks[..., None, :, :], masks, depths
 
 
 def scene(batch=1, views=4, size=56):
     """Photographs, dull and thin splats at the true depth, and a view between the inputs."""
     around = ring(batch, 2 * views, size, size)
-    images, masks, depths = photographs(around[:, ::2])
+    images, masks, depths = painted_ellipsoid(around[:, ::2])
     inputs = Batch(images, masks, around[:, ::2])
     splats = splats_at(inputs, depths, masks, sigma=0.25)
-    image = masks.flatten(0, 1).flatten(1).nonzero()[:, 0]
-    splats = dataclasses.replace(splats, image=image, colors=0.95 * splats.colors)
+    splats = dataclasses.replace(splats, colors=0.95 * splats.colors)
     return splats, inputs, around[:, 1:2]
 
 
@@ -43,7 +34,7 @@ def quality(gaussians, cameras, images):
 def test_a_view_that_nobody_saw_gets_better():
     """It is for other views that a user refines; the inputs' PSNR must be what is reported."""
     splats, inputs, between = scene()
-    target = photographs(between)[0]
+    target = painted_ellipsoid(between)[0]
     refinement = Refinement(15, RENDERER)
     refined = refinement(splats, inputs)
     assert quality(refined, between, target) > quality(splats, between, target) + 2

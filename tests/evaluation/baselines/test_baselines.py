@@ -2,13 +2,13 @@
 
 import dataclasses
 import math
+from types import MappingProxyType
 
 import pytest
 import torch
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation import baselines
-from ghgs_lit.evaluation.baselines import baseline, nearest_view, splats_at
+from ghgs_lit.evaluation.baselines import BASELINES, baseline, nearest_view, splats_at
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import psnr
 from ghgs_lit.rendering import Renderer
@@ -19,6 +19,10 @@ from tests.helpers.training import Standin, batched, example_batch, flat_rendere
 def nothing(gaussians, cameras):
     shape = (*cameras.shape, 1, cameras.height, cameras.width)
     return Rendering(torch.zeros(*cameras.shape, 3, cameras.height, cameras.width), *[torch.zeros(shape)] * 2)
+
+
+def named(name, renderer, splats=MappingProxyType({})):
+    return baseline(name, renderer, Standin, splats, {"steps": 1, "start": "hull"})
 
 
 @pytest.mark.parametrize("views", [3, 5])
@@ -72,7 +76,7 @@ def test_true_depth_renders_the_input_again():
     alone = batch.masks.clone()
     alone[:, 1] = False
     batch = dataclasses.replace(batch, targets=own, masks=alone)
-    method = baseline("true_depth", Renderer("reference"), untrained=None, sigma=0.1, opacity=0.99)
+    method = named("true_depth", Renderer("reference"), splats={"sigma": 0.1, "opacity": 0.99})
     estimate = method(batch)
     assert torch.equal(estimate.depth, batch.depths)
     inside = batch.masks[0, 0]
@@ -83,7 +87,7 @@ def test_true_depth_renders_the_input_again():
 def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
     """The depth is measured along the axis of each camera, not as a distance."""
     batch = example_batch(subjects=1, views=3)
-    estimate = baseline("body_depth", nothing, untrained=None)(batch)
+    estimate = named("body_depth", nothing)(batch)
     for v in range(3):
         _, z = project(batch.body_vertices[0], batch.cameras.intrinsics[0, v], batch.cameras.extrinsics[0, v])
         assert torch.allclose(estimate.depth[0, v], z.mean().expand(16, 16), atol=1e-5)
@@ -92,8 +96,8 @@ def test_body_depth_is_the_mean_z_of_the_vertices_in_each_view():
 def test_black_and_untrained():
     """The two baselines without geometry have the shapes of the targets."""
     batch = example_batch()
-    assert baseline("black", nothing, None)(batch).image.abs().max() == 0
-    estimate = baseline("untrained", flat_renderer, Standin)(batch)
+    assert named("black", nothing)(batch).image.abs().max() == 0
+    estimate = named("untrained", flat_renderer)(batch)
     assert estimate.image.shape == batch.targets.images.shape
     assert estimate.gaussians == (144, 144)
 
@@ -103,7 +107,15 @@ def test_what_the_data_lacks_is_an_error(name, field):
     """A baseline that the data cannot support is refused, as is an unknown name."""
     batch = dataclasses.replace(example_batch(), **{field: None})
     with pytest.raises(InputError, match=name):
-        baseline(name, nothing, None)(batch)
+        named(name, nothing)(batch)
     with pytest.raises(InputError, match="baselines"):
-        baseline("white", nothing, None)
-    assert set(baselines.BASELINES) == {"black", "nearest_view", "body_depth", "true_depth", "untrained"}
+        named("white", nothing)
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_baseline_predicts_the_targets(name):
+    """Also of another size and number than the inputs, for several subjects."""
+    batch = example_batch(subjects=2, views=3, targets=2)
+    image = named(name, Renderer("cpu") if name != "untrained" else flat_renderer)(batch).image
+    assert image.shape == batch.targets.images.shape
+    assert image.isfinite().all()

@@ -1,43 +1,20 @@
-"""Simple methods that a model must beat, measured on the same targets."""
+"""Baselines that are splats at a depth of each pixel."""
 
 from collections.abc import Callable
-from functools import partial
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, choice
-from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.measure import Estimate, Renderer
 from ghgs_lit.geometry.projection import unproject_maps, world_to_camera
 from ghgs_lit.types import Batch, Gaussians
-
-BASELINES = ("black", "nearest_view", "body_depth", "true_depth", "untrained")
-
-
-def black(batch: Batch) -> Estimate:
-    """A black image: the score of the background alone."""
-    return Estimate(torch.zeros_like(batch.targets.images))
-
-
-def nearest_view(batch: Batch) -> Estimate:
-    """The input photograph whose viewing direction is nearest to that of the target, at its size."""
-    forward = batch.cameras.extrinsics[..., 2, :3]
-    wanted = batch.targets.cameras.extrinsics[..., 2, :3]
-    choice_of_view = torch.einsum("btk,bvk->btv", wanted, forward).argmax(-1)
-    element = torch.arange(len(batch.images), device=batch.images.device)[:, None]
-    images = batch.images[element, choice_of_view]
-    size = batch.targets.images.shape[-2:]
-    if images.shape[-2:] != size:
-        flat = F.interpolate(images.flatten(0, 1), size, mode="bilinear", antialias=True, align_corners=False)
-        images = flat.unflatten(0, images.shape[:2])
-    return Estimate(images)
 
 
 def splats_at(
     batch: Batch, depth: Tensor, valid: Tensor, sigma: float = 0.3, opacity: float = 0.9
 ) -> Gaussians:
-    """Round splats for pixels of the inputs.
+    """Round splats for pixels of the inputs, in the order of the pixels.
 
     Args:
         batch: gives cameras and colours.
@@ -56,10 +33,11 @@ def splats_at(
         opacities=torch.full_like(scale, opacity),
         colors=batch.images.movedim(2, -1)[valid],
         splits=tuple(valid.flatten(1).sum(1).tolist()),
+        image=valid.flatten(0, 1).nonzero()[:, 0],
     )
 
 
-def _body_depth(batch: Batch) -> Tensor:
+def body_depth(batch: Batch) -> Tensor:
     """Mean depth of the body's vertices in each view, as maps [B, V, H, W] in metres."""
     if batch.body_vertices is None:
         raise InputError("baselines: body_depth expects body vertices in the data; found none")
@@ -70,7 +48,8 @@ def _body_depth(batch: Batch) -> Tensor:
     return torch.stack(means)[..., None, None].expand(batch.masks.shape)
 
 
-def _true_depth(batch: Batch) -> Tensor:
+def true_depth(batch: Batch) -> Tensor:
+    """Depth maps [B, V, H, W] of the data, metres."""
     if batch.depths is None:
         raise InputError("baselines: true_depth expects depth maps in the data; found none")
     return batch.depths
@@ -96,27 +75,3 @@ def splatted(
     gaussians = splats_at(batch, depth, valid, sigma, opacity)
     image = renderer(gaussians, batch.targets.cameras).image
     return Estimate(image, depth, valid, gaussians.splits)
-
-
-def baseline(
-    name: str,
-    renderer: Renderer,
-    untrained: Callable[[], torch.nn.Module],
-    sigma: float = 0.3,
-    opacity: float = 0.9,
-) -> Method:
-    """The baseline called ``name``, one of ``BASELINES``.
-
-    Args:
-        name: which one.
-        renderer: draws its splats.
-        untrained: builds a model with random weights, for the baseline ``untrained``.
-        sigma, opacity: of the splats of ``body_depth`` and ``true_depth``, as for :func:`splats_at`.
-    """
-    choice("baselines", name, BASELINES)
-    if name == "untrained":
-        return ModelMethod(untrained().eval(), renderer)
-    if name in ("body_depth", "true_depth"):
-        depth_of = _body_depth if name == "body_depth" else _true_depth
-        return partial(splatted, depth_of=depth_of, renderer=renderer, sigma=sigma, opacity=opacity)
-    return {"black": black, "nearest_view": nearest_view}[name]

@@ -1,0 +1,48 @@
+"""The methods that `ghgs evaluate` and `ghgs benchmark task=peers` measure, as configured."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+from ghgs_lit.cli.inputs import MODEL_NODES, build_renderer
+from ghgs_lit.evaluation.baselines import BASELINES, baseline
+from ghgs_lit.evaluation.measure import Method, ModelMethod
+from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.refinement import Refinement
+from ghgs_lit.weights.checkpoint import read_checkpoint
+
+
+def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
+    """The model of ``config["checkpoint"]``, and facts about it for results.
+
+    Args:
+        config: of the verb; its model is that of the checkpoint. ``refine`` may be missing: none.
+        device: where it runs.
+    """
+    path, renderer = config["checkpoint"], build_renderer(config, device)
+    model = GHGS.from_config(config, empty=STAGES)
+    model.load(path)
+    model.precision = config["precision"]
+    checkpoint = read_checkpoint(path)
+    facts: dict[str, Any] = {
+        "checkpoint_config": checkpoint["config"],
+        "model_config": {node: config[node] for node in MODEL_NODES if node in config},
+        "parameters": {"total": sum(p.numel() for p in model.parameters())},
+    }
+    if "global_step" in checkpoint:
+        facts["training"] = {"steps": checkpoint["global_step"]}
+    refinement = Refinement(config["refine"], renderer) if config.get("refine") else None
+    return ModelMethod(model.to(device).eval(), renderer, refinement), facts
+
+
+def baselines_of(
+    names: str | Sequence[str], config: Mapping[str, Any], device: torch.device
+) -> dict[str, Method]:
+    """The baselines called ``names``, or ``all``; other arguments as for :func:`trained_method`."""
+    names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
+    renderer, options = build_renderer(config, device), (config["splats"], config["per_scene"])
+    return {
+        name: baseline(name, renderer, lambda: GHGS.from_config(config).to(device), *options)
+        for name in names
+    }
