@@ -37,7 +37,7 @@ def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
 
 def _check_shapes(batch: Batch, patch_size: int) -> None:
     require(batch.images.dim() == 5, "batch.images", "[B, V, 3, H, W]", tuple(batch.images.shape))
-    for name, tensor in (("images", batch.images), ("depths", batch.depths)):
+    for name, tensor in (("images", batch.images), ("depths", batch.depths), ("alpha", batch.alpha)):
         floating = tensor is None or tensor.is_floating_point()
         require(floating, f"batch.{name}", "floating-point values", tensor is not None and tensor.dtype)
     require(batch.masks.dtype == torch.bool, "batch.masks", "dtype torch.bool", batch.masks.dtype)
@@ -46,12 +46,10 @@ def _check_shapes(batch: Batch, patch_size: int) -> None:
     divisible = height % patch_size == width % patch_size == 0
     expected = f"sides divisible by the patch size {patch_size} (or model.pad=multiple)"
     require(divisible, "batch.images", expected, (height, width))
-    require(
-        batch.masks.shape == (b, v, height, width),
-        "batch.masks",
-        str((b, v, height, width)),
-        tuple(batch.masks.shape),
-    )
+    for name in ("masks", "alpha"):
+        maps, expected = getattr(batch, name), (b, v, height, width)
+        fits = maps is None or maps.shape == expected
+        require(fits, f"batch.{name}", str(expected), maps is not None and tuple(maps.shape))
     cameras = batch.cameras
     require(cameras.shape == (b, v), "batch.cameras", f"cameras of shape {(b, v)}", tuple(cameras.shape))
     size = (cameras.height, cameras.width)
@@ -70,7 +68,10 @@ def _findings_of_cameras(batch: Batch) -> list[Finding]:
 
 
 def _findings_of_values(batch: Batch) -> list[Finding]:
-    found = [("images", "finite values within [0, 1]", _beyond(batch.images, 1.0))]
+    within = "finite values within [0, 1]"
+    found = [("images", within, _beyond(batch.images, 1.0))]
+    if batch.alpha is not None:
+        found.append(("alpha", within, _beyond(batch.alpha, 1.0)))
     if batch.depths is not None:
         expected = "finite depths of 0 or more metres"
         found.append(("depths", expected, _beyond(batch.depths, torch.finfo().max)))

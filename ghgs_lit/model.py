@@ -16,6 +16,7 @@ from ghgs_lit.config import build
 from ghgs_lit.encoder import FeatureCache, PhotographCache, VGGTEncoder
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.mattes import with_matte
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
@@ -53,6 +54,8 @@ class GHGS(nn.Module):
             size; ``none`` refuses them.
         frame: ``subject`` gives the stages each scene in metres around its subject, whatever the world's
             unit, origin and axes (:mod:`ghgs_lit.geometry.frame`); ``world`` as it is.
+        matte: pixels that show a larger share of the subject become Gaussians, whose colours and opacities
+            know that share (:mod:`ghgs_lit.geometry.mattes`); None: mattes are ignored.
         check_inputs: refuse values that are not finite or out of range (:func:`check_batch`).
         auto: chooses what the encoder sees of each subject (``skip=auto``); None: it does itself.
         rounds: correct the Gaussians; None: those of the Gaussian head are the result. They need bounds.
@@ -68,6 +71,7 @@ class GHGS(nn.Module):
         gaussian_head: GaussianHead,
         pad: str = "none",
         frame: str = "subject",
+        matte: float | None = None,
         check_inputs: bool = True,
         auto: AutoSkip | None = None,
         rounds: Rounds | None = None,
@@ -75,6 +79,7 @@ class GHGS(nn.Module):
         super().__init__()
         choice("model.pad", pad, ("none", "multiple"))
         choice("model.frame", frame, ("subject", "world"))
+        require(matte is None or 0 <= matte <= 0.5, "model.matte", "null or a share of at most a half", matte)
         has_bounds = not isinstance(bounds, NoBounds)
         expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
         found = f"{type(bounds).__name__} with {depth_head.parameterization}"
@@ -89,7 +94,7 @@ class GHGS(nn.Module):
         self.recalibration = recalibration
         self.rounds = rounds
         self.gaussian_head = gaussian_head
-        self.pad, self.frame, self.check_inputs, self.auto = pad, frame, check_inputs, auto
+        self.pad, self.frame, self.matte, self.check_inputs, self.auto = pad, frame, matte, check_inputs, auto
         #: Where features of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | PhotographCache | None = None
         self.precision = "inherit"
@@ -116,6 +121,7 @@ class GHGS(nn.Module):
             InputError: :func:`check_batch` refuses the batch.
         """
         check_batch(batch, self.side_multiple, self.check_inputs)
+        batch = with_matte(batch, self.matte)
         if self.frame == "world":
             return self._predict(batch)
         frame = Frame.of(batch)
@@ -167,7 +173,7 @@ class GHGS(nn.Module):
 
         Args:
             config: with the nodes :data:`STAGES`, and, where they are given, ``skip.choices``, ``model.pad``,
-                ``model.frame`` and ``model.check_inputs``; other keys are ignored.
+                ``model.frame``, ``model.matte`` and ``model.check_inputs``; other keys are ignored.
             empty: stages that are built without storage (on the meta device), for weights to be assigned to.
 
         Raises:
@@ -190,6 +196,7 @@ class GHGS(nn.Module):
             pad=options.get("pad", "none"),
             # Checkpoints from before this option have learned offsets and rotations along the world's axes.
             frame=options.get("frame", "world"),
+            matte=options.get("matte"),
             check_inputs=options.get("check_inputs", True),
             auto=auto_skip(config.get("skip") or {}),
             rounds=stage("rounds", channels=config["gaussian_head"]["channels"])

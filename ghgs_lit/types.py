@@ -132,7 +132,8 @@ class Batch(_TensorStruct):
     """Input photographs of ``B`` subjects, with everything that is known about them.
 
     ``body_vertices`` are points of the body's surface in metres, ``depths`` true z-depths in metres (0 where
-    there is none); both None where the data set has none. ``views`` names the photographs of each subject.
+    there is none), ``alpha`` soft mattes: the share of each pixel that shows the subject, by which its colour
+    is multiplied; None where the data set has none. ``views`` names the photographs of each subject.
     """
 
     images: Float[Tensor, "B V 3 H W"]
@@ -141,6 +142,7 @@ class Batch(_TensorStruct):
     targets: Targets | None = None
     body_vertices: list[Float[Tensor, "_ 3"]] | None = None
     depths: Float[Tensor, "B V H W"] | None = None
+    alpha: Float[Tensor, "B V H W"] | None = None
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
 

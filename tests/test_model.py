@@ -24,7 +24,7 @@ from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.types import Batch, Cameras, DepthBounds, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
-from tests.helpers.scenes import CASES, fixture, hard_subjects, make_batch, stack
+from tests.helpers.scenes import CASES, fixture, hard_subjects, make_batch, stack, with_soft_rims
 
 PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
 
@@ -429,3 +429,53 @@ def test_padding_is_what_a_black_border_does_by_hand():
     torch.testing.assert_close(found.depth, expected.depth[..., 3:-3, 3:-3], rtol=1e-6, atol=0)
     torch.testing.assert_close(found.points.tokens, expected.points.tokens, rtol=0, atol=2e-6)
     assert model(make_batch(1, 3, 56, 70)).depth.shape[-2:] == (56, 70)
+
+
+def test_without_the_option_mattes_are_ignored():
+    """model=paper knows masks alone."""
+    soft = with_soft_rims(make_batch())
+    model = make_model("model=paper").eval()
+    found, expected = (model(b).gaussians for b in (soft, dataclasses.replace(soft, alpha=None)))
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+
+
+@pytest.mark.parametrize("kind", ["hull", "recurrent"])
+def test_pixels_that_show_a_part_of_the_subject_become_gaussians(kind):
+    """With their share in the opacity; skip=exact changes nothing, nor do batch mates."""
+    both = with_soft_rims(make_batch(2, 3))
+    options = (f"model={kind}", "model.matte=0.125")
+    model = make_model(*options).eval()
+    prediction = model(both)
+    shown = (both.alpha > 0.125).flatten(0, 1).flatten(1)
+    gaussians = prediction.gaussians
+    assert torch.equal(torch.stack((gaussians.image, gaussians.pixel), 1), shown.nonzero())
+    assert (gaussians.opacities <= both.alpha.flatten(0, 1).flatten(1)[shown]).all()
+    assert prediction.depth_valid.sum() == shown.sum() > both.masks.sum()
+    close(gaussians, make_model(*options, "skip=none").eval()(both).gaussians, 2e-5)
+    part = slice(1, 2)
+    alone = dataclasses.replace(
+        both,
+        images=both.images[part],
+        masks=both.masks[part],
+        alpha=both.alpha[part],
+        cameras=both.cameras[part],
+        depths=None,
+    )
+    close(model(alone).gaussians, gaussians[1], 2e-5)
+
+
+def test_photographs_of_any_size_keep_their_mattes():
+    """The black border of model.pad=multiple is no part of the subject."""
+    soft = with_soft_rims(make_batch(1, 2, 50, 60))
+    gaussians = make_model("model=hull", "model.matte=0.125", "model.pad=multiple").eval()(soft).gaussians
+    shown = (soft.alpha > 0.125).flatten(0, 1).flatten(1)
+    assert torch.equal(torch.stack((gaussians.image, gaussians.pixel), 1), shown.nonzero())
+
+
+def test_an_impossible_matte_is_refused():
+    """More than a half would leave pixels of the mask without Gaussians."""
+    with pytest.raises(
+        InputError, match=r"model\.matte: expected null or a share of at most a half; found 0\.7"
+    ):
+        make_model("model=hull", "model.matte=0.7")

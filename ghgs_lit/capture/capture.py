@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ghgs_lit.data.resampling import area_image, area_mask
+from ghgs_lit.data.resampling import area_image
 from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras
 
@@ -22,16 +22,21 @@ class Photograph:
     Attributes:
         name: of its camera.
         image: [h, w, 3] uint8, RGB.
-        mask: [h, w] bool, true on the subject.
+        matte: [h, w] uint8, 255 times the share of each pixel that shows the subject.
         intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
         extrinsics: [4, 4] float64, world to camera, OpenCV axes, in the user's unit.
     """
 
     name: str
     image: np.ndarray
-    mask: np.ndarray
+    matte: np.ndarray
     intrinsics: np.ndarray
     extrinsics: np.ndarray
+
+    @property
+    def mask(self) -> np.ndarray:
+        """[h, w] bool, true where the subject fills half of a pixel or more."""
+        return self.matte > 127
 
 
 @dataclass(frozen=True)
@@ -74,15 +79,18 @@ class Capture:
             size: (height, width) of the crops in pixels.
         """
         crops = [crop_to_subject(photograph, size) for photograph in self.photographs]
-        images = torch.from_numpy(np.stack([crop.image * crop.mask[..., None] for crop in crops]))
+        images, mattes = (
+            torch.from_numpy(np.stack([getattr(crop, name) for crop in crops])) for name in ("image", "matte")
+        )
         cameras = (
             torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
             for name in ("intrinsics", "extrinsics")
         )
         return Batch(
             images=images.permute(0, 3, 1, 2)[None].float() / 255,
-            masks=torch.from_numpy(np.stack([crop.mask for crop in crops]))[None],
+            masks=mattes[None] > 127,
             cameras=Cameras(*cameras, *size),
+            alpha=mattes[None].float() / 255,
             subjects=(self.name,),
             views=(tuple(crop.name for crop in crops),),
         )
@@ -91,8 +99,9 @@ class Capture:
 def crop_to_subject(photograph: Photograph, size: tuple[int, int]) -> Photograph:
     """The subject in the middle of an image of ``size`` (height, width); its camera is that of the crop.
 
-    Beyond the photograph the crop is black. Where the subject is cut by the photograph's border the crop ends
-    there, too: black beside it would say that the subject ends.
+    Beyond the photograph and beside the subject the crop is black. A large photograph's sharp mask becomes a
+    soft matte. Where the subject is cut by the photograph's border the crop ends there, too: black beside it
+    would say that the subject ends.
     """
     rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
     extents = [(int(found[0]), int(found[-1]) + 1) for found in (rows, columns)]
@@ -106,10 +115,13 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int]) -> Photograph
     intrinsics = photograph.intrinsics.copy()
     intrinsics[:2, 2] -= [left, top]
     intrinsics[:2] *= factors[:, None]
+    image, matte = _cut(photograph.image, spans), _cut(photograph.matte, spans)
+    # Before it is made smaller: the background has no part in the pixels of the rim.
+    premultiplied = np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
     return replace(
         photograph,
-        image=area_image(_cut(photograph.image, spans), *size),
-        mask=area_mask(_cut(photograph.mask, spans), *size),
+        image=area_image(premultiplied, *size),
+        matte=area_image(matte, *size),
         intrinsics=intrinsics,
     )
 

@@ -128,14 +128,14 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
 def small_views(folder: CaptureFolder, instant: str) -> tuple[View, ...]:
     """The photographs of an instant at a size at which many meanings can be tried."""
     found = []
-    for name, (camera, pixels, mask) in zip(folder.paths[instant], folder.decode(instant), strict=True):
+    for name, (camera, pixels, matte) in zip(folder.paths[instant], folder.decode(instant), strict=True):
         height, width = pixels.size
         scale = min(_SIDE / max(height, width), 1)
         size = max(round(height * scale), 1), max(round(width * scale), 1)
         # Without a stored size the intrinsics are for the whole photograph.
         known = camera.size or pixels.stored_size
         small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
-        mask = area_mask(np.ascontiguousarray(mask), *size)
+        mask = area_mask(np.ascontiguousarray(matte > 127), *size)
         found.append(View(name, replace(camera, size=known), small, mask, folder.convention))
     return tuple(found)
 
@@ -146,7 +146,8 @@ def silhouettes_of(folder: CaptureFolder, views: Sequence[View]) -> list[Silhoue
     Raises:
         InputError: it has the photographs in another ratio of height and width.
     """
-    found = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention) for v in views]
+    white = np.uint8(255)
+    found = [folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in views]
     return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in found]
 
 

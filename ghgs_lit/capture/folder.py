@@ -12,7 +12,7 @@ import torch
 from ghgs_lit.capture.calibration import Calibration, Convention, StoredCamera, calibrate, quarter_turned
 from ghgs_lit.capture.capture import Capture, Photograph
 from ghgs_lit.capture.formats import CameraFile, read_cameras
-from ghgs_lit.capture.masks import mask_of_background, mask_of_file, mask_path, segmenter
+from ghgs_lit.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.capture.photographs import Pixels, find_instants, fits_stored, image_named, read_pixels
 from ghgs_lit.data.silhouettes import implausible
 from ghgs_lit.errors import InputError, choice, require
@@ -95,53 +95,53 @@ class CaptureFolder:
         return Capture(instant, tuple(self.photograph(name, *view, self.convention) for name, view in views))
 
     def decode(self, instant: str) -> list[tuple[StoredCamera, Pixels, np.ndarray]]:
-        """Camera, photograph and mask as shown of each view, before the calibration is applied."""
+        """Camera, photograph and matte as shown of each view, before the calibration is applied."""
         found = []
         for name, path in self.paths[instant].items():
             camera, pixels = self.file.cameras[name], read_pixels(path)
-            mask = self._mask(name, camera, path, pixels)
-            problem = implausible(mask)
+            matte = self._matte(name, camera, path, pixels)
+            problem = implausible(matte > 127)
             if problem is not None:
                 raise InputError(f"{path}: {problem}")
-            found.append((camera, pixels, mask))
+            found.append((camera, pixels, matte))
         return found
 
     def photograph(
-        self, name: str, camera: StoredCamera, pixels: Pixels, mask: np.ndarray, convention: Convention
+        self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
     ) -> Photograph:
         """One view without distortion and upright, as a convention has it."""
         image, turns = pixels.image, 0
         if fits_stored(pixels, camera, self._said("exif", "auto")):
             turns = pixels.turns
-            image, mask = np.rot90(image, -turns), np.rot90(mask, -turns)
+            image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
         size = image.shape[:2]
         calibration = calibrate(camera, convention, size)
         if calibration.distortion.any():
-            image, mask = undistort(image, mask, _grid(_key(calibration), *size))
+            image, matte = undistort(image, matte, _grid(_key(calibration), *size))
         calibration = quarter_turned(calibration, turns, size)
-        image, mask = np.rot90(image, turns), np.rot90(mask, turns)
-        return Photograph(name, image, mask, calibration.intrinsics, calibration.extrinsics)
+        image, matte = np.rot90(image, turns), np.rot90(matte, turns)
+        return Photograph(name, image, matte, calibration.intrinsics, calibration.extrinsics)
 
-    def _mask(self, name: str, camera: StoredCamera, path: Path, pixels: Pixels) -> np.ndarray:
-        """The mask [h, w] as the photograph is shown, of the first source that there is."""
+    def _matte(self, name: str, camera: StoredCamera, path: Path, pixels: Pixels) -> np.ndarray:
+        """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
         images = Path(self.images).expanduser()
         if self.masks is not None:
             found = mask_path(path, images, Path(self.masks).expanduser())
             require(found is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
-            return mask_of_file(found, pixels)
+            return matte_of_file(found, pixels)
         if self.backgrounds is not None:
             background = image_named(Path(self.backgrounds).expanduser(), name)
             expected = f"a photograph {name} without the subject"
             require(background is not None, f"{self.backgrounds}", expected, "none")
-            return mask_of_background(pixels, background)
+            return matte_of_background(pixels, background)
         if self.segment is not None:
             return _segmenter(self.segment)(pixels)
         beside = mask_path(path, images, images)
         named = beside if beside is not None else camera.mask
         if named is not None:
-            return mask_of_file(named, pixels)
+            return matte_of_file(named, pixels)
         if pixels.alpha is not None:
-            return pixels.alpha > 127
+            return pixels.alpha
         raise InputError(
             f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
             f" segment=rembg, {path.stem}_mask.png beside the photograph, or an alpha channel; found none"

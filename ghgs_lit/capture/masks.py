@@ -1,4 +1,7 @@
-"""The subject's mask in a photograph: from a file, alpha, a photograph of the background, or rembg."""
+"""The subject's matte in a photograph: from a file, alpha, a photograph of the background, or rembg.
+
+A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; of a mask 0 and 255.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,8 +24,8 @@ _DEVIATIONS, _LEAST_DIFFERENCE = 6.0, 12.0
 _SPECK = 0.05
 
 
-def mask_of_file(path: Path, pixels: Pixels) -> np.ndarray:
-    """[h, w] bool of the photograph as shown, from labels (any but 0) or from values of 0 to 255 (above 127).
+def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
+    """The matte of the photograph as shown, from labels (any but 0), or from grey of 8 or 16 bits.
 
     Raises:
         InputError: it cannot be decoded, or fits the photograph neither as shown nor as stored.
@@ -35,11 +38,14 @@ def mask_of_file(path: Path, pixels: Pixels) -> np.ndarray:
         fits = values.shape == pixels.stored_size
         require(fits, str(path), f"the size of its photograph, {pixels.size} (height, width)", values.shape)
         values = np.rot90(values, pixels.turns)
-    return values > (127 if values.max(initial=0) >= _LABELS else 0)
+    most = int(values.max(initial=0))
+    if most < _LABELS:
+        return (values > 0) * np.uint8(255)
+    return np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8)
 
 
-def mask_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """[h, w] bool: where a photograph differs from one without the subject, without specks and holes.
+def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
+    """A mask: where a photograph differs from one without the subject, without specks and holes.
 
     Raises:
         InputError: the background's photograph has another size, or nothing differs.
@@ -58,11 +64,11 @@ def mask_of_background(pixels: Pixels, path: Path) -> np.ndarray:
     subject = (areas >= _SPECK * areas.max())[regions]
     radius *= 2
     closed = ndimage.binary_closing(np.pad(subject, radius), iterations=radius)
-    return ndimage.binary_fill_holes(closed[radius:-radius, radius:-radius])
+    return ndimage.binary_fill_holes(closed[radius:-radius, radius:-radius]) * np.uint8(255)
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from a photograph to its mask [h, w] bool.
+    """A function from a photograph to its matte.
 
     Args:
         name: one of :data:`SEGMENTERS`.
@@ -79,11 +85,11 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
         ) from None
     session = rembg.new_session()
 
-    def mask(pixels: Pixels) -> np.ndarray:
+    def matte(pixels: Pixels) -> np.ndarray:
         alpha = rembg.remove(Image.fromarray(pixels.image), session=session, only_mask=True)
-        return np.asarray(alpha.convert("L")) > 127
+        return np.asarray(alpha.convert("L"))
 
-    return mask
+    return matte
 
 
 def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:

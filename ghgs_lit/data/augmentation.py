@@ -97,7 +97,7 @@ class Augmentation:
             rngs: random numbers of each element. Whether one thing varies changes nothing about another.
         """
         streams = [rng.spawn(3) for rng in rngs]
-        images, masks, cameras = batch.images, batch.masks, batch.cameras
+        images, masks, cameras, alpha = batch.images, batch.masks, batch.cameras, batch.alpha
         if self.exposure or self.white_balance:
             views = masks.shape[1]
             gains = [color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
@@ -113,7 +113,9 @@ class Augmentation:
         if self.mask_offset or self.mask_ragged or self.mask_hole:
             masks = torch.stack([self._masks(masks[b], s[2]) for b, s in enumerate(streams)])
             images = images * masks[:, :, None]
-        return dataclasses.replace(batch, images=images, masks=masks, cameras=cameras)
+            if alpha is not None:  # what a segmentation takes for the subject it takes for all of a pixel
+                alpha = torch.where(masks > batch.masks, 1, alpha * masks)
+        return dataclasses.replace(batch, images=images, masks=masks, cameras=cameras, alpha=alpha)
 
     def _masks(self, masks: Tensor, rng: np.random.Generator) -> Tensor:
         limits = (self.mask_offset, self.mask_ragged, self.mask_hole, self.mask_hole_chance)

@@ -89,7 +89,6 @@ class BatchBuilder:
         """
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
         depths = [[view.depth for view in row] for row in inputs]
-        known = all(depth is not None for row in depths for depth in row)
         bodies = [self._body(s.subject) for s in specs]
         return Batch(
             images=self._images(inputs),
@@ -97,7 +96,8 @@ class BatchBuilder:
             cameras=_cameras(inputs),
             targets=self._targets(specs, target_size) if specs[0].targets else None,
             body_vertices=None if any(body is None for body in bodies) else bodies,
-            depths=_stack(depths) if known else None,
+            depths=_stack_known(depths),
+            alpha=self._alpha(inputs),
             subjects=tuple(s.subject for s in specs),
             views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
         )
@@ -118,6 +118,12 @@ class BatchBuilder:
             images = images * _stack([[view.mask for view in row] for row in views])[..., None]
         return images.permute(0, 1, 4, 2, 3).float() / 255
 
+    def _alpha(self, views: list[list[View]]) -> Tensor | None:
+        alpha = _stack_known([[view.alpha for view in row] for row in views])
+        if alpha is None or not self.apply_mask:
+            return alpha
+        return alpha * _stack([[view.mask for view in row] for row in views])
+
     def _body(self, name: str) -> Tensor | None:
         vertices = self.inputs.body(name)
         if vertices is None:
@@ -136,6 +142,11 @@ def _views(
 
 def _stack(arrays: list[list[np.ndarray]]) -> Tensor:
     return torch.from_numpy(np.stack([np.stack(row) for row in arrays]))
+
+
+def _stack_known(arrays: list[list[np.ndarray | None]]) -> Tensor | None:
+    """None where one is not known."""
+    return None if any(array is None for row in arrays for array in row) else _stack(arrays)
 
 
 def _cameras(views: list[list[View]]) -> Cameras:

@@ -178,6 +178,8 @@ def check_view(place: Path | str, view: View) -> None:
     arrays = {"image": (view.image, (*size, 3), np.uint8), "mask": (view.mask, size, np.bool_)}
     if view.inverse_depth is not None:
         arrays["inverse_depth"] = (view.inverse_depth, size, np.uint16)
+    if view.matte is not None:
+        arrays["matte"] = (view.matte, size, np.uint8)
     for name, (array, shape, dtype) in arrays.items():
         if len(size) != 2 or np.shape(array) != shape or getattr(array, "dtype", None) != dtype:
             expected = f"{dtype.__name__} of {'x'.join(map(str, shape))}"

@@ -4,6 +4,8 @@
 
     img/<id>_<position:03d>/<view>.jpg             photograph on black (.png is read too)
     mask/<id>_<position:03d>/<view>.png            subject where channel 0 is above half of its maximum
+    alpha/<id>_<position:03d>/<view>.png           optional; 8 bits, the share of each pixel that shows the
+                                                   subject, by which the photograph is premultiplied
     depth/<id>_<position:03d>/<view>.png           optional; uint16, 2^15 / z, 0 where there is none
     parm/<id>_<position:03d>/<view>_intrinsic.npy  3 x 3 in pixels of the stored image
     parm/<id>_<position:03d>/<view>_extrinsic.npy  3 x 4 or 4 x 4, world to camera, metres, OpenCV axes
@@ -183,6 +185,11 @@ class Layout(Reader):
                     f"{path}: expected 16 bits of inverse depth; found {inverse.min()} to {inverse.max()}"
                 )
             inverse = inverse.astype(np.uint16)
+        path, matte = self._folder(name, "alpha", position) / f"{view}.png", None
+        if path.exists():
+            matte = read_map(path, size)
+            if matte.dtype != np.uint8:
+                raise InputError(f"{path}: expected 8 bits of grey; found {matte.dtype}")
         intrinsics, extrinsics = _read_camera(self._folder(name, "parm", position), view)
         intrinsics[:2, 2] += self._shift
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
@@ -192,6 +199,7 @@ class Layout(Reader):
             inverse_depth=inverse,
             intrinsics=intrinsics.astype(np.float32),
             extrinsics=extrinsics.astype(np.float32),
+            matte=matte,
         )
 
     def _folder(self, name: str, kind: str, position: int) -> Path:

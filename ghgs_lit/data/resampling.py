@@ -16,7 +16,7 @@ _SAME_SURFACE = 0.02
 
 
 def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width, 3] uint8: the mean over the area of each new pixel; bicubic when it grows."""
+    """[height, width, ...] uint8: the mean over the area of each new pixel; bicubic when it grows."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image
@@ -24,7 +24,8 @@ def area_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
         return release_image(image, height, width)
     if h % height == w % width == 0:  # a quarter of the time of the general case
         return np.asarray(Image.fromarray(image).reduce((w // width, h // height)))
-    return np.floor(_area_means(image, height, width) + 0.5).astype(np.uint8)
+    means = _area_means(image.reshape(h, w, -1), height, width).reshape(height, width, *image.shape[2:])
+    return np.floor(means + 0.5).astype(np.uint8)
 
 
 def area_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -58,7 +59,7 @@ def centered_depth(inverse: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def release_image(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """[height, width, 3] uint8 by Pillow's bicubic filter."""
+    """[height, width, ...] uint8 by Pillow's bicubic filter."""
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BICUBIC))
 
 

@@ -21,6 +21,8 @@ class View:
         inverse_depth: [h, w] uint16, 2^15 / metres, 0 where unknown; or None.
         intrinsics: [3, 3] float32 in pixels, pixel centres at +0.5.
         extrinsics: [4, 4] float32, world to camera, metres, OpenCV axes.
+        matte: [h, w] uint8, 255 times the share of each pixel that shows the subject, by which the image is
+            premultiplied; or None.
     """
 
     image: np.ndarray
@@ -28,6 +30,7 @@ class View:
     inverse_depth: np.ndarray | None
     intrinsics: np.ndarray
     extrinsics: np.ndarray
+    matte: np.ndarray | None = None
 
     @property
     def depth(self) -> np.ndarray | None:
@@ -39,7 +42,13 @@ class View:
 
     @property
     def nbytes(self) -> int:
-        return self.image.nbytes + self.mask.nbytes + getattr(self.inverse_depth, "nbytes", 0) + 1024
+        maps = (self.image, self.mask, self.inverse_depth, self.matte)
+        return sum(map_.nbytes for map_ in maps if map_ is not None) + 1024
+
+    @property
+    def alpha(self) -> np.ndarray | None:
+        """The matte [h, w] float32 in [0, 1]."""
+        return None if self.matte is None else self.matte.astype(np.float32) / 255
 
 
 def encode_depth(depth: np.ndarray) -> np.ndarray:
@@ -74,8 +83,9 @@ def resize_view(view: View, height: int, width: int, resampling: str = "area") -
         view: the photograph.
         height, width: the new size in pixels.
         resampling: one of :data:`RESAMPLINGS`. ``area`` keeps everything at its place; ``release`` resizes
-            photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Depth is
-            that at the centres of the mask's new pixels in both.
+            photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Mattes are resized
+            as photographs, and the mask is where the subject fills half of a pixel or more. Depth is that at
+            the centres of the subject's new pixels in both.
     """
     h, w = view.mask.shape
     if (h, w) == (height, width):
@@ -84,11 +94,17 @@ def resize_view(view: View, height: int, width: int, resampling: str = "area") -
     intrinsics[:2] *= np.array([[width / w], [height / h]])
     resize = {"area": (area_image, area_mask), "release": (release_image, release_mask)}
     image, mask = resize[resampling]
-    inverse, subject = view.inverse_depth, mask(view.mask, height, width)
+    inverse, matte = view.inverse_depth, view.matte
+    if matte is None:
+        shown = subject = mask(view.mask, height, width)
+    else:
+        matte = image(matte, height, width)
+        shown, subject = matte > 0, matte >= 128
     return replace(
         view,
         image=image(view.image, height, width),
         mask=subject,
-        inverse_depth=None if inverse is None else centered_depth(inverse, height, width) * subject,
+        inverse_depth=None if inverse is None else centered_depth(inverse, height, width) * shown,
         intrinsics=intrinsics.astype(np.float32),
+        matte=matte,
     )

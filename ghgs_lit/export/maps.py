@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from plyfile import PlyData, PlyElement
@@ -72,14 +73,16 @@ def write_points(scene: Scene, directory: Path) -> list[Path]:
 
 
 def write_inputs(scene: Scene, directory: Path) -> list[Path]:
-    """``inputs/<view>.png``, what the model saw with its mask as alpha, and ``cameras.json``.
+    """``inputs/<view>.png``, what the model saw with its matte or mask as alpha, and ``cameras.json``.
 
     Both are what ``ghgs predict images=inputs cameras=cameras.json`` reads.
     """
     paths = [directory / "inputs" / f"{file_name(view)}.png" for view in scene.views]
-    for path, image, mask in zip(paths, scene.images, scene.masks, strict=True):
-        alpha = mask.cpu().numpy()[..., None].astype(np.uint8) * 255
-        picture = Image.fromarray(np.concatenate([to_uint8(image), alpha], -1))
+    for path, image, matte in zip(paths, scene.images, scene.mattes, strict=True):
+        # Colours of a PNG are not premultiplied.
+        colors = to_uint8(image / torch.where(matte > 0, matte, 1))
+        alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
+        picture = Image.fromarray(np.concatenate([colors, alpha], -1))
         write_atomically(path, lambda p, image=picture: image.save(p, format="PNG"))
     cameras = {
         path.stem: {

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.export.world import AXES, rotate_world, turn
+from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
@@ -74,6 +75,7 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
 class Scene:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
 
+    ``images`` are premultiplied by ``mattes``, which are the masks where there are none.
     ``points`` are the unprojected pixels of the subject with their ``colors``; ``dropped`` counts Gaussians
     that are not finite, which no renderer draws and no file holds.
     """
@@ -85,6 +87,7 @@ class Scene:
     cameras: Cameras
     images: Float[Tensor, "V 3 H W"]
     masks: Bool[Tensor, "V H W"]
+    mattes: Float[Tensor, "V H W"]
     depth: Float[Tensor, "V H W"]
     depth_valid: Bool[Tensor, "V H W"]
     points: Float[Tensor, "n 3"]
@@ -144,10 +147,11 @@ def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: 
         cameras=cameras,
         images=batch.images[0],
         masks=batch.masks[0],
+        mattes=coverage(batch)[0],
         depth=depth,
         depth_valid=valid,
         points=unproject_maps(depth, cameras)[valid],
-        colors=batch.images[0].movedim(1, -1)[valid],
+        colors=surface_colors(batch)[0].movedim(1, -1)[valid],
         up=up,
         renderer=renderer,
         options=options,

@@ -45,6 +45,7 @@ class Padding:
             images=self.pad(batch.images.movedim(2, -1)).movedim(-1, 2),
             masks=self.pad(batch.masks, False),
             depths=None if batch.depths is None else self.pad(batch.depths),
+            alpha=None if batch.alpha is None else self.pad(batch.alpha),
             cameras=batch.cameras.cropped(self.top, self.left, self.height, self.width),
         )
 

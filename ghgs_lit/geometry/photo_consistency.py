@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry import cpu
+from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.kernels.parts import even_parts
@@ -67,7 +68,7 @@ def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V 
 def _views(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """What does not depend on depths: smooth colours, relations of the views, and which are compared."""
     turn, shift, facing = _relations(batch.cameras)
-    colors = _smooth(batch.images.to(at_least_float32(batch.images).dtype), batch.masks)
+    colors = _smooth(batch.once(surface_colors), batch.masks)
     return colors, turn, shift, ~(facing < WIDEST)
 
 

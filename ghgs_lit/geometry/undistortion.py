@@ -46,16 +46,16 @@ def undistorting_grid(
     return dense.permute(0, 2, 3, 1)
 
 
-def undistort(image: np.ndarray, mask: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Resample bilinearly; black and empty outside the photograph.
 
     Args:
         image: [h, w, 3] uint8.
-        mask: [h, w] bool; pixels that are more than half covered stay in the mask.
+        matte: [h, w] uint8; of a mask 0 and 255.
         grid: from :func:`undistorting_grid`.
     """
-    layers = np.concatenate((image, 255 * mask[..., None].astype(np.uint8)), -1)
+    layers = np.concatenate((image, matte[..., None]), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()
     sampled = F.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    sampled = sampled[0].permute(1, 2, 0).numpy()
-    return np.round(sampled[..., :3]).astype(np.uint8), sampled[..., 3] > 127.5
+    sampled = np.round(sampled[0].permute(1, 2, 0).numpy()).astype(np.uint8)
+    return sampled[..., :3], sampled[..., 3]

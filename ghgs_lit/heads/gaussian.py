@@ -12,13 +12,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.errors import choice, require
+from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
+from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
+from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.precision import without_float16
@@ -95,6 +98,10 @@ class FootprintAttributes:
             resolution.
         scale_cap: largest scale in footprints.
         scale_start: scale in footprints at which training starts.
+        thickness_start: the same of the third axis (None: as the others).
+        inward: distance in footprints along the third axis to which training starts moving the splats: with
+            axes of the surface, away from the camera. What a splat covers beside its pixel then ends at the
+            silhouette.
         opacity_floor: least opacity: below 1/255 a splat has no gradient left.
         opacity_start: opacity at which training starts.
     """
@@ -105,18 +112,19 @@ class FootprintAttributes:
         scale_floor: float = 0.15,
         scale_cap: float = 4.0,
         scale_start: float = 0.3,
+        thickness_start: float | None = None,
+        inward: float = 0.0,
         opacity_floor: float = 0.1,
         opacity_start: float = 0.9,
     ):
         key = "gaussian_head.attributes"
         require(offset_limit >= 0, f"{key}.offset_limit", "0 or more metres", offset_limit)
-        rising = 0 < scale_floor < scale_start < scale_cap
-        require(
-            rising,
-            f"{key}.scale_start",
-            "0 < scale_floor < scale_start < scale_cap",
-            (scale_floor, scale_start, scale_cap),
-        )
+        starts = {"scale_start": scale_start, "thickness_start": thickness_start or scale_start}
+        for name, start in starts.items():
+            expected = f"0 < scale_floor < {name} < scale_cap"
+            found = (scale_floor, start, scale_cap)
+            require(0 < scale_floor < start < scale_cap, f"{key}.{name}", expected, found)
+        require(inward >= 0, f"{key}.inward", "0 or more footprints", inward)
         require(
             0 <= opacity_floor < opacity_start < 1,
             f"{key}.opacity_start",
@@ -125,7 +133,10 @@ class FootprintAttributes:
         )
         self.offset_limit, self.scale_floor, self.opacity_floor = offset_limit, scale_floor, opacity_floor
         self.scale_range = log(scale_cap / scale_floor)
-        self.scale_bias = _logit(log(scale_start / scale_floor) / self.scale_range)
+        self.scale_bias, self.thickness_bias = (
+            _logit(log(start / scale_floor) / self.scale_range) for start in starts.values()
+        )
+        self.inward = inward
         self.opacity_bias = _logit((opacity_start - opacity_floor) / (1 - opacity_floor))
 
     def __call__(
@@ -137,10 +148,11 @@ class FootprintAttributes:
         footprint: Float[Tensor, " N"],
     ) -> Attributes:
         identity = F.pad(rotation.new_ones(1), (0, 3))
-        scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale + self.scale_bias))
+        scale = torch.cat((scale[:, :2] + self.scale_bias, scale[:, 2:] + self.thickness_bias), 1)
+        scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale))
         shown = bounded_sigmoid(opacity + self.opacity_bias)
         return (
-            self.offset_limit * bounded_tanh(offset),
+            self.offset_limit * bounded_tanh(offset) + F.pad(self.inward * footprint[:, None], (2, 0)),
             footprint[:, None] * scale,
             unit(identity + rotation, _SHORTEST),
             self.opacity_floor + (1 - self.opacity_floor) * shown,
@@ -172,6 +184,8 @@ class GaussianHead(nn.Module):
         parameterization: ``footprint`` (:class:`FootprintAttributes`, raw values start at 0) or
             ``release`` (:func:`release_attributes`, PyTorch's initialisation).
         attributes: options of :class:`FootprintAttributes`.
+        axes: of offsets, scales and rotations: those of the ``world``, or of the ``surface`` around each
+            pixel's depth (:func:`surface_axes`), which look alike from every camera.
         pixels: ``subject`` decodes windows around the subject and runs the four networks on its pixels,
             ``all`` computes every pixel and selects afterwards; the Gaussians are the same.
         guide: let the dense head see photographs, masks and depths at full resolution.
@@ -190,6 +204,7 @@ class GaussianHead(nn.Module):
         hidden: Sequence[int] = (128, 32),
         parameterization: str = "footprint",
         attributes: Mapping | None = None,
+        axes: str = "world",
         pixels: str = "subject",
         guide: bool = False,
         photo_consistency: bool = False,
@@ -200,12 +215,13 @@ class GaussianHead(nn.Module):
         super().__init__()
         choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
         choice("gaussian_head.pixels", pixels, ("subject", "all"))
+        choice("gaussian_head.axes", axes, ("world", "surface"))
         require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
         allowed = guide or not photo_consistency
         require(allowed, "gaussian_head.photo_consistency", "false where there is no guide", True)
         require(low_pass >= 0, "gaussian_head.low_pass", "0 or more", low_pass)
         require(color_limit >= 0, "gaussian_head.color_limit", "0 or more", color_limit)
-        self.pixels = pixels
+        self.pixels, self.axes = pixels, axes
         self.low_pass, self.antialiased = low_pass, antialiased
         self.photo_consistency, self.color_limit = photo_consistency, color_limit
         guided = PHOTO_CHANNELS + 1 + photo_consistency if guide else 0
@@ -264,7 +280,13 @@ class GaussianHead(nn.Module):
         offset, scales, quaternions, opacities = self.attributes(
             raw.offset, raw.scale, raw.rotation, raw.opacity, footprint
         )
-        colors = at_least_float32(batch.images).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
+        if self.axes == "surface":
+            axes = surface_axes(depth_maps, batch.cameras, image, pixel)
+            offset = (quaternion_to_matrix(axes) * offset[:, None]).sum(-1)
+            quaternions = multiply_quaternions(axes, quaternions)
+        if batch.alpha is not None:
+            opacities = opacities * batch.alpha.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
+        colors = batch.once(surface_colors).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
         return Gaussians(
             means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
             quaternions=quaternions,

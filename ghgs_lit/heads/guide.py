@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.window import Window
 from ghgs_lit.types import Batch
@@ -23,10 +24,9 @@ Guide = tuple[Float[Tensor, "n _ H W"], ...]
 
 
 def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
-    """Photographs, masks and further ``maps`` of all images."""
+    """Photographs, masks (mattes where there are some) and further ``maps`` of all images."""
     images = at_least_float32(batch.images)
-    masks = batch.masks.to(images.dtype)[:, :, None]
-    return tuple(part.flatten(0, 1) for part in (images, masks, *maps))
+    return tuple(part.flatten(0, 1) for part in (images, coverage(batch)[:, :, None], *maps))
 
 
 class GuidePyramid(nn.Module):

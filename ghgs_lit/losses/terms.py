@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.chamfer import chamfer as chamfer_distance
+from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import ssim
 from ghgs_lit.types import Batch, Prediction, Rendering
@@ -72,7 +73,7 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
     """
     if batch.depths is None:
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")
-    used = batch.masks & prediction.depth_valid & (batch.depths > 0)
+    used = (coverage(batch) > 0) & prediction.depth_valid & (batch.depths > 0)
     truth = torch.where(used, batch.depths, 1)
     rounds = prediction.rounds or (prediction.depth_maps,)
     errors = [(torch.where(used, at_least_float32(maps.depth), truth) - truth).abs() for maps in rounds]

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
+from ghgs_lit.geometry.mattes import coverage
+from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
@@ -153,8 +154,9 @@ class Refinement:
 def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
     """Photographs on black, masks and cameras of some views."""
     views = list(views)
-    masks = batch.masks[:, views, None].to(at_least_float32(batch.images).dtype)
-    return batch.images[:, views] * masks, masks, batch.cameras[:, views]
+    images, shown = batch.images[:, views], coverage(batch)[:, views, None]
+    # With a matte they are on black already.
+    return images if batch.alpha is not None else images * shown, shown, batch.cameras[:, views]
 
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:

@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.rendering import render
@@ -35,8 +36,8 @@ def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[
     element, cameras = gaussians.image // views, batch.cameras
     means = gaussians.means[:, None].expand(-1, views, -1)
     pixels, z = project(means, cameras.intrinsics[element], cameras.extrinsics[element])
-    photo, mask = at_least_float32(batch.images), batch.masks[:, :, None]
-    maps = (photo, photo - rendering.image, mask.to(photo), rendering.alpha, rendering.depth)
+    photo, mask = at_least_float32(batch.images), coverage(batch)[:, :, None]
+    maps = (photo, photo - rendering.image, mask, rendering.alpha, rendering.depth)
     image = element[:, None] * views + torch.arange(views, device=element.device)
     # A colour that is not finite would reach other elements.
     found = sample(torch.cat(maps, 2).flatten(0, 1).nan_to_num(), image, pixels)

@@ -38,7 +38,7 @@ from ghgs_lit.synthesis.writing import write_body, write_view
 
 _GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: increase it when photographs of the same settings would change.
-RENDER_VERSION = 1
+RENDER_VERSION = 2
 
 
 class Source(Protocol):
@@ -143,6 +143,7 @@ def render_subject(job: _Job) -> _Job:
                 inverse_depth=encode_depth(photographs.depths[n]),
                 intrinsics=cameras.intrinsics[n].numpy(),
                 extrinsics=cameras.extrinsics[n].numpy(),
+                matte=np.round(photographs.alphas[n] * 255).astype(np.uint8),
             )
             folder = position_name(job.name, position)
             write_view(job.workspace, folder, number, view, job.settings.quality)

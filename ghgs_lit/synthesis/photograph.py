@@ -1,13 +1,14 @@
-"""Photographs of textured meshes: image, mask and metric depth from pinhole cameras.
+"""Photographs of textured meshes: image, matte, mask and metric depth from pinhole cameras.
 
 Embree casts ``samples`` x ``samples`` rays on a regular grid through each pixel of the window in which the
 subject lies. Conventions: see :mod:`ghgs_lit.types`.
 
 * image: the mean colour of the samples; samples that miss are black, so silhouettes are antialiased and
   premultiplied by their coverage (like an alpha-blended splat on black);
-* mask: at least half of the samples of a pixel hit the subject;
-* depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd), 0 outside
-  the mask. Samples are never averaged, so that no depth lies between two surfaces.
+* matte: the share of a pixel's samples that hit the subject;
+* mask: at least half of them do;
+* depth: z of the hit nearest to the pixel's centre (at the centre itself when ``samples`` is odd), 0 where
+  there is none. Samples are never averaged, so that no depth lies between two surfaces.
 """
 
 from dataclasses import dataclass
@@ -106,14 +107,19 @@ class Photographs:
     """Photographs from n cameras.
 
     Attributes:
-        images: [n, h, w, 3] float32 in [0, 1].
-        masks: [n, h, w] bool.
-        depths: [n, h, w] float32, metres, 0 outside the mask.
+        images: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
+        alphas: [n, h, w] float32 in [0, 1].
+        depths: [n, h, w] float32, metres, 0 where ``alphas`` are.
     """
 
     images: np.ndarray
-    masks: np.ndarray
+    alphas: np.ndarray
     depths: np.ndarray
+
+    @property
+    def masks(self) -> np.ndarray:
+        """[n, h, w] bool: at least half of a pixel shows the subject."""
+        return self.alphas >= 0.5
 
 
 def _check_part(name: str, part: TexturedMesh) -> None:
@@ -174,7 +180,7 @@ class Studio:
         extrinsics = cameras.extrinsics.double().numpy()
         size = (len(intrinsics), cameras.height, cameras.width)
         images, depths = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
-        masks = np.zeros(size, bool)
+        alphas = np.zeros(size, np.float32)
         for n, (matrix, pose) in enumerate(zip(intrinsics, extrinsics, strict=True)):
             if not (
                 np.isfinite(matrix).all() and np.isfinite(pose).all() and min(matrix[0, 0], matrix[1, 1]) > 0
@@ -186,8 +192,8 @@ class Studio:
             step = max(1, _CHUNK // max(1, (right - left) * self.samples**2))
             for row in range(top, bottom, step):
                 window = (n, slice(row, min(row + step, bottom)), slice(left, right))
-                images[window], masks[window], depths[window] = self._expose(matrix, pose, *window[1:])
-        return Photographs(images, masks, depths)
+                images[window], alphas[window], depths[window] = self._expose(matrix, pose, *window[1:])
+        return Photographs(images, alphas, depths)
 
     def _window(
         self, matrix: np.ndarray, pose: np.ndarray, height: int, width: int
@@ -206,7 +212,7 @@ class Studio:
     def _expose(
         self, matrix: np.ndarray, pose: np.ndarray, rows: slice, columns: slice
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Image [h, w, 3], mask [h, w] and depth [h, w] of a window."""
+        """Image [h, w, 3], matte [h, w] and depth [h, w] of a window."""
         n, h, w = self.samples, rows.stop - rows.start, columns.stop - columns.start
         y = (rows.start + (np.arange(h * n) + 0.5) / n - matrix[1, 2]) / matrix[1, 1]
         u = columns.start + (np.arange(w * n) + 0.5) / n - matrix[0, 2]
@@ -226,10 +232,10 @@ class Studio:
         offset = np.abs(np.arange(n) - (n - 1) / 2)
         order = np.argsort(offset[:, None] ** 2 + offset**2, axis=None, kind="stable")
         nearest = order[hit[..., order].argmax(-1)]
-        mask = 2 * hit.sum(-1) >= n * n
+        alpha = hit.mean(-1, dtype=np.float32)
         center = np.take_along_axis(depth, nearest[..., None], -1)[..., 0]
         image = colors.reshape(h, w, n * n, 3).mean(2)
-        return np.clip(image, 0, 1), mask, np.where(mask, center, 0)
+        return np.clip(image, 0, 1), alpha, np.where(alpha > 0, center, 0)
 
     def _trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distance [n], face [n] (-1: none) and barycentric weights [n, 3] of the first hit not cut away."""

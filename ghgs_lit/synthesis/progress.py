@@ -19,7 +19,7 @@ from ghgs_lit.files import is_locked, lock, lock_owner, write_text_atomically
 
 log = logging.getLogger(__name__)
 
-_KINDS = ("mask", "depth", "parm", "img", "smpl")
+_KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
 
 
 class Progress:

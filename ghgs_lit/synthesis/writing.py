@@ -20,12 +20,14 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int =
         view: what to write.
         quality: of the JPEG, 1 to 100.
     """
-    folders = {kind: phase / kind / folder for kind in ("img", "mask", "depth", "parm")}
+    folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():
         path.mkdir(parents=True, exist_ok=True)
     Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
     mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
     Image.fromarray(mask).save(folders["mask"] / f"{number}.png")
+    if view.matte is not None:
+        Image.fromarray(view.matte).save(folders["alpha"] / f"{number}.png")
     if view.inverse_depth is not None:
         Image.fromarray(view.inverse_depth).save(folders["depth"] / f"{number}.png")
     np.save(folders["parm"] / f"{number}_intrinsic.npy", view.intrinsics.astype(np.float64))

@@ -118,9 +118,11 @@ def _read_inputs(directory: Path) -> Batch:
         torch.from_numpy(np.stack([getattr(camera, name) for camera in cameras])).float()[None]
         for name in ("intrinsics", "extrinsics")
     ]
+    colors, alpha = values[:, :, :3], values[:, :, 3:]
     return Batch(
-        images=values[:, :, :3],
-        masks=values[:, :, 3] > 0.5,
+        images=torch.where(alpha > 0, colors * alpha, colors),
+        masks=alpha[:, :, 0] > 0.5,
+        alpha=alpha[:, :, 0],
         cameras=Cameras(*stacked, *pictures[0].shape[:2]),
         views=(tuple(stored.cameras),),
     )

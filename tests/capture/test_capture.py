@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from ghgs_lit import Capture, predict
 from ghgs_lit.capture.folder import CaptureFolder
+from ghgs_lit.capture.masks import matte_of_file
+from ghgs_lit.capture.photographs import Pixels
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from tests.helpers.figures import PARTS, Figure
@@ -30,7 +33,7 @@ def test_crops_hold_the_subject_and_their_cameras_follow(tmp_path):
     capture = Capture.read(tmp_path, figure.write(tmp_path))
     batch = capture.batch((84, 56))
     assert batch.images.shape == (1, 4, 3, 84, 56)
-    assert (batch.images[0].movedim(1, -1)[~batch.masks[0]] == 0).all()
+    assert (batch.images[0].movedim(1, -1)[batch.alpha[0] == 0] == 0).all()
     for v, photograph in enumerate(capture.photographs):
         mask = batch.masks[0, v].numpy()
         extents = [np.ptp(np.nonzero(mask.any(axis))[0]) + 1 for axis in (1, 0)]
@@ -157,6 +160,32 @@ def test_masks_come_from_many_places(tmp_path, source):
         assert (found & figure.masks).sum() / (found | figure.masks).sum() > 0.9
     else:
         np.testing.assert_array_equal(found, figure.masks)
+
+
+def test_soft_masks_are_mattes(tmp_path):
+    """Grey values of a mask are shares; the background has no part in what a model sees of the rim."""
+    figure = Figure()
+    path = figure.write(tmp_path)
+    sharp = Capture.read(tmp_path, path).batch((42, 42))
+    assert ((sharp.alpha > 0.1) & (sharp.alpha < 0.9)).sum() > 100  # of a larger photograph's mask
+    assert torch.equal(sharp.masks, sharp.alpha > 127.5 / 255)
+    for name, image, mask in zip(figure.names, figure.images, figure.masks, strict=True):
+        matte = gaussian_filter(mask * 255.0, 1.5).round().astype(np.uint8)
+        Image.fromarray(matte).save(tmp_path / f"{name}_mask.png")
+        Image.fromarray(np.where(mask[..., None], image, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    capture = Capture.read(tmp_path, path)
+    np.testing.assert_array_equal(capture.photographs[-1].matte, matte)
+    soft = capture.batch((42, 42))
+    assert (soft.images <= soft.alpha[:, :, None] + 2 / 255).all()  # premultiplied
+    assert ((soft.alpha > 0) & (soft.alpha < 1)).sum() > ((sharp.alpha > 0) & (sharp.alpha < 1)).sum()
+
+
+def test_mattes_of_16_bits_are_read(tmp_path):
+    """Their range is that of 16 bits."""
+    pixels = Pixels(np.zeros((2, 3, 3), np.uint8), None, 0)
+    Image.fromarray(np.array([[0, 65535, 32768], [257, 40000, 1]], np.uint16)).save(tmp_path / "matte.png")
+    found = matte_of_file(tmp_path / "matte.png", pixels)
+    assert found.tolist() == [[0, 255, 128], [1, 156, 0]]
 
 
 @pytest.mark.parametrize("fisheye", [False, True])

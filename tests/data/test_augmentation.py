@@ -89,7 +89,8 @@ def differing(a, b) -> set[str]:
         f"cameras.{name}": (getattr(a.cameras, name), getattr(b.cameras, name))
         for name in ("intrinsics", "extrinsics")
     }
-    tensors = {name: (getattr(a, name), getattr(b, name)) for name in ("images", "masks", "depths")} | cameras
+    names = ("images", "masks", "depths", "alpha")
+    tensors = {name: (getattr(a, name), getattr(b, name)) for name in names} | cameras
     found = {name for name, (x, y) in tensors.items() if not torch.equal(x, y)}
     return found | ({"targets"} if not equal(a.targets, b.targets) else set())
 
@@ -99,9 +100,9 @@ def differing(a, b) -> set[str]:
     [
         (("exposure",), {"images"}),
         (("white_balance",), {"images"}),
-        (("mask_offset",), {"images", "masks"}),
-        (("mask_ragged",), {"images", "masks"}),
-        (("mask_hole", "mask_hole_chance"), {"images", "masks"}),
+        (("mask_offset",), {"images", "masks", "alpha"}),
+        (("mask_ragged",), {"images", "masks", "alpha"}),
+        (("mask_hole", "mask_hole_chance"), {"images", "masks", "alpha"}),
         (("calibration",), {"cameras.intrinsics", "cameras.extrinsics"}),
     ],
 )
@@ -111,7 +112,13 @@ def test_each_imperfection_changes_its_part_of_the_inputs_alone(root, names, cha
     clean, batch = (module(root, augmentation=a).training_batch(1) for a in ({}, chosen))
     assert differing(clean, batch) == changed
     together = module(root, augmentation=IMPERFECT).training_batch(1)
-    assert differing(clean, together) == {"images", "masks", "cameras.intrinsics", "cameras.extrinsics"}
+    everything = {"images", "masks", "alpha", "cameras.intrinsics", "cameras.extrinsics"}
+    assert differing(clean, together) == everything
+    # A matte knows no more than the mask: nothing beside it, and all of what the mask adds.
+    assert not together.alpha[~together.masks].any()
+    assert (together.alpha[together.masks & ~clean.masks] == 1).all()
+    kept = together.masks & clean.masks
+    assert torch.equal(together.alpha[kept], clean.alpha[kept])
     if names == ("calibration",):
         assert "cameras.extrinsics" not in differing(batch, together)
     for one in (batch, together):

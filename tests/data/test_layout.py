@@ -32,9 +32,9 @@ def write_person(root, name="box", size=SIZE, positions=(0, 4)) -> dict:
         photographs = studio.shoot(cameras)
         image = np.round(photographs.images[0] * 255).astype(np.uint8)
         inverse = encode_depth(photographs.depths[0])
-        view = View(
-            image, photographs.masks[0], inverse, cameras.intrinsics[0].numpy(), cameras.extrinsics[0].numpy()
-        )
+        camera = cameras.intrinsics[0].numpy(), cameras.extrinsics[0].numpy()
+        matte = np.round(photographs.alphas[0] * 255).astype(np.uint8)
+        view = View(image, photographs.masks[0], inverse, *camera, matte)
         write_view(root / "train", f"{name}_{position:03d}", 0, view)
         written[position] = (photographs, cameras)
     write_body(root / "train", name, person.body_vertices)
@@ -76,6 +76,8 @@ def test_round_trip(tmp_path):
         # The authors' loader takes channel 0 of three.
         stored = np.asarray(Image.open(tmp_path / f"train/mask/box_{position:03d}/0.png"))
         np.testing.assert_array_equal(stored, np.stack([shots.masks[0] * np.uint8(255)] * 3, -1))
+        np.testing.assert_allclose(view.alpha, shots.alphas[0], atol=0.5 / 255 + 1e-6)
+        assert ((view.alpha > 0) & (view.alpha < 1)).sum() > 50
         np.testing.assert_allclose(view.depth, shots.depths[0], atol=1.5e-4)
         np.testing.assert_allclose(view.intrinsics, cameras.intrinsics[0], rtol=1e-6)
         np.testing.assert_allclose(view.extrinsics, cameras.extrinsics[0], atol=1e-6)
@@ -140,6 +142,34 @@ def test_renders_of_others_are_read(root):
     np.testing.assert_allclose(half.intrinsics[:2, 2], (ours.intrinsics[:2, 2] + 0.5) / 2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("size", [(28, 28), (30, 21)])
+def test_mattes_are_resized_as_photographs_and_masks_follow(root, size):
+    """The share of the subject stays; masks are where it fills a half, depths where it shows at all."""
+    full, small = photographs(root).view("box", 0, 0), photographs(root, size).view("box", 0, 0)
+    assert small.alpha.mean() == pytest.approx(full.alpha.mean(), abs=1e-3)
+    np.testing.assert_array_equal(small.mask, small.matte >= 128)
+    assert not small.depth[small.matte == 0].any()
+    assert (small.depth[small.mask] > 0).all()
+    # The colour of the box is known where the image is divided by its matte.
+    rim = (small.matte > 64) & (small.matte < 255)
+    own, color = small.image[rim].astype(float), small.image[small.matte == 255].mean(0)
+    assert len(own) > 20
+    error, dark = own / small.alpha[rim][:, None] - color, own - color
+    assert np.abs(error).mean() < 0.25 * np.abs(dark).mean()
+
+
+def test_data_without_mattes_is_read_as_before(root):
+    """The matte is optional: mask, image and depth of the subject are the same without it."""
+    soft = photographs(root).view("box", 0, 0)
+    shutil.rmtree(root / "train" / "alpha")
+    plain = photographs(root).view("box", 0, 0)
+    assert plain.matte is None
+    assert plain.alpha is None
+    np.testing.assert_array_equal(plain.mask, soft.mask)
+    np.testing.assert_array_equal(plain.image, soft.image)
+    assert photographs(root, (28, 28)).view("box", 0, 0).matte is None
+
+
 def test_masks_of_one_channel_are_read(root):
     """Data that was rendered before masks had three channels stays readable."""
     before = photographs(root).view("box", 0, 0).mask
@@ -150,7 +180,7 @@ def test_masks_of_one_channel_are_read(root):
 
 def test_cache_keeps_what_fits_and_no_more(root):
     """The cache respects its limit and drops the least recently used first."""
-    layout = photographs(root, cache_mb=2 * (SIZE * SIZE * 6 + 1024) / 2**20)
+    layout = photographs(root, cache_mb=2 * (SIZE * SIZE * 7 + 1024) / 2**20)
     first = layout.view("box", 0, 0)
     assert layout.view("box", 0, 0) is first
     layout.view("box", 4, 0)
@@ -184,6 +214,13 @@ def damage(root, kind: str) -> str:
     if kind == "depth of 8 bits":
         Image.new("L", (SIZE, SIZE)).save(depth / "0.png")
         return r"depth/box_000/0\.png: expected 16 bits of inverse depth; found 8"
+    alpha = root / "train" / "alpha" / "box_000" / "0.png"
+    if kind == "matte of 16 bits":
+        Image.fromarray(np.zeros((SIZE, SIZE), np.uint16)).save(alpha)
+        return r"alpha/box_000/0\.png: expected 8 bits of grey; found uint16"
+    if kind == "matte size":
+        Image.new("L", (20, 30)).save(alpha)
+        return r"alpha/box_000/0\.png: expected the size of its photograph, 56x56; found 30x20"
     if kind == "zero focal":
         focal[0, 0] = 0
         np.save(parm / "0_intrinsic.npy", focal)
@@ -213,6 +250,8 @@ BAD_IMAGES = [
     "mask missing",
     "mask size",
     "depth of 8 bits",
+    "matte of 16 bits",
+    "matte size",
 ]
 BAD_CAMERAS = ["zero focal", "nan camera", "camera shape", "no rotation", "camera garbage", "camera missing"]
 

@@ -193,25 +193,32 @@ def test_batches_have_the_shapes_and_values_they_promise(root):
     assert 0.3 < batch.images.max() <= 1
     assert [tuple(b.shape) for b in batch.body_vertices] == [(5, 3)] * 2
     assert ((batch.depths > 1.5) & (batch.depths < 2.5))[batch.masks].float().mean() > 0.98
-    assert (batch.depths[~batch.masks] == 0).all()
+    assert torch.equal(batch.depths > 0, batch.alpha > 0)
+    assert torch.equal(batch.masks, batch.alpha > 0.5)
+    assert ((batch.alpha > 0) & (batch.alpha < 1)).any()
+    assert (batch.images.amax(2) <= batch.alpha + 4 / 255).all()  # premultiplied; JPEG may add a little
     assert [len(v) for v in batch.views] == [4, 4]
     # Antialiased rims stay unless asked: some light outside the mask, none with apply_mask.
     outside = batch.images.movedim(2, -1)[~batch.masks]
     assert outside.max() > 0.05
     blacked = module(root, targets={"name": "random", "per_step": 2}, apply_mask=True).training_batch(0)
     assert blacked.images.movedim(2, -1)[~blacked.masks].max() == 0
+    assert blacked.alpha[~blacked.masks].max() == 0
     assert torch.equal(data.training_batch(0).body_vertices[0], batch.body_vertices[0])
 
 
 def test_data_without_depth_or_body_says_none(root, tmp_path):
-    """Missing depth or bodies become None, not zeros."""
+    """Missing depths, bodies or mattes (of one photograph) become None, not zeros."""
     import shutil
 
     shutil.copytree(root / "train", tmp_path / "train")
     shutil.rmtree(tmp_path / "train" / "depth")
     shutil.rmtree(tmp_path / "train" / "smpl" / "s1")
+    for folder in (tmp_path / "train" / "alpha").glob("s1_*"):
+        shutil.rmtree(folder)
     batch = module(tmp_path, batch_size=3).training_batch(0)
     assert batch.depths is None
+    assert batch.alpha is None
     assert batch.body_vertices is None
 
 

@@ -74,6 +74,18 @@ def test_everything_is_written_and_reported(subject, tmp_path):
     assert np.allclose(cameras["001_0"]["extrinsics"], batch.cameras.extrinsics[0, 1], atol=1e-7)
 
 
+def test_mattes_are_the_alpha_of_the_photographs(subject, tmp_path):
+    """Colours of a PNG are the subject's own; on black they give the photograph that the model saw."""
+    batch, prediction = subject
+    share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1)) * batch.masks
+    batch = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("inputs",)))
+    picture = iio.imread(tmp_path / "inputs" / "000_0.png") / 255
+    assert np.abs(picture[..., 3] - share[0, 0].numpy()).max() <= 0.5 / 255 * 1.001
+    seen = batch.images[0, 0].movedim(0, -1).numpy()
+    assert np.abs(picture[..., :3] * picture[..., 3:] - seen).max() <= 1 / 255 * 1.001
+
+
 def test_up_turns_everything_and_changes_no_picture(subject, tmp_path):
     """With up=z the cameras' up is +z; Gaussians, points and cameras fit one another as before."""
     batch, prediction = subject

@@ -29,7 +29,8 @@ def boxes(b, v, height, width, seed=0):
 )
 def test_padding_is_centred_and_undone(size, top, left, padded):
     """512 gets 3 pixels on each side as in the authors' release; a single pixel goes below and right."""
-    batch = Batch(torch.rand(1, 2, 3, *size), boxes(1, 2, *size), cameras(1, 2, *size))
+    alpha = torch.rand(1, 2, *size)
+    batch = Batch(torch.rand(1, 2, 3, *size), boxes(1, 2, *size), cameras(1, 2, *size), alpha=alpha)
     padding = pad_to_patches(batch.masks, 14)
     assert (padding.top, padding.left) == (top, left)
     part = padding.pad_batch(batch)
@@ -37,6 +38,8 @@ def test_padding_is_centred_and_undone(size, top, left, padded):
     assert (part.cameras.height, part.cameras.width) == padded
     assert part.images.sum() == pytest.approx(batch.images.sum().item())
     assert torch.equal(padding.cut(part.masks), batch.masks)
+    assert torch.equal(padding.cut(part.alpha), alpha)
+    assert part.alpha.sum() == pytest.approx(alpha.sum().item())
     shift = part.cameras.intrinsics - batch.cameras.intrinsics
     assert shift[0, 0, :2, 2].tolist() == [-left, -top]
     depth = torch.rand(1, 2, *padded) + 1

@@ -157,3 +157,17 @@ def test_splats_see_photo_consistency_and_colors_leave_their_pixels_within_the_l
     assert not torch.equal(here.opacities, there.opacities)
     change = (here.colors - pixels).abs()
     assert 0 < change.max() <= 0.25
+
+
+def test_rims_agree_as_if_they_were_not_premultiplied():
+    """Photographs on black are darker where they show the subject in part."""
+    batch = make_batch(1, 3)
+    share = (
+        0.3 + 0.7 * torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(1))
+    ) * batch.masks
+    mixed = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
+    bounds = DepthBounds(batch.depths - 0.1, batch.depths + 0.1)
+    expected = photo_consistency(batch, bounds, 4)
+    torch.testing.assert_close(photo_consistency(mixed, bounds, 4), expected, atol=1e-5, rtol=1e-4)
+    dark = photo_consistency(dataclasses.replace(mixed, alpha=None), bounds, 4)
+    assert (dark - expected).abs().max() > 0.1

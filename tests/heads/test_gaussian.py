@@ -4,13 +4,17 @@ import dataclasses
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.gaussian import GaussianHead
+from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.types import DepthMaps
 from tests.heads.test_depth import make_tokens
-from tests.helpers.scenes import CASES, fixture, make_batch
+from tests.helpers.scenes import CASES, CENTER, RADII, fixture, make_batch
 
 HEADERS = ("offset_header", "scale_header", "rot_header", "opacity_header")
 
@@ -63,6 +67,54 @@ def test_training_starts_with_small_opaque_splats_on_the_surface():
     torch.testing.assert_close(gaussians.opacities, torch.full_like(gaussians.opacities, 0.9))
     assert torch.equal(gaussians.quaternions, torch.tensor([1.0, 0, 0, 0]).expand(len(gaussians), 4))
     assert torch.equal(gaussians.colors, batch.images.permute(0, 1, 3, 4, 2)[batch.masks])
+
+
+def test_training_starts_with_discs_that_end_at_the_silhouette():
+    """With axes of the surface: flat along the normal, wide along the surface, moved inward."""
+    batch = make_batch(1, 3, 112, 112)
+    start = {"scale_start": 0.5, "thickness_start": 0.2, "inward": 0.4}
+    gaussians = run(make_head(axes="surface", attributes=start), batch)
+    footprint = (batch.depths / batch.cameras.intrinsics[..., :1, :1])[batch.masks][:, None]
+    expected = footprint * torch.tensor([0.5, 0.5, 0.2])
+    torch.testing.assert_close(gaussians.scales, expected, rtol=1e-4, atol=0)
+    points = unproject_maps(batch.depths, batch.cameras)[batch.masks]
+    moved = gaussians.means - points
+    torch.testing.assert_close(moved.norm(dim=-1, keepdim=True), 0.4 * footprint)
+    inward = F.normalize((CENTER - points) / RADII.square(), dim=-1)
+    assert (F.normalize(moved, dim=-1) * inward).sum(-1).quantile(0.05) > 0.98
+    thin = quaternion_to_matrix(gaussians.quaternions)[..., 2]
+    assert (thin * inward).sum(-1).quantile(0.05) > 0.98
+
+
+def test_offsets_and_rotations_are_along_the_axes_of_the_surface():
+    """The same raw values from every camera of a ring mean the same, whatever the world's axes."""
+    batch = make_batch(1, 2, 56, 56, spread=180.0)
+    maps = DepthMaps(batch.depths, batch.masks, batch.depths)
+    points = Unprojection()(maps, make_tokens(batch), batch)
+    head = make_head(axes="surface", attributes={"scale_start": 0.5, "thickness_start": 0.2})
+    raw = head(make_tokens(batch), batch, points, maps)
+    n = len(raw.image)
+    some = {"offset": (0.3, -0.2, 0.1), "rotation": (0.0, 0.4, 0.1, -0.2)}
+    some = {name: torch.tensor(value).expand(n, -1) for name, value in some.items()}
+    gaussians = head.activate(dataclasses.replace(raw, **some), batch, points, maps)
+    axes = surface_axes(maps, batch.cameras, raw.image, raw.pixel)
+    matrix = quaternion_to_matrix(axes)
+    own = (matrix.mT @ (gaussians.means - points.pixels[batch.masks])[..., None])[..., 0]
+    torch.testing.assert_close(own, 0.05 * some["offset"].tanh(), atol=1e-6, rtol=1e-4)
+    turned = matrix.mT @ quaternion_to_matrix(gaussians.quaternions)
+    expected = quaternion_to_matrix(some["rotation"] + torch.tensor([1.0, 0, 0, 0]))
+    torch.testing.assert_close(turned, expected, atol=1e-5, rtol=0)
+
+
+def test_rim_pixels_have_the_subjects_color_and_the_opacity_of_their_share():
+    """A photograph on black is premultiplied by its matte."""
+    batch = make_batch(1, 2)
+    share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(5)) * batch.masks
+    mixed = dataclasses.replace(batch, images=batch.images * share[:, :, None], alpha=share)
+    plain, soft = run(make_head(), batch), run(make_head(), mixed)
+    torch.testing.assert_close(soft.colors, plain.colors)
+    torch.testing.assert_close(soft.opacities, plain.opacities * share[batch.masks])
+    assert torch.equal(soft.means, plain.means)
 
 
 def test_gaussians_name_their_pixels_in_order():
@@ -151,6 +203,9 @@ def test_attributes_are_wide_under_autocast():
         ({"pixels": "some"}, "gaussian_head.pixels"),
         ({"hidden": [32]}, "gaussian_head.hidden"),
         ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
+        ({"attributes": {"thickness_start": 5.0}}, "gaussian_head.attributes.thickness_start"),
+        ({"attributes": {"inward": -1.0}}, "gaussian_head.attributes.inward"),
+        ({"axes": "camera"}, "gaussian_head.axes"),
         ({"attributes": {"opacity_start": 1.0}}, "gaussian_head.attributes.opacity_start"),
         ({"attributes": {"offset_limit": -1.0}}, "gaussian_head.attributes.offset_limit"),
     ],

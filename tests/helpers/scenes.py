@@ -64,6 +64,13 @@ def make_batch(batch=1, views=3, height=56, width=56, **kwargs):
     return Batch(images * masks[:, :, None], masks, cameras, depths=depths)
 
 
+def with_soft_rims(batch):
+    """The batch with a matte that falls from 1 to 0 over two pixels, which premultiplies its photographs."""
+    alpha = torch.nn.functional.avg_pool2d(batch.masks.float(), 3, 1, 1)
+    images = torch.rand(batch.images.shape, generator=torch.Generator().manual_seed(8))
+    return replace(batch, images=images * alpha[:, :, None], masks=alpha >= 0.5, alpha=alpha)
+
+
 def training_batch(batch=1, size=28, views=3):
     """As :func:`make_batch`, with a target for each element, the surface's points, and names."""
     inputs, seen = make_batch(batch, views, size, size), make_batch(batch, 2, size, size, spread=90.0)

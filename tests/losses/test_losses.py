@@ -197,6 +197,15 @@ def test_losses_without_any_subject_pixel_are_zero():
     assert values["depth"].item() == 0
 
 
+def test_pixels_that_show_a_part_of_the_subject_have_depths():
+    """With a matte the subject's pixels are all that show some of it."""
+    prediction, rendering, batch = _example()
+    soft = dataclasses.replace(batch, alpha=torch.full_like(batch.depths, 0.2))
+    value = Losses({"depth": 1.0})(prediction, rendering, soft)[1]["depth"]
+    error = (prediction.depth - batch.depths).abs()[prediction.depth_valid].mean()
+    assert value.item() == pytest.approx(error.item(), rel=1e-5)
+
+
 def test_subsampled_chamfer_is_unbiased():
     """Matching random subsets changes the loss by noise only."""
     prediction, rendering, batch = _example()

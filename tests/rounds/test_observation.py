@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Gaussians
-from tests.helpers.scenes import make_batch
+from tests.helpers.scenes import make_batch, with_soft_rims
 
 
 def splats(batch):
@@ -98,3 +98,13 @@ def test_what_is_not_finite_reaches_no_other_element():
     colors[element == 1] = torch.nan
     found = observe(dataclasses.replace(gaussians, colors=colors), batch)
     torch.testing.assert_close(found[element != 1], expected[element != 1], rtol=0, atol=1e-5)
+
+
+def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
+    """Gaussians with the subject's colours and its share as opacity; the share takes the mask's place."""
+    batch = with_soft_rims(make_batch(1, 2))
+    plain = observe(splats(batch), dataclasses.replace(batch, alpha=None))
+    each = observe(splats(batch), batch)
+    assert torch.equal(each[..., :6], plain[..., :6])
+    between = [((found[..., 6] > 0.05) & (found[..., 6] < 0.95)).sum() for found in (each, plain)]
+    assert between[0] > between[1]

@@ -89,9 +89,15 @@ def test_square_covers_exactly_the_pixels_it_should():
     assert (mask == expected.astype(bool)).all()
     np.testing.assert_allclose(depth, 2.0 * expected, atol=1e-6)
     third = 0.5 * 17 / 16 - 0.5 / 48  # edge at 8.333 pixels from the centre
-    image, mask, _ = shoot([quad(half=third)], front_camera(size))
+    image, mask, depth = shoot([quad(half=third)], front_camera(size))
     np.testing.assert_allclose(image[16, 7, 0], 1 / 3, atol=1e-6)
     assert mask.sum() == 16 * 16
+    taken = Studio(Person("p", (quad(half=third),), None), LIGHT).shoot(front_camera(size))
+    np.testing.assert_allclose(taken.alphas[0, 16, 6:9], [0, 1 / 3, 1], atol=1e-6)
+    np.testing.assert_allclose(taken.alphas[0, 7, 7], 1 / 9, atol=1e-6)
+    # The surface is white: a photograph on black is its matte. What shows at all has a depth.
+    np.testing.assert_allclose(taken.images[0, ..., 0], taken.alphas[0], atol=1e-6)
+    np.testing.assert_allclose(depth, 2.0 * (taken.alphas[0] > 0), atol=1e-6)
 
 
 def test_depth_never_mixes_two_surfaces():

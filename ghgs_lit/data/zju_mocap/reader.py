@@ -129,7 +129,8 @@ class ZJUMoCapReader(FrameReader):
         if self.undistorted:
             distortion = frame.annotations.distortions[position]
             grid = undistorting_grid(half_centers(intrinsics), distortion, *image.shape[:2])
-            image, mask = undistort(image, mask, grid)
+            image, matte = undistort(image, mask * np.uint8(255), grid)
+            mask = matte > 127
         return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[position])
 
     def read_body(self, name: str) -> np.ndarray | None:

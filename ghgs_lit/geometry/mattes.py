@@ -1,0 +1,44 @@
+"""Soft mattes: pixels at a silhouette show the subject in a part of their area.
+
+Photographs on black are premultiplied by that part, as renders of Gaussians are (Porter and Duff, SIGGRAPH
+1984). A Gaussian needs the colour of the surface itself.
+"""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.types import Batch
+
+
+def with_matte(batch: Batch, least: float | None) -> Batch:
+    """The batch whose masks hold all pixels that show more of the subject than ``least``.
+
+    Args:
+        batch: as it is where it has no matte.
+        least: a share; None: the batch without its matte.
+    """
+    if batch.alpha is None:
+        return batch
+    if least is None:
+        return dataclasses.replace(batch, alpha=None)
+    return dataclasses.replace(batch, masks=batch.alpha > least)
+
+
+def coverage(batch: Batch) -> Float[Tensor, "B V H W"]:
+    """The share of each pixel that shows the subject: 0 or 1 by the mask where there is no matte."""
+    shares = batch.masks if batch.alpha is None else batch.alpha
+    return shares.to(at_least_float32(batch.images).dtype)
+
+
+def surface_colors(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
+    """Photographs divided by the matte, at most 1: the colour of what a pixel shows of the subject."""
+    images = at_least_float32(batch.images)
+    if batch.alpha is None:
+        return images
+    alpha = batch.alpha.to(images.dtype)[:, :, None]
+    # A matte of 0 says nothing of the colour.
+    return torch.where(alpha > 0, (images / torch.where(alpha > 0, alpha, 1)).clamp(max=1), images)
