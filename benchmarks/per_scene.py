@@ -18,6 +18,7 @@ from ghgs_lit.cli.inputs import build_data, build_renderer
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.evaluation.baselines.per_scene import PerScene
 from ghgs_lit.evaluation.protocols import target_protocols
+from ghgs_lit.geometry.mattes import on_black
 from ghgs_lit.metrics import psnr
 from ghgs_lit.types import Batch, Gaussians
 
@@ -45,7 +46,7 @@ def numbers(method: PerScene, gaussians: Gaussians, batch: Batch) -> list[float]
     def of(cameras, images: Tensor) -> Tensor:
         return psnr(method.renderer(gaussians, cameras).image[0].clamp(0, 1), images[0])
 
-    inputs = of(batch.cameras, batch.images * batch.masks[:, :, None]).mean()
+    inputs = of(batch.cameras, on_black(batch)).mean()
     return [float(inputs), *of(batch.targets.cameras, batch.targets.images).tolist()]
 
 

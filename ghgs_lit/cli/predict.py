@@ -125,7 +125,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             place = directory / name if several else directory
             write(place, result.batch, prediction, renderer, options, facts)
             if several and "mp4" in options.formats:
-                camera = fixed_camera(capture).to(device) if number == 1 else camera
+                if number == 1:
+                    camera = fixed_camera(capture).to(device)
                 pictures.append(to_uint8(renderer(prediction.gaussians, camera).image[0, 0]))
             for stage, value in (facts["seconds"] | {"write": time.perf_counter() - start}).items():
                 totals[stage] = totals.get(stage, 0.0) + value

@@ -24,9 +24,8 @@ class KeptPatches:
 
     def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):
         _, _, height, width = self.grid = tuple(kept.shape)
-        kept_here = kept.cpu()  # the lengths and the box below are needed as numbers
-        self._counts = kept_here.flatten(2).sum(-1)
-        self._lines = kept_here.any(3).flatten(0, 1).any(0), kept_here.any(2).flatten(0, 1).any(0)
+        self._kept = kept.cpu()  # the lengths and the box below are needed as numbers
+        self._counts = self._kept.flatten(2).sum(-1)
         total = int(self._counts.sum())
         is_whole = total == kept.numel()
         self.index = torch.arange(total, device=device) if is_whole else true_places(kept.to(device), total)
@@ -44,7 +43,8 @@ class KeptPatches:
 
     def box(self, margin: int) -> tuple[slice, slice]:
         """Rows and columns of patches around those that are kept in any image; one patch at least."""
-        return tuple(_around(line, margin) for line in self._lines)
+        anywhere = self._kept.flatten(0, 1).any(0)
+        return _around(anywhere.any(1), margin), _around(anywhere.any(0), margin)
 
     def select(self, patches: Float[Tensor, "n p c"]) -> Float[Tensor, "N c"]:
         """The kept ones among the tokens of all patches."""

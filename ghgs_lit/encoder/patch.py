@@ -64,9 +64,7 @@ class ConvStem(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, images: Float[Tensor, "n i H W"], kept: KeptPatches) -> Float[Tensor, "N c"]:
-        box = kept.box(_REACH)
-        rows, columns = box
-        seen = (slice(part.start * self.patch_size, part.stop * self.patch_size) for part in box)
-        x = self.reduce(images[..., *seen])
+        p, (rows, columns) = self.patch_size, kept.box(_REACH)
+        x = self.reduce(images[..., p * rows.start : p * rows.stop, p * columns.start : p * columns.stop])
         x = x + self.mix(F.gelu(self.mix_norm(x)))
         return self.norm(x.movedim(1, -1)[kept.image, kept.row - rows.start, kept.column - columns.start])

@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from plyfile import PlyData, PlyElement
 
 from ghgs_lit.export.scene import Scene, file_name
 from ghgs_lit.files import write_atomically, write_text_atomically
+from ghgs_lit.geometry.mattes import unmultiplied
 from ghgs_lit.visualization.pictures import to_uint8
 
 _LEVELS = 65535  # of a picture of 16 bits
@@ -80,7 +80,7 @@ def write_inputs(scene: Scene, directory: Path) -> list[Path]:
     paths = [directory / "inputs" / f"{file_name(view)}.png" for view in scene.views]
     for path, image, matte in zip(paths, scene.images, scene.mattes, strict=True):
         # Colours of a PNG are not premultiplied.
-        colors = to_uint8(image / torch.where(matte > 0, matte, 1))
+        colors = to_uint8(unmultiplied(image, matte))
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
         picture = Image.fromarray(np.concatenate([colors, alpha], -1))
         write_atomically(path, lambda p, image=picture: image.save(p, format="PNG"))

@@ -37,8 +37,14 @@ def coverage(batch: Batch) -> Float[Tensor, "B V H W"]:
 def surface_colors(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
     """Photographs divided by the matte, at most 1: the colour of what a pixel shows of the subject."""
     images = at_least_float32(batch.images)
-    if batch.alpha is None:
-        return images
-    alpha = batch.alpha.to(images.dtype)[:, :, None]
-    # A matte of 0 says nothing of the colour.
+    return images if batch.alpha is None else unmultiplied(images, batch.alpha.to(images.dtype)[:, :, None])
+
+
+def unmultiplied(images: Tensor, alpha: Tensor) -> Tensor:
+    """Colours divided by ``alpha``, at most 1; as they are where it is 0 and says nothing of them."""
     return torch.where(alpha > 0, (images / torch.where(alpha > 0, alpha, 1)).clamp(max=1), images)
+
+
+def on_black(batch: Batch) -> Float[Tensor, "B V 3 H W"]:
+    """Photographs without what is beside the subject; with a matte they are on black already."""
+    return batch.images if batch.alpha is not None else batch.images * coverage(batch)[:, :, None]

@@ -119,7 +119,8 @@ class FootprintAttributes:
     ):
         key = "gaussian_head.attributes"
         require(offset_limit >= 0, f"{key}.offset_limit", "0 or more metres", offset_limit)
-        starts = {"scale_start": scale_start, "thickness_start": thickness_start or scale_start}
+        thickness_start = scale_start if thickness_start is None else thickness_start
+        starts = {"scale_start": scale_start, "thickness_start": thickness_start}
         for name, start in starts.items():
             expected = f"0 < scale_floor < {name} < scale_cap"
             found = (scale_floor, start, scale_cap)

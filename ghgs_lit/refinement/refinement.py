@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.mattes import coverage
+from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
@@ -154,9 +154,7 @@ class Refinement:
 def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
     """Photographs on black, masks and cameras of some views."""
     views = list(views)
-    images, shown = batch.images[:, views], coverage(batch)[:, views, None]
-    # With a matte they are on black already.
-    return images if batch.alpha is not None else images * shown, shown, batch.cameras[:, views]
+    return on_black(batch)[:, views], coverage(batch)[:, views, None], batch.cameras[:, views]
 
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:

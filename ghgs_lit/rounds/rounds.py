@@ -143,7 +143,7 @@ class Rounds(nn.Module):
         low, high = torch.minimum(torch.maximum(depth - half, near), depth), torch.minimum(depth + half, far)
         high = torch.maximum(high, depth)
 
-        def at(values: Float[Tensor, "B V *s H W"]) -> Float[Tensor, "N *s"]:
+        def at(values: Float[Tensor, "B V *s H W"]) -> Float[Tensor, " N *s"]:
             return values.flatten(0, 1).flatten(-2)[raw.image, ..., raw.pixel]
 
         thickness = at(far - near)

@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.recalibration import MODES, SIMILARITIES, cpu
-from tests.recalibration.test_recalibration import make, scene
+from tests.helpers.tokens import make_stage, scene
 
 
 def neighborhood(n=37, c=64, k=9, seed=0, scale=1.0):
@@ -107,7 +107,7 @@ def test_the_module_without_a_gradient_is_the_same(monkeypatch, similarity, neig
     """Inference by the kernels equals the module with a gradient, for every option."""
     tokens, points = scene(dim=128)
     tokens = type(tokens)(tokens.latent, torch.randn(96, 32), *list(vars(tokens).values())[2:])
-    module = make(dim=128, similarity=similarity, neighbors=neighbors)
+    module = make_stage(dim=128, similarity=similarity, neighbors=neighbors)
     expected = module(tokens, points)
     calls = []
     for name in ("attend", "cosines"):

@@ -80,11 +80,8 @@ def _sweep_rows(
     size = np.uint64(height + 2) * line
     rate = np.float32(math.log2(math.e)) / (THREE * tolerance)
     padded = -(-count // LANES) * LANES
-    pixels, rights, downs = (
-        np.empty(count, np.int64),
-        np.empty(count, np.float32),
-        np.empty(count, np.float32),
-    )
+    pixels = np.empty(count, np.int64)
+    rights, downs = np.empty(count, np.float32), np.empty(count, np.float32)
     differences, seen, best = simd.aligned(padded), simd.aligned(padded), simd.aligned(padded)
     columns = simd.aligned(LANES)
     differences[:], seen[:] = ZERO, ZERO

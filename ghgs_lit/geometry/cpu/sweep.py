@@ -11,8 +11,8 @@ from torch import Tensor
 from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.parts import even_parts
 
-#: Rows of an image of one task, and floats that the kernel reads at once.
-_ROWS, LANES = 16, 16
+#: Rows of an image of one task.
+_ROWS = 16
 
 
 def padded(colors: Float[Tensor, "B V 4 H W"]) -> Tensor:
@@ -21,6 +21,8 @@ def padded(colors: Float[Tensor, "B V 4 H W"]) -> Tensor:
     The rim of zeros is what lies outside a photograph; one pixel's channels lie side by side. Whole
     vectors are read, of the last pixels beyond the end.
     """
+    from ghgs_lit.kernels.simd import LANES  # here: it loads a compiler
+
     elements, views, _, height, width = colors.shape
     shape = (elements, views, height + 2, width + 2, 4)
     flat = colors.new_zeros(math.prod(shape) + LANES, dtype=torch.float32)

@@ -1,0 +1,51 @@
+"""Tokens with points for the recalibration stage, and its neighbours by definition."""
+
+import numpy as np
+import torch
+
+from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.types import Points, Tokens
+
+
+def literal_neighbors(points, view, i, k, mode):
+    """Indices of the neighbours of point ``i``, computed from the definition in float64."""
+    distance = np.linalg.norm(points.double().numpy() - points[i].double().numpy(), axis=1)
+    order = sorted(range(len(points)), key=lambda j: (np.float32(distance[j]), j))
+    own, other = ([j for j in order if (view[j] == view[i]) == same] for same in (True, False))
+    if mode == "all":
+        return order[:k]
+    if mode == "other_views":
+        return other[:k] or [i]
+    k = min(k, len(points))
+    from_own = min(len(own), max(k // 2, k - len(other)))
+    return own[:from_own] + other[: k - from_own]
+
+
+def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torch.float32):
+    """Tokens and points; ``counts[b][v]`` tokens are valid in view v of element b."""
+    generator = torch.Generator().manual_seed(seed)
+    b, v = len(counts), len(counts[0])
+    n = b * v * grid[0] * grid[1]
+    axes = (torch.arange(m) for m in (b * v, *grid))
+    image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+    valid = torch.zeros(b * v, grid[0] * grid[1], dtype=torch.bool)
+    for index, count in enumerate(c for element in counts for c in element):
+        valid[index, torch.randperm(grid[0] * grid[1], generator=generator)[:count]] = True
+    latent = tuple(torch.randn(n, dim, generator=generator, dtype=dtype) for _ in range(4))
+    semantic = torch.randn(n, 12, generator=generator, dtype=dtype)
+    tokens = Tokens(latent, semantic, image, row, column, (b, v, *grid), 2)
+    height, width = 2 * grid[0], 2 * grid[1]
+    masks = torch.ones(b, v, height, width, dtype=torch.bool)
+    points = Points(
+        torch.zeros(b, v, height, width, 3),
+        masks,
+        torch.randn(n, 3, generator=generator),
+        valid.flatten(),
+        image,
+    )
+    return tokens, points
+
+
+def make_stage(dim=32, k=4, num_heads=2, **options):
+    torch.manual_seed(2)
+    return Recalibration(dim, k=k, num_heads=num_heads, **options)

@@ -1,0 +1,131 @@
+"""Neighbours against their definition and SciPy: ties, few points, points of all sizes."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from ghgs_lit.recalibration import nearest_neighbors
+from ghgs_lit.recalibration.neighbors import MODES, Neighbors
+from tests.helpers.tokens import literal_neighbors, make_stage, scene
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("k", [1, 2, 3, 7, 64])
+def test_mixed_neighbors_are_never_too_few(k, dtype):
+    """``mixed`` with k = 1, one token, one view or fewer tokens than k gave NaN or dropped neighbours."""
+    for counts in ([1], [1, 1], [9], [3, 6], [1, 2, 40], [30, 30, 0, 4]):
+        view = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+        points = torch.rand(len(view), 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
+        found = nearest_neighbors(points, view, k, "mixed")
+        assert found.index.shape == (len(view), min(k, len(view)))
+        assert found.valid.all()
+        for i, row in enumerate(found.index.tolist()):
+            assert row == literal_neighbors(points, view, i, k, "mixed")
+    tokens, points = scene(((1, 0, 0), (1, 2, 0)))
+    found = make_stage(neighbors="mixed", k=k)(tokens, points)
+    assert all(layer.isfinite().all() for layer in found.latent)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("mode", MODES)
+def test_ties_on_the_image_plane_favor_no_view_and_no_side(mode, dtype):
+    """Views share their places there, so most distances are equal; lower views had a quarter more."""
+    tokens, points = scene(((144, 144, 144, 144),), grid=(12, 12))
+    module = make_stage(neighborhood="image_plane", k=48, neighbors=mode)
+    position = module.positions(tokens, points).to(dtype)
+    near = nearest_neighbors(position, tokens.image, 48, mode, module.places(tokens))
+    inside = (tokens.row - 5.5).abs().maximum((tokens.column - 5.5).abs()) < 2
+    index = near.index[inside]
+    turn = (tokens.image[index] - tokens.image[inside, None]) % 4
+    counts = [(turn == t).sum(1) for t in range(4)]
+    expected = {"all": [12] * 4, "other_views": [0, 16, 16, 16], "mixed": [24, 8, 8, 8]}[mode]
+    assert [c.float().mean().item() for c in counts] == expected
+    assert all(c.min() == c.max() for c in counts)
+    # The neighbours of one view lie around the query: within one place of balanced.
+    offset = position[index] - position[inside, None]
+    for t in range(4):
+        drift = torch.where((turn == t)[..., None], offset, 0).sum(1) / tokens.patch_size
+        assert drift.abs().max() <= 3
+    # Distances come first: nothing nearer is left out.
+    distance = torch.cdist(position[inside], position)
+    if mode == "all":
+        farthest = distance.gather(1, index).amax(1)
+        assert torch.equal(farthest, distance.sort(1).values[:, 47])
+
+
+def test_neighbors_on_the_image_plane_are_those_of_whole_photographs():
+    """Patches that left must not move the others: the ablation would align the views."""
+    tokens, points = scene(((16, 16, 16),))
+    module = make_stage(neighborhood="image_plane", k=5)
+    left = tokens.image == 1
+    left |= tokens.row > 2
+    kept = tokens.select(~left)
+    place = 2 * torch.stack((kept.row, kept.column), -1) + 1
+    assert torch.equal(module.positions(kept, points), place.float())
+    assert torch.equal(module.places(kept), module.places(tokens)[~left])
+
+
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
+def test_neighbors_match_a_kd_tree(offset):
+    """Neighbours equal SciPy's k-d tree, also far from the origin."""
+    points = (torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 + offset).float()
+    found = nearest_neighbors(points, torch.zeros(500, dtype=torch.int64), 16)
+    distance, index = cKDTree(points.double().numpy()).query(points.double().numpy(), 17)
+    clear = distance[:, 16] - distance[:, 15] > 1e-6
+    assert clear.mean() > 0.9
+    assert (np.sort(found.index.numpy())[clear] == np.sort(index[:, :16])[clear]).all()
+    assert (found.index[:, 0] == torch.arange(500)).all()
+
+
+def test_ties_go_to_the_lower_index():
+    """Equal distances give the same neighbours on every machine."""
+    points = torch.zeros(700, 3)
+    points[300:] = 1
+    found = nearest_neighbors(points, torch.zeros(700, dtype=torch.int64), 5).index
+    assert (found[:300] == torch.arange(5)).all()
+    assert (found[300:] == torch.arange(300, 305)).all()
+
+
+def test_blocks_do_not_change_the_neighbors(monkeypatch):
+    """Searching in blocks to save memory gives the same neighbours."""
+    points = torch.rand(90, 3)
+    view = torch.arange(90) % 3
+    for mode in MODES:
+        expected = nearest_neighbors(points, view, 7, mode)
+        monkeypatch.setattr("ghgs_lit.recalibration.neighbors._BLOCK", 1000)
+        found = nearest_neighbors(points, view, 7, mode)
+        assert torch.equal(found.index, expected.index)
+        assert torch.equal(found.valid, expected.valid)
+        monkeypatch.undo()
+
+
+def test_fewer_points_than_k_and_none():
+    """Fewer points than ``k``, and elements without points, do not fail or give NaN."""
+    found = nearest_neighbors(torch.rand(3, 3), torch.zeros(3, dtype=torch.int64), 64)
+    assert found.index.shape == (3, 3)
+    assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).index.shape[0] == 0
+    for counts in (((0, 0, 0), (3, 0, 0)), ((0, 0, 0), (0, 0, 0))):
+        tokens, points = scene(counts)
+        for neighbors in MODES:
+            found = make_stage(neighbors=neighbors, k=64)(tokens, points)
+            assert all(layer.isfinite().all() for layer in found.latent)
+
+
+def test_points_of_all_sizes_have_neighbors():
+    """Huge, tiny and broken points give valid indices, and broken points are never near."""
+    points = torch.rand(40, 3) * torch.logspace(-20, 25, 40)[:, None]
+    points[7], points[8] = float("nan"), float("inf")
+    found = nearest_neighbors(points, torch.zeros(40, dtype=torch.int64), 8)
+    assert ((found.index >= 0) & (found.index < 40)).all()
+    rest = found.index[[i for i in range(40) if i not in (7, 8)]]
+    assert ((rest != 7) & (rest != 8)).all()
+
+
+def test_neighbors_of_elements_are_joined_with_invalid_ones_where_there_are_fewer():
+    """Indices count the tokens of all elements."""
+    elements = [nearest_neighbors(torch.rand(n, 3), torch.zeros(n, dtype=torch.int64), 4) for n in (6, 3)]
+    found = Neighbors.join(elements)
+    assert torch.equal(found.index[:6], elements[0].index)
+    assert torch.equal(found.index[6:, :3], elements[1].index + 6)
+    assert found.valid.sum(1).tolist() == [4] * 6 + [3] * 3
