@@ -26,7 +26,7 @@ def main() -> None:
         size=bench.definition()["size"],
         positions=bench.POSITIONS,
         views=(RING_VIEW,),
-        lights=data["render"]["lights"],
+        **data["render"],
     )
     with tempfile.TemporaryDirectory() as folder:
         root, people = Path(folder), {bench.SPLIT: bench.names()}

@@ -19,12 +19,10 @@ SOME = (bench.names()[0], bench.names()[-1])
 
 
 def render(root, size):
-    """Some of the people, with one ray a pixel."""
+    """Some of the people, as defined."""
     data = bench.definition()["data"]
     rig = from_config(Rig, "rig", data["rig"])
-    settings = RenderSettings(
-        size=size, samples=1, positions=bench.POSITIONS, views=(0,), lights=data["render"]["lights"]
-    )
+    settings = RenderSettings(size=size, positions=bench.POSITIONS, views=(0,), **data["render"])
     render_people(root, {"bench": SOME}, SyntheticSource(data["people_seed"]), rig, settings, 0, workers=0)
     return root
 
@@ -80,6 +78,7 @@ def synthetic(tmp_path, *overrides):
         ("data.people_seed=3", r"data\.people_seed: expected 0"),
         ("data.size=42", r"data\.size: expected 56 pixels or more with split=bench; found 42"),
         ("data.render.lights.count=3", r"data\.render\.lights\.count: expected 6"),
+        ("data.render.samples=1", r"data\.render\.samples: expected 3"),
     ],
 )
 def test_another_definition_is_refused_before_anything_is_rendered(tmp_path, override, message):
@@ -90,12 +89,12 @@ def test_another_definition_is_refused_before_anything_is_rendered(tmp_path, ove
 
 
 def test_only_the_split_that_is_measured_is_rendered(tmp_path, monkeypatch):
-    """Forty people take minutes, sixty-four of the training more; size, rays and quality are free."""
+    """Forty people take minutes, sixty-four of the training more; the size is free."""
     asked = []
     monkeypatch.setattr(datasets, "render_people", lambda root, names, *rest: asked.append(names))
     monkeypatch.setattr(bench, "check_photographs", lambda reader: None)
     monkeypatch.setattr(datasets.Synthetic, "reader", lambda self, phase: None)
-    data = synthetic(tmp_path, "data.size=252", "data.render.samples=2")
+    data = synthetic(tmp_path, "data.size=252")
     data.prepare_data(["bench"])
     data.prepare_data(["val"])
     data.prepare_data()
