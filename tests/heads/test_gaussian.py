@@ -203,6 +203,7 @@ def test_attributes_are_wide_under_autocast():
         ({"pixels": "some"}, "gaussian_head.pixels"),
         ({"hidden": [32]}, "gaussian_head.hidden"),
         ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
+        ({"attributes": {"thickness_start": 0.0}}, "gaussian_head.attributes.thickness_start"),
         ({"attributes": {"thickness_start": 5.0}}, "gaussian_head.attributes.thickness_start"),
         ({"attributes": {"inward": -1.0}}, "gaussian_head.attributes.inward"),
         ({"axes": "camera"}, "gaussian_head.axes"),

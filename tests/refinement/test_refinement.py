@@ -84,6 +84,17 @@ def test_the_input_that_is_held_out_takes_no_part(monkeypatch):
     assert torch.equal(drawn[-1].means, expected.means)
 
 
+def test_what_is_beside_the_subject_takes_no_part():
+    """Photographs may come with their background; those with a matte are premultiplied by it, on black."""
+    splats, inputs, _ = scene(size=42)
+    room = dataclasses.replace(inputs, images=torch.where(inputs.masks[:, :, None], inputs.images, 0.7))
+    matte = dataclasses.replace(inputs, alpha=inputs.masks.float())
+    expected, *found = (Refinement(3, RENDERER)(splats, batch) for batch in (inputs, room, matte))
+    for refined in found:
+        assert torch.equal(refined.means, expected.means)
+        assert torch.equal(refined.colors, expected.colors)
+
+
 def test_two_inputs_are_refined_without_one_that_is_held_out():
     """A single input says nothing of another view."""
     splats, inputs, _ = scene(views=2, size=28)

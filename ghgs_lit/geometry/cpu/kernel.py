@@ -84,7 +84,7 @@ def _sweep_rows(
     rights, downs = np.empty(count, np.float32), np.empty(count, np.float32)
     differences, seen, best = simd.aligned(padded), simd.aligned(padded), simd.aligned(padded)
     columns = simd.aligned(LANES)
-    differences[:], seen[:] = ZERO, ZERO
+    differences[:], seen[:] = ZERO, ZERO  # no result, but defined arithmetic beyond the last depth
     for row in range(first, last):
         v = np.float32(row) + HALF
         for column in range(width):
