@@ -201,6 +201,7 @@ KINDS: dict[str, Kind] = {
     "data.val_fraction": number(least=0, below=1),
     "data.workers": WORKERS,
     "augmentation.calibration": AMOUNT,
+    "augmentation.chance": SHARE,
     "augmentation.exposure": AMOUNT,
     "augmentation.mask_hole": AMOUNT,
     "augmentation.mask_hole_chance": SHARE,

@@ -17,7 +17,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras
 
 # Streams of random numbers beside those of ghgs_lit.data.sampling.
-_SIZES, _IMPERFECTIONS = 3, 4
+_SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
 
 Size = tuple[int, int]
 
@@ -28,7 +28,9 @@ class Augmentation:
 
     Attributes:
         sizes: sides or (height, width) of the inputs; one is drawn for each step, the same in all processes.
-        target_scale: least and greatest size of the targets over that of the inputs, drawn likewise.
+        target_scale: least and greatest size of the targets over that of the inputs, drawn likewise; never
+            larger than without it, as photographs that are enlarged teach blur.
+        chance: share of the steps whose inputs are imperfect, 0 to 1.
         exposure, white_balance: in stops, as for :func:`color_gains`. Targets keep theirs.
         mask_offset, mask_ragged, mask_hole, mask_hole_chance: as for :func:`imperfect_mask`. The inputs are
             black outside their masks, as those of a capture.
@@ -39,6 +41,7 @@ class Augmentation:
 
     sizes: tuple[Size, ...] | None = None
     target_scale: tuple[float, float] | None = None
+    chance: float = 1.0
     exposure: float = 0.0
     white_balance: float = 0.0
     mask_offset: float = 0.0
@@ -56,6 +59,7 @@ class Augmentation:
             ordered = len(limits) == 2 and 0 < limits[0] <= limits[1]
             require(ordered, "augmentation.target_scale", "[least, greatest] above 0", list(limits))
             set_fields(self, target_scale=limits)
+        require(self.chance <= 1, "augmentation.chance", "at most 1", self.chance)
         for field in dataclasses.fields(self)[2:]:
             value = getattr(self, field.name)
             require(value >= 0, f"augmentation.{field.name}", "at least 0", value)
@@ -74,17 +78,21 @@ class Augmentation:
             ratios = [t / s for s, t in zip(size, target, strict=True)]
         else:
             low, high = self.target_scale
-            ratios = [low + share * (high - low)] * 2
+            ratios = [
+                min(low + share * (high - low), *(t / d for t, d in zip(target, drawn, strict=True)))
+            ] * 2
         return drawn, tuple(max(1, round(r * side)) for r, side in zip(ratios, drawn, strict=True))
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
-        """The batch of a training step as imperfect captures show it.
+        """The batch of a training step, as imperfect captures show it in a share ``chance`` of the steps.
 
         Args:
             batch: its samples.
             seed, step: of the run.
             indices: numbers of the samples in the run.
         """
+        if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
+            return batch
         return self.imperfections(
             batch, [np.random.default_rng([seed, _IMPERFECTIONS, step, index]) for index in indices]
         )

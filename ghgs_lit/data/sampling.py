@@ -59,7 +59,7 @@ class ViewProtocol:
         training_counts: numbers of views; one of them is drawn for each training step.
         evaluation_count: number of views in evaluation.
         training: ``any`` (ring cameras in random order), ``even`` (evenly spaced from a random start) or
-            ``mixed`` (one of both, drawn for each sample).
+            ``uneven`` (evenly spaced, then each moved by up to one position, as captures are).
     """
 
     name: str
@@ -72,13 +72,15 @@ class ViewProtocol:
         valid = len(self.training_counts) > 0 and min(self.training_counts) >= 2
         require(valid, "views.training_counts", "counts of at least 2", list(self.training_counts))
         require(self.evaluation_count >= 2, "views.evaluation_count", "at least 2", self.evaluation_count)
-        choice("views.training", self.training, ("any", "even", "mixed"))
+        choice("views.training", self.training, ("any", "even", "uneven"))
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
         """Positions of the ``count`` inputs of a training sample."""
-        if self.training == "even" or (self.training == "mixed" and rng.uniform() < 0.5):
-            start = int(rng.integers(ring))
-            return [(start + position) % ring for position in even_positions(ring, count)]
+        if self.training != "any":
+            start, positions = int(rng.integers(ring)), np.asarray(even_positions(ring, count))
+            if self.training == "uneven":  # they are at least 3 apart, so they stay different
+                positions = positions + rng.integers(-1, 1, count, endpoint=True)
+            return [int(position) for position in (start + positions) % ring]
         return [int(position) for position in rng.choice(np.asarray(available), count, replace=False)]
 
 
@@ -210,6 +212,8 @@ class TrainingSampler:
 
     def __post_init__(self) -> None:
         most = max(self.views.training_counts)
+        roomy = self.views.training != "uneven" or self.ring >= 3 * most
+        require(roomy, "views.training", f"any or even for {most} views of {self.ring} positions", "uneven")
         wanted = most if self.views.training == "any" else self.ring
         for name, positions in self.subjects.items():
             if len(positions) < max(wanted, most):

@@ -11,7 +11,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.types import Batch
 from tests.helpers.people import RELEASE, V4, equal, render_boxes
 
-RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "mixed"}
+RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "uneven"}
 IMPERFECT = {
     "exposure": 0.5, "white_balance": 0.2, "mask_offset": 1.5, "mask_ragged": 1.0, "mask_hole": 0.2,
     "mask_hole_chance": 0.5, "calibration": 2.0,
@@ -54,7 +54,9 @@ def test_batches_depend_on_seed_and_step_alone(root):
 
 def test_sizes_are_drawn_for_a_step_and_cameras_follow(root):
     """Every size occurs, the same for all processes; targets are 0.7 to 2 times as large."""
-    data = module(root, augmentation={"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]})
+    data = module(
+        root, target_size=[84, 84], augmentation={"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
+    )
     inputs, scales = set(), []
     for step in range(12):
         batch = data.training_batch(step)
@@ -81,6 +83,23 @@ def test_drawn_sizes_keep_the_proportion_of_the_targets(root):
     batch = module(root, target_size=56, augmentation={"sizes": [42]}).training_batch(0)
     assert batch.images.shape[-2:] == (42, 42)
     assert batch.targets.images.shape[-2:] == (84, 84)
+
+
+def test_targets_are_never_enlarged(root):
+    """Twice the size of the inputs is more than the photographs hold: they stay as large as they are read."""
+    data = module(root, target_size=42, augmentation={"target_scale": [1.0, 2.0]})
+    sides = {data.training_batch(step).targets.images.shape[-1] for step in range(12)}
+    assert 28 <= min(sides) < 36
+    assert max(sides) == 42
+
+
+def test_a_share_of_the_steps_is_imperfect(root):
+    """The others are as they are read, to the bit; chance=1 is every step."""
+    clean, some, every = (module(root, augmentation=a) for a in ({}, IMPERFECT | {"chance": 0.4}, IMPERFECT))
+    steps = [(clean.training_batch(step), some.training_batch(step)) for step in range(40)]
+    changed = [step for step, pair in enumerate(steps) if not equal(*pair)]
+    assert 8 <= len(changed) <= 24
+    assert equal(steps[changed[0]][1], every.training_batch(changed[0]))
 
 
 def differing(a, b) -> set[str]:
@@ -165,6 +184,7 @@ def test_shipped_variation_is_built():
         ({"sizes": []}, "augmentation.sizes: expected sizes or null; found"),
         ({"sizes": [[3, 4, 5]]}, "augmentation.sizes: expected a side or"),
         ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
+        ({"chance": 1.5}, "augmentation.chance: expected at most 1; found 1.5"),
         ({"calibration": -1}, "augmentation.calibration: expected at least 0; found -1"),
         ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole"),
     ],

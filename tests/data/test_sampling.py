@@ -52,13 +52,22 @@ def test_even_positions_are_the_protocols():
     assert even_positions(16, 5) == [0, 3, 6, 9, 12]
 
 
-def test_mixed_views_are_even_or_any():
-    """About half of the samples are even; the others have any angles."""
-    mixed = ViewProtocol("mixed", (4,), 4, "mixed")
-    draws = [mixed.draw(FULL, 4, 16, np.random.default_rng(seed)) for seed in range(80)]
-    even = [set(np.diff(positions) % 16) == {4} for positions in draws]
-    assert 25 < sum(even) < 55
-    assert all(len(set(positions)) == 4 for positions in draws)
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_uneven_views_stay_around_the_subject(count):
+    """Neighbours are a position or more apart; no camera is further than one from where it is even."""
+    protocol = ViewProtocol("uneven", (count,), 4, "uneven")
+    draws = [protocol.draw(FULL, count, 16, np.random.default_rng(seed)) for seed in range(80)]
+    gaps = {tuple(np.diff([*positions, positions[0]]) % 16) for positions in draws}
+    assert all(len(set(positions)) == count for positions in draws)
+    assert all(max(g) <= 16 // count + 3 for g in gaps)
+    assert len(gaps) > 15
+
+
+def test_uneven_views_need_room():
+    """Positions that are closer than 3 could meet."""
+    protocol = ViewProtocol("uneven", (4,), 4, "uneven")
+    with pytest.raises(InputError, match=r"views\.training: expected any or even for 4 views of 8 positions"):
+        TrainingSampler({"a": tuple(range(8))}, protocol, TargetProtocol("release"), 8, 1, 0)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])
@@ -302,7 +311,7 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
         ({"views": V4 | {"training_counts": [1]}}, "views.training_counts: expected counts of at least 2"),
         (
             {"views": V4 | {"training": "odd"}},
-            "views.training: expected one of any, even, mixed",
+            "views.training: expected one of any, even, uneven",
         ),
         ({"views": V4 | {"trainign": "any"}}, "views key: expected one of .*; found 'trainign'"),
         ({"targets": {"name": "sideways"}}, "targets.kind: expected one of release, midway, random"),
