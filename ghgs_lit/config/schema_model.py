@@ -78,6 +78,7 @@ MODEL: dict[str, Kind] = {
     "model.pad": TEXT,
     "rounds.count": COUNT,
     "rounds.depths": COUNT,
+    "rounds.gains": FLAG,
     "rounds.hidden": WIDTH,
     "rounds.reach": SHARE,
     "rounds.training_counts": list_of(COUNT),

@@ -20,6 +20,7 @@ from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32, unproject_maps
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
+from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points
 
@@ -67,6 +68,7 @@ class Rounds(nn.Module):
         hidden: width of the network.
         depths: at how many depths around the current one a round compares the photographs.
         reach: how far these lie from it in the first round, as a share of the distance from near to far.
+        gains: whether photographs of cameras whose exposure differs are made alike first.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class Rounds(nn.Module):
         hidden: int = 48,
         depths: int = 8,
         reach: float = 0.25,
+        gains: bool = False,
     ):
         super().__init__()
         require(count >= 1, "rounds.count", "1 or more", count)
@@ -84,7 +87,7 @@ class Rounds(nn.Module):
         require(drawn, "rounds.training_counts", "numbers of 1 or more", list(training_counts))
         require(0 < reach <= 1, "rounds.reach", "a share above 0, at most 1", reach)
         self.count, self.training_counts = count, tuple(training_counts)
-        self.depths, self.reach = depths, reach
+        self.depths, self.reach, self.gains = depths, reach, gains
         self.view = nn.Sequential(
             nn.Linear(CHANNELS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
         )
@@ -106,6 +109,10 @@ class Rounds(nn.Module):
             activate: of the Gaussian head.
             batch: photographs, masks and cameras are read.
         """
+        if self.gains:
+            batch = equalized(state.gaussians.detach(), batch)
+            colored = activate(state.raw, batch, state.points, state.depth_maps)
+            state = dataclasses.replace(state, gaussians=colored)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
         for number in range(self._drawn() if self.training else self.count):
             change, memory = self._round(states[-1], batch, memory, 0.5**number)

@@ -1,0 +1,87 @@
+"""Photographs of cameras whose exposure or white balance differ, made alike.
+
+A point on the surface has the same colour in all views that see it, up to a gain of each camera and channel
+(Brown and Lowe, IJCV 2007, solve the same for panoramas).
+"""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.geometry.mattes import coverage, surface_colors
+from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.rendering import render
+from ghgs_lit.rounds.observation import looked_up
+from ghgs_lit.types import Batch, Gaussians
+
+#: Metres from the rendered surface at which a view counts a Gaussian as the surface that it shows, by 1 / e.
+_NEAR = 0.02
+#: Colours closer than this to black or white, which say little of a gain, count less.
+_DARK = 0.05
+#: Deviation of a logarithm of colours from the gains at which a Gaussian counts half: wrong depths, shadows.
+_OUTLIER = 0.15
+#: Logarithms of gains well below this are taken for an error of the estimate.
+_LEAST = 0.02
+#: Weight of no difference beside that of one Gaussian: decides where views share nothing.
+_PRIOR = 1.0
+#: Steps of reweighting.
+_STEPS = 5
+
+
+def equalized(gaussians: Gaussians, batch: Batch) -> Batch:
+    """The batch whose photographs are divided by their cameras' gains."""
+    gains = torch.exp(-log_gains(gaussians, batch))[..., None, None]
+    return dataclasses.replace(batch, images=(at_least_float32(batch.images) * gains).clamp(0, 1))
+
+
+@torch.no_grad()
+def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
+    """Natural logarithms of each camera's gains.
+
+    Their mean is about 0, as photographs do not tell which camera is right. Pairs of views vote with the
+    Gaussians that both see; each counts the less the more it deviates (Cauchy weights), so that wrong depths
+    do not decide. 0 where views share nothing.
+    """
+    with torch.autocast(gaussians.means.device.type, enabled=False):
+        ratios, weights = _compared(gaussians, batch)
+        b, views = batch.masks.shape[:2]
+        gains = ratios.new_zeros(b, views, 3)
+        own, element = gaussians.image, gaussians.image // views
+        for _ in range(_STEPS):
+            between = gains[element] - gains.flatten(0, 1)[own, None]
+            counted = weights / (1 + ((ratios - between) / _OUTLIER).square())
+            sums = ratios.new_zeros(2, b * views, views, 3)
+            sums[0].index_add_(0, own, counted)
+            sums[1].index_add_(0, own, counted * ratios)
+            gains = _solved(*sums.view(2, b, views, views, 3))
+        return gains * gains.square() / (gains.square() + _LEAST**2)
+
+
+def _compared(gaussians: Gaussians, batch: Batch) -> tuple[Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
+    """Logarithms of a Gaussian's colours in each view over that in its own photograph, and their weights."""
+    views = batch.masks.shape[1]
+    shares, depth = coverage(batch)[:, :, None], render(gaussians, batch.cameras).depth
+    maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2)
+    found, z, can_see = looked_up(gaussians, batch.cameras, maps)
+    color, share, depth = found.split((3, 1, 1), -1)
+    color = color / torch.where(share > 0, share, 1)
+    weights = torch.where(can_see, torch.exp(-((z - depth) / _NEAR).square()), 0)
+    weights = weights * (10 * share - 9).clamp(0, 1)
+    weights = weights * (torch.minimum(color, 1 - color) / _DARK).clamp(0, 1)
+    own = (gaussians.image % views)[:, None, None].expand(-1, 1, 3)
+    logs = color.clamp(min=_DARK / 8).log()
+    return logs - logs.gather(1, own), weights * weights.gather(1, own)
+
+
+def _solved(
+    counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"]
+) -> Float[Tensor, "B V 3"]:
+    """Gains whose differences, to a view (last V) from another one, explain the sums of differences."""
+    counts, differences = counts.movedim(-1, 1), differences.movedim(-1, 1)
+    both = counts + counts.mT
+    identity = torch.eye(both.shape[-1], dtype=both.dtype, device=both.device)
+    laplacian = torch.diag_embed(both.sum(-1)) - both + _PRIOR * identity
+    right = differences.sum(-2) - differences.sum(-1)
+    return torch.linalg.solve(laplacian, right).mT

@@ -1,0 +1,109 @@
+"""Cameras whose exposure differs: their gains are found, and divided out."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.data.imperfections import color_gains
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.rounds.gains import equalized, log_gains
+from ghgs_lit.types import Gaussians
+from tests.helpers.models import make_model
+from tests.helpers.scenes import make_batch
+
+
+def painted(batch=1, views=4):
+    """A surface whose colour is a function of the place in the world, so that all views agree about it."""
+    batch = make_batch(batch, views, spread=40.0)
+    points = unproject_maps(batch.depths, batch.cameras)
+    colors = 0.5 + 0.3 * torch.sin(points * torch.tensor([9.0, 5.0, 7.0])).movedim(-1, 2)
+    return dataclasses.replace(batch, images=colors * batch.masks[:, :, None])
+
+
+def splats(batch):
+    """Discs at the true points."""
+    image, pixel = batch.masks.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
+    n, counts = len(image), tuple(batch.masks.flatten(1).sum(1).tolist())
+    means = unproject_maps(batch.depths, batch.cameras).flatten(0, 1).flatten(1, 2)[image, pixel]
+    colors = batch.images.flatten(0, 1).flatten(2).mT[image, pixel]
+    turn = torch.tensor([1.0, 0, 0, 0]).expand(n, 4)
+    sizes = torch.full((n, 3), 0.01)
+    return Gaussians(means, turn, sizes, torch.full((n,), 0.95), colors, counts, image, pixel)
+
+
+def seen_with(batch, gains):
+    return dataclasses.replace(batch, images=batch.images * torch.as_tensor(gains)[..., None, None].float())
+
+
+def drawn(batch, seed=0, stops=0.5):
+    rng = np.random.default_rng(seed)
+    return np.stack([color_gains(batch.masks.shape[1], stops, stops / 2, rng) for _ in batch.masks])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gains_are_found(seed):
+    """Half a stop between cameras, to 3 %; photographs that are divided by them agree again."""
+    batch = painted(2)
+    gains = drawn(batch, seed)
+    dark = seen_with(batch, gains)
+    found = log_gains(splats(dark), dark)
+    assert np.abs(np.log(gains)).max() > 0.1
+    np.testing.assert_allclose(found, np.log(gains), atol=0.03)
+    before, after = ((x.images - batch.images).abs().mean() for x in (dark, equalized(splats(dark), dark)))
+    assert after < 0.2 * before
+
+
+def test_equal_cameras_stay_as_they_are():
+    """The estimate's own error is not taken for a gain."""
+    batch = painted(2)
+    assert log_gains(splats(batch), batch).abs().max() < 2e-3
+
+
+def test_wrong_depths_do_not_decide():
+    """A quarter of the surface lies 3 cm too deep and shows other colours."""
+    batch = painted()
+    gains = drawn(batch)
+    dark = seen_with(batch, gains)
+    surface = splats(dark)
+    chosen = torch.rand(len(surface), generator=torch.Generator().manual_seed(0)) < 0.25
+    direction = torch.nn.functional.normalize(surface.means - surface.means.mean(0), dim=-1)
+    means = surface.means - 0.03 * direction * chosen[:, None]
+    found = log_gains(dataclasses.replace(surface, means=means), dark)
+    np.testing.assert_allclose(found, np.log(gains), atol=0.04)
+
+
+def test_batch_mates_change_nothing():
+    both = painted(2)
+    dark = seen_with(both, drawn(both))
+    together = log_gains(splats(dark), dark)
+    for b in range(2):
+        parts = {name: getattr(dark, name)[[b]] for name in ("images", "masks", "cameras", "depths")}
+        alone = dataclasses.replace(dark, **parts)
+        torch.testing.assert_close(log_gains(splats(alone), alone), together[[b]], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_photographs_that_say_nothing_have_no_gains(value):
+    """Black or white all over; and no Gaussians at all."""
+    batch = painted()
+    flat = dataclasses.replace(batch, images=torch.full_like(batch.images, value))
+    assert not log_gains(splats(flat), flat).any()
+    nothing = splats(batch).select(slice(0, 0), (0,))
+    assert not log_gains(nothing, batch).any()
+
+
+def test_the_model_equalizes_before_its_rounds():
+    """Colours of the Gaussians are those of the equalized photographs; without the option they are not."""
+    batch = painted()
+    dark = seen_with(batch, drawn(batch))
+    with torch.no_grad():
+        plain, equal = (
+            make_model("model=recurrent", "skip=exact", f"rounds.gains={on}").eval()(dark)
+            for on in ("false", "true")
+        )
+    photos = dark.images.flatten(0, 1).flatten(2).mT
+    own = photos[plain.gaussians.image, plain.gaussians.pixel]
+    torch.testing.assert_close(plain.gaussians.colors, own)
+    assert (equal.gaussians.colors - own).abs().max() > 0.02
