@@ -43,6 +43,7 @@ def held_out(batch: Batch) -> Iterator[Batch]:
             batch,
             images=batch.images[:, others],
             masks=batch.masks[:, others],
+            alpha=None if batch.alpha is None else batch.alpha[:, others],
             cameras=batch.cameras[:, others],
             views=(tuple(batch.views[0][j] for j in others),),
             targets=targets,

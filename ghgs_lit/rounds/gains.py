@@ -5,6 +5,7 @@ A point on the surface has the same colour in all views that see it, up to a gai
 """
 
 import dataclasses
+import itertools
 
 import torch
 from jaxtyping import Float
@@ -26,14 +27,18 @@ _OUTLIER = 0.15
 _LEAST = 0.02
 #: Weight of no difference beside that of one Gaussian: decides where views share nothing.
 _PRIOR = 1.0
+#: Every which Gaussian is asked: a third is enough, and a third of the time.
+_EVERY = 3
 #: Steps of reweighting.
 _STEPS = 5
 
 
-def equalized(gaussians: Gaussians, batch: Batch) -> Batch:
-    """The batch whose photographs are divided by their cameras' gains."""
-    gains = torch.exp(-log_gains(gaussians, batch))[..., None, None]
-    return dataclasses.replace(batch, images=(at_least_float32(batch.images) * gains).clamp(0, 1))
+def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
+    """Gaussians and the photographs that they come from, divided by their cameras' gains."""
+    gains = torch.exp(-log_gains(gaussians.detach(), batch))
+    images = (at_least_float32(batch.images) * gains[..., None, None]).clamp(0, 1)
+    colors = gaussians.colors * gains.flatten(0, 1)[gaussians.image]
+    return dataclasses.replace(gaussians, colors=colors), dataclasses.replace(batch, images=images)
 
 
 @torch.no_grad()
@@ -45,10 +50,12 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
     do not decide. 0 where views share nothing.
     """
     with torch.autocast(gaussians.means.device.type, enabled=False):
-        ratios, weights = _compared(gaussians, batch)
+        depth = render(gaussians, batch.cameras).depth
+        some = _thinned(gaussians)
+        ratios, weights = _compared(some, batch, depth)
         b, views = batch.masks.shape[:2]
         gains = ratios.new_zeros(b, views, 3)
-        own, element = gaussians.image, gaussians.image // views
+        own, element = some.image, some.image // views
         for _ in range(_STEPS):
             between = gains[element] - gains.flatten(0, 1)[own, None]
             counted = weights / (1 + ((ratios - between) / _OUTLIER).square())
@@ -59,10 +66,20 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
         return gains * gains.square() / (gains.square() + _LEAST**2)
 
 
-def _compared(gaussians: Gaussians, batch: Batch) -> tuple[Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
+def _thinned(gaussians: Gaussians) -> Gaussians:
+    """Every so many of each element."""
+    device, splits = gaussians.means.device, gaussians.splits
+    ends = list(itertools.accumulate(splits))
+    kept = [torch.arange(end - n, end, _EVERY, device=device) for n, end in zip(splits, ends, strict=True)]
+    return gaussians.select(torch.cat(kept), tuple(map(len, kept)))
+
+
+def _compared(
+    gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "B V 1 H W"]
+) -> tuple[Float[Tensor, "N V 3"], Float[Tensor, "N V 3"]]:
     """Logarithms of a Gaussian's colours in each view over that in its own photograph, and their weights."""
     views = batch.masks.shape[1]
-    shares, depth = coverage(batch)[:, :, None], render(gaussians, batch.cameras).depth
+    shares = coverage(batch)[:, :, None]
     maps = torch.cat((batch.once(surface_colors) * shares, shares, depth), 2)
     found, z, can_see = looked_up(gaussians, batch.cameras, maps)
     color, share, depth = found.split((3, 1, 1), -1)

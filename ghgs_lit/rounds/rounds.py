@@ -20,10 +20,13 @@ from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32, unproject_maps
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
+from ghgs_lit.kernels.parts import at_once, even_parts
 from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points
 
+#: Gaussians whose views go through the network at once.
+_AT_ONCE = 1024
 #: Of :class:`Search`: how far from near to far a Gaussian is, and the distance between them.
 _PLACE = 2
 
@@ -110,9 +113,8 @@ class Rounds(nn.Module):
             batch: photographs, masks and cameras are read.
         """
         if self.gains:
-            batch = equalized(state.gaussians.detach(), batch)
-            colored = activate(state.raw, batch, state.points, state.depth_maps)
-            state = dataclasses.replace(state, gaussians=colored)
+            gaussians, batch = equalized(state.gaussians, batch)
+            state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
         for number in range(self._drawn() if self.training else self.count):
             change, memory = self._round(states[-1], batch, memory, 0.5**number)
@@ -129,15 +131,25 @@ class Rounds(nn.Module):
         gaussians = state.gaussians.detach()
         each = observe(gaussians, batch)
         search = self._search(state, batch, size * self.reach)
-        views, is_own = self.view(each), each[..., -1:]
-        others = views * (1 - is_own)
-        seen = ((views * is_own).sum(1), others.sum(1) / max(1, views.shape[1] - 1), others.amax(1))
-        known = (search.matches, search.place, gaussians.colors)
-        memory = torch.tanh(memory + self.memory(self.update(torch.cat((*seen, *known, memory), -1))))
+        rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
+        # In parts that fit a CPU's cache: half the time. Backward the number of operators counts for more.
+        count = len(memory)
+        most = count if torch.is_grad_enabled() else at_once(memory.device, _AT_ONCE, count)
+        parts = even_parts(count, most)
+        memory = torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
         return (moved, size * change[:, 1:]), memory
+
+    def _remembered(
+        self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
+    ) -> Float[Tensor, "n h"]:
+        """The memory after a look at what each view shows and what is known beside it."""
+        views, is_own = self.view(each), each[..., -1:]
+        others = views * (1 - is_own)
+        seen = ((views * is_own).sum(1), others.sum(1) / max(1, views.shape[1] - 1), others.amax(1))
+        return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
 
     @torch.no_grad()
     def _search(self, state: State, batch: Batch, reach: float) -> Search:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, Renderer
+from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.projection import unproject_maps, world_to_camera
 from ghgs_lit.types import Batch, Gaussians
 
@@ -31,7 +32,7 @@ def splats_at(
         quaternions=points.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(points), 4),
         scales=scale[:, None].expand(-1, 3),
         opacities=torch.full_like(scale, opacity),
-        colors=batch.images.movedim(2, -1)[valid],
+        colors=batch.once(surface_colors).movedim(2, -1)[valid],
         splits=tuple(valid.flatten(1).sum(1).tolist()),
         image=valid.flatten(0, 1).nonzero()[:, 0],
     )
