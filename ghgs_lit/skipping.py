@@ -160,5 +160,5 @@ def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tenso
         kept: patches that take part.
     """
     tokens = (kept.flatten(2).sum(-1) + encoder.aggregator.special).double()
-    width, both = encoder.dim_semantic, tokens.sum(1)
+    width, both = encoder.dim_latent // 2, tokens.sum(1)
     return 48 * width**2 * both + 4 * width * (tokens.square().sum(1) + both.square())

@@ -16,6 +16,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
 VERBS = (
     "train",
+    "pretext",
     "evaluate",
     "predict",
     "prepare",

@@ -40,6 +40,10 @@ VERBS = {
         "train a model and evaluate it",
         "ghgs train model=hull data=synthetic trainer.max_time=00:00:10:00",
     ),
+    "pretext": (
+        "train the semantic branch of an encoder on the parts of built-in people",
+        "ghgs pretext data=synthetic data/rig=varied trainer.max_time=00:00:15:00",
+    ),
     "evaluate": (
         "measure a checkpoint or the baselines",
         "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt",

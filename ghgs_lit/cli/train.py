@@ -12,6 +12,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
+from torch import nn
 
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
@@ -24,6 +25,7 @@ from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import (
+    Train,
     in_sweep,
     is_multirun,
     needs_own_process,
@@ -43,7 +45,7 @@ from ghgs_lit.training.interruption import StopAtStep
 from ghgs_lit.training.optimization import require_whole_parameters
 
 
-def _quiet() -> None:
+def quiet() -> None:
     """Silence Lightning's own lines, which Hydra would print twice, and warnings that do not apply here."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
@@ -62,6 +64,11 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
             if differing := start.switched(config):
                 print(f"the weights were trained in a different model: {', '.join(differing)}", flush=True)
+    return resume_step(config, model)
+
+
+def resume_step(config: dict[str, Any], model: nn.Module) -> int | None:
+    """The step that ``resume`` goes on at, None for a new run; ``model`` gets its weights."""
     if config["resume"] is None:
         return None
     step, changed = start.check_resume(config["resume"], model, config)
@@ -106,9 +113,18 @@ def run(cfg: DictConfig) -> float | str | None:
     if config["dry_run"]:
         return print_single_plan(config, run_directory)
     check_config(config)
+    return run_job(config, run_directory, train)
+
+
+def run_job(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
+    """What ``train`` returns; where it is interrupted, print how to go on.
+
+    Raises:
+        Interrupted: on Ctrl-C and SIGTERM.
+    """
     with interruptible():
         try:
-            return _run(config, run_directory)
+            return _run(config, run_directory, train)
         except Interrupted as stop:
             if rank_zero_only.rank == 0 and not stop.explained:
                 print_how_to_go_on(stop, str(run_directory.path), _changes_to_go_on(run_directory))
@@ -124,7 +140,7 @@ def _changes_to_go_on(run_directory: RunDirectory) -> str:
     return f"hydra.run.dir={run_directory.path} resume={run_directory.checkpoint}"
 
 
-def _run(config: dict[str, Any], run_directory: RunDirectory) -> float | str | None:
+def _run(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
     if needs_own_process(config):
         return train_in_own_process(run_directory)
     if rank_zero_only.rank == 0:
@@ -163,7 +179,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         config,
         None if budgets is None else TokenBudgets(budgets),
     )
-    _quiet()
+    quiet()
     cost = TrainingCost()
     trainer = build_trainer(config, directory, cost, StopAtStep())
     # Last of all checks: it makes the photographs that are missing.
@@ -188,7 +204,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
 
 def fit(
     trainer: L.Trainer,
-    module: GHGSModule,
+    module: L.LightningModule,
     data: L.LightningDataModule,
     config: dict[str, Any],
     step: int | None,

@@ -96,7 +96,8 @@ class FeatureCache(FeatureFiles):
         stored = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
         facts = [LAYOUT, encoder.options, self.fingerprint(encoder), stored, *_precision(images)]
         inputs = [images, kept]
-        if encoder.mask_input or encoder.bounds_input or self.tokens == "subject":
+        reads_masks = encoder.mask_input or encoder.bounds_input or encoder.semantic is not None
+        if reads_masks or self.tokens == "subject":
             inputs.append(masks)
         if encoder.bounds_input and bounds is not None:
             inputs += [bounds.near, bounds.far]

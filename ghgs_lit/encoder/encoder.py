@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
+from ghgs_lit.encoder.semantic import SemanticBranch
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
@@ -47,11 +48,13 @@ class VGGTEncoder(nn.Module):
             the smallest rectangle that holds the subject, ``subject`` those with a pixel of the subject. They
             keep their place in the photograph; a view with an empty mask keeps its special tokens only.
         margin: patches around them that stay, too.
+        semantic: the semantic features: None, the patch tokens that enter the aggregator; or ``{width, depth,
+            heads, channels, parts}`` of a :class:`SemanticBranch`, which does not learn here.
         layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
         trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
         checkpointing: recompute activations in the backward pass instead of keeping them.
-        weights: name of the published weights that the encoder started from, or None. A note for checkpoints
-            and tables; nothing is loaded.
+        weights: what the semantic features learned from, the name of published weights or ``pretext``, or
+            None. A note for checkpoints and tables; nothing is loaded.
     """
 
     def __init__(
@@ -68,6 +71,7 @@ class VGGTEncoder(nn.Module):
         bounds_input: bool = False,
         tokens: str = "all",
         margin: int = 1,
+        semantic: Mapping[str, int] | None = None,
         layer_scale: float = 0.01,
         trainable: str = "all",
         checkpointing: bool = False,
@@ -88,10 +92,12 @@ class VGGTEncoder(nn.Module):
             "mask_input": mask_input,
             "bounds_input": bounds_input,
         }
+        if semantic is not None:
+            self.options["semantic"] = dict(semantic)
         self.tokens, self.margin = tokens, margin
         self.weights = weights
         self.patch_size, self.mask_input, self.bounds_input = patch_size, mask_input, bounds_input
-        self.dim_latent, self.dim_semantic = 2 * width, width
+        self.dim_latent = 2 * width
         mean, std = (*IMAGENET_MEAN, *[0.5] * mask_input), (*IMAGENET_STD, *[0.5] * mask_input)
         channels = len(mean) + BOUNDS_CHANNELS * bounds_input
         # No part of a checkpoint, so they need storage even in a model that is built on the meta device.
@@ -103,6 +109,10 @@ class VGGTEncoder(nn.Module):
             patch_embed, patch_size, width, heads, depth, registers, layers, layer_scale, checkpointing
         )
         self._set_trainable(trainable, depth)
+        self.semantic = None
+        if semantic is not None:
+            self.semantic = SemanticBranch.of(semantic, patch_size).requires_grad_(False)
+        self.dim_semantic = width if self.semantic is None else self.semantic.parts
 
     def _set_trainable(self, trainable: str, depth: int) -> None:
         if trainable == "all":
@@ -128,8 +138,8 @@ class VGGTEncoder(nn.Module):
 
         Args:
             images: [B, V, 3, H, W], RGB in [0, 1], sides divisible by the patch size.
-            masks: [B, V, H, W]; read with ``mask_input`` or ``bounds_input``, and where ``tokens`` is not
-                ``all``.
+            masks: [B, V, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, and where
+                ``tokens`` is not ``all``.
             bounds: read with ``bounds_input``.
             cache: to look features up in (:mod:`ghgs_lit.encoder.cache`); None: compute them.
             kept: which patches take part; None: those of :meth:`keeps`.
@@ -151,11 +161,11 @@ class VGGTEncoder(nn.Module):
 
         ``embed`` takes the place of the patch embedding.
         """
-        kept = KeptPatches(kept, images.device)
+        chosen, kept = kept, KeptPatches(kept, images.device)
         pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept, embed)
         return Tokens(
             latent=tuple(_joined(pairs, kept, self.aggregator.special)),
-            semantic=patches.detach(),
+            semantic=patches.detach() if self.semantic is None else self.semantic(images, masks, chosen),
             image=kept.image,
             row=kept.row,
             column=kept.column,

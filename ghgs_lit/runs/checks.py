@@ -40,7 +40,14 @@ def _require_weights(config: Mapping[str, Any]) -> None:
     """A part of an encoder that does not learn must have learned before."""
     trainable = lookup(config, "encoder.trainable")
     starts = config.get("init_from") is not None or config.get("resume") is not None
-    if trainable in (None, "all") or starts or config.get("allow_random_encoder"):
+    if starts or config.get("allow_random_encoder"):
+        return
+    if lookup(config, "encoder.semantic") is not None:
+        raise InputError(
+            "init_from: expected a checkpoint of `ghgs pretext` for encoder.semantic, which does not learn in"
+            " training; found none: it would stay random (allow_random_encoder=true to try things out)"
+        )
+    if trainable in (None, "all"):
         return
     raise InputError(
         f"init_from: expected a checkpoint with the encoder's weights for encoder.trainable={trainable},"

@@ -87,11 +87,12 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
 
 
 def train_in_own_process(run: RunDirectory) -> float | str | None:
-    """Run this job as a ``ghgs train`` of its own: training in several processes cannot share its process.
+    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process.
 
     The new process locks the run, so that the lock stays when this process dies.
     """
-    command = [sys.executable, "-m", "ghgs_lit", "train", *HydraConfig.get().overrides.task]
+    hydra = HydraConfig.get()
+    command = [sys.executable, "-m", "ghgs_lit", hydra.job.name, *hydra.overrides.task]
     command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
     mode = {_VARIABLE: "wait" if _waits() else "skip"}
     code = _run_process(command, {**os.environ, **mode})

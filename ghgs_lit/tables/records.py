@@ -35,8 +35,8 @@ class Variant:
         name: name of the method.
         model, encoder: options of our model.
         switches: whether 3D unprojection and semantic consistency are on.
-        has_semantics: whether the encoder has published weights. It is not known before training starts, so
-            rows are not told apart by it.
+        has_semantics: whether the semantic features have learned parts: from published weights or in `ghgs
+            pretext`. It is not known before training starts, so rows are not told apart by it.
         extra: further configuration keys and their values that tell rows apart.
     """
 
@@ -122,13 +122,15 @@ def _shipped_encoders() -> dict[str, dict]:
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
-    """The option of conf/encoder that a configuration has; ``unnamed`` where it is another."""
+    """The option of conf/encoder that a configuration has, and whether it has a semantic branch; ``unnamed``
+    where it is another."""
     encoder = config.get("encoder")
     encoder = encoder if isinstance(encoder, Mapping) else {}
+    branch = ", semantic branch" * (encoder.get("semantic") is not None)
     for name, shipped in sorted(_shipped_encoders().items()):
         if all(key in encoder and encoder[key] == shipped.get(key) for key in _ENCODER_KEYS):
-            return name
-    return "unnamed"
+            return name + branch
+    return "unnamed" + branch
 
 
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
@@ -154,7 +156,7 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
         model=", ".join(model),
         encoder=encoder_name(config),
         switches=switches_of(config),
-        # Without published weights an encoder has seen the photographs of this data only.
+        # Without such weights an encoder has learned from the loss of the rendering only.
         has_semantics=bool(lookup(config, "encoder.weights")),
         extra=tuple((key, str(lookup(config, key))) for key in by),
     )

@@ -1,25 +1,20 @@
-"""The LightningModule: steps, optimizer and logging calls around the model."""
+"""The LightningModule of training: steps and logging calls around the model."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import lightning.pytorch as L
-import numpy as np
 import torch
-from lightning.pytorch.callbacks import Timer
 from torch import Tensor, nn
 
-from ghgs_lit.errors import InputError
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import PSNR, depth_error_mm
 from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.training.base import BudgetedModule
 from ghgs_lit.training.budgets import TokenBudgets, token_budget
-from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -28,21 +23,18 @@ def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
     return depth_error_mm(maps.depth.flatten(0, 1), batch.depths.flatten(0, 1), valid.flatten(0, 1))
 
 
-class GHGSModule(L.LightningModule):
+class GHGSModule(BudgetedModule):
     """Trains a model through a renderer.
 
     Args:
         model: gives the Gaussians and depths of a batch.
         renderer: draws Gaussians from cameras.
         losses: the terms that are trained on.
-        optimization: optimizer, schedule and gradient clipping.
-        config: the run's full configuration as plain data; every checkpoint contains it.
+        optimization, config: as of :class:`BudgetedModule`.
         token_budgets: drawn from in each training step; None: the model stays as it is configured.
 
     Attributes:
         guard: looks for steps whose loss or gradient is not finite.
-        clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
-        used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
     """
 
     def __init__(
@@ -54,17 +46,12 @@ class GHGSModule(L.LightningModule):
         config: Mapping[str, Any],
         token_budgets: TokenBudgets | None = None,
     ):
-        super().__init__()
-        self.model = model
+        super().__init__(model, optimization, config)
         self.renderer = renderer
         self.losses = losses
-        self.optimization = optimization
-        self.config = config
         self.token_budgets = token_budgets
         self.guard = Guard(optimization.skip_nonfinite)
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
-        self.used_budget = 0.0
-        self.clock = StepClock()
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         """The prediction for a batch, and its Gaussians as the batch's target cameras see them."""
@@ -73,20 +60,6 @@ class GHGSModule(L.LightningModule):
         rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
         self.clock.mark("render")
         return prediction, rendering
-
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        # Lightning copies structures that it does not know one tensor after the other, and waits for each.
-        return batch.to(device, non_blocking=device.type != "cpu")
-
-    def on_train_start(self) -> None:
-        # After a restart the scheduler asks for the first time when a step has been taken.
-        self.used_budget = self.progress()
-
-    def step_seed(self, batch_idx: int) -> int:
-        """Seed of the random numbers of this step; it does not depend on interruptions of the run."""
-        part = batch_idx % self.trainer.accumulate_grad_batches
-        numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
-        return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
     def draw_budget(self, batch_idx: int) -> str | int | None:
         """The token budget of this step: the same in all processes, so that none waits for a larger one."""
@@ -147,36 +120,6 @@ class GHGSModule(L.LightningModule):
                 found[f"val/depth_error_mm_before_round_{number + 1}"] = error
         return found
 
-    def progress(self) -> float:
-        """Share of the budget in [0, 1] that is used: of steps or of time, whichever is larger."""
-        trainer = self.trainer
-        shares = [self.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
-        for timer in (c for c in trainer.callbacks if isinstance(c, Timer)):
-            used, left = timer.time_elapsed(), timer.time_remaining()
-            if left is not None:
-                share = torch.tensor(used / max(used + left, 1e-9), device=self.device)
-                # Clocks differ between processes; learning rates must not.
-                together = trainer.world_size > 1 and used > 0
-                shares.append(float(trainer.strategy.reduce(share, reduce_op="max") if together else share))
-        if not shares:
-            raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
-        return min(max(shares), 1.0)
-
-    @property
-    def _scaler(self) -> torch.amp.GradScaler | None:
-        """What scales the loss, so that gradients of half precision (``16-mixed``) do not vanish."""
-        return getattr(self.trainer.precision_plugin, "scaler", None)
-
-    def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = self.optimization.build(self.model, fused=self._scaler is None)
-
-        def factor(_: int) -> float:
-            self.used_budget = self.progress()
-            return self.optimization.factor(self.used_budget)
-
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
         """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
 
@@ -198,17 +141,8 @@ class GHGSModule(L.LightningModule):
                 return
         self.guard.accept()
 
-    def on_train_batch_end(self, *args: Any) -> None:
-        # Called after all callbacks: what they did since the step ended is not counted.
-        self.clock.restart()
-
-    def on_validation_end(self) -> None:
-        self.on_train_batch_end()
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
-        checkpoint["format_version"] = FORMAT_VERSION
-        checkpoint["config"] = dict(self.config)
+        super().on_save_checkpoint(checkpoint)
         checkpoint["skipped_steps"] = self.guard.skipped
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

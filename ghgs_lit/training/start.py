@@ -110,7 +110,7 @@ def initialize(
 
 
 def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any]:
-    """``config`` with the origin of the encoder's weights, where the start has one and all of them fit.
+    """``config`` with the origin of the encoder's semantic features, where the start has one and all fit.
 
     Tables read ``encoder.weights`` to know whether the features carry semantics.
     """
@@ -119,10 +119,11 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
         return config
     checkpoint = read_checkpoint(path)
     origin, state = lookup(checkpoint["config"], "encoder.weights"), model_state(checkpoint)
-    fits = all(
+    has_branch = lookup(config, "encoder.semantic") is not None
+    fits = has_branch == (lookup(checkpoint["config"], "encoder.semantic") is not None) and all(
         name in state and state[name].shape == tensor.shape
         for name, tensor in model.state_dict().items()
-        if name.startswith("encoder.")
+        if name.startswith("encoder.semantic." if has_branch else "encoder.")
     )
     return {**config, "encoder": {**config["encoder"], "weights": origin}} if origin and fits else config
 

@@ -55,6 +55,15 @@ def test_a_partly_frozen_encoder_needs_weights_too():
         check_config(config("encoder.trainable=last_1"))
 
 
+def test_a_semantic_branch_needs_weights():
+    """It does not learn in training, so that it would stay random."""
+    branch = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8, parts: 16}"
+    with pytest.raises(InputError, match="init_from: expected a checkpoint of `ghgs pretext`"):
+        check_config(config(branch))
+    check_config(config(branch, "init_from=pretext.ckpt"))
+    check_config(config(branch, "allow_random_encoder=true"))
+
+
 def test_a_feature_cache_that_cannot_pay_is_refused():
     """Each order of random views is a file of its own: terabytes, and hardly a hit."""
     frozen = ("feature_cache.directory=features", "encoder.trainable=none", "allow_random_encoder=true")

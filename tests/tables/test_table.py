@@ -94,6 +94,15 @@ def test_lpips_is_shown_when_every_run_has_it(tmp_path):
     assert "3-view FLIP ↓" in to_markdown(table)
 
 
+@pytest.mark.parametrize(("weights", "semantic"), [("pretext", True), (None, False)])
+def test_a_branch_that_has_learned_parts_needs_no_footnote(tmp_path, weights, semantic):
+    """A random branch (`allow_random_encoder`) carries no more than any other random features."""
+    encoder = {"semantic": {"width": 64}, "weights": weights}
+    write_run(tmp_path / "0", "full", 20.0, encoder=encoder)
+    (table,) = tables_of(tmp_path, views=(3,))
+    assert (NO_SEMANTICS not in to_markdown(table)) is semantic
+
+
 def test_notes_and_caption_say_what_the_numbers_are(tmp_path):
     """Readers see data, protocol, code states and settings that differ."""
     write_run(tmp_path / "0", "full", 20.0, git={"commit": "a" * 40, "changed": False})

@@ -1,0 +1,58 @@
+"""``ghgs pretext``: train the semantic branch of an encoder on built-in people."""
+
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+from lightning.pytorch.utilities import rank_zero_only
+from omegaconf import DictConfig
+
+from ghgs_lit.cli.inputs import build_data
+from ghgs_lit.cli.runtime import announce, output_dir, write_config
+from ghgs_lit.cli.train import build_trainer, fit, quiet, resume_step, run_job
+from ghgs_lit.config import build, resolve
+from ghgs_lit.encoder.semantic import SemanticBranch
+from ghgs_lit.errors import require
+from ghgs_lit.pretext.module import Pretext, PretextModule
+from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.training import loggers
+from ghgs_lit.training.interruption import StopAtStep
+
+
+def run(cfg: DictConfig) -> float | str | None:
+    """The verb: train the branch; returns its part accuracy on validation people.
+
+    Raises:
+        Interrupted: on Ctrl-C and SIGTERM.
+    """
+    return run_job(resolve(cfg), RunDirectory(output_dir()), pretrain)
+
+
+def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+    """Train the branch and save it; arguments as of :func:`ghgs_lit.cli.train.train`."""
+    # A note for the tables of models that start from this checkpoint.
+    config = {**config, "encoder": {**config["encoder"], "weights": "pretext"}}
+    options, patch_size = config["encoder"]["semantic"], config["encoder"]["patch_size"]
+    require(options is not None, "encoder.semantic", "the options of a branch to train", None)
+    if rank_zero_only.rank == 0:
+        write_config(config, directory)
+    L.seed_everything(config["seed"], workers=True, verbose=False)
+    data = build_data(config)
+    fits = not any(side % patch_size for side in data.options.size)
+    require(fits, "data.size", f"sides divisible by the patch size {patch_size}", list(data.options.size))
+    model = Pretext(SemanticBranch.of(options, patch_size))
+    step = resume_step(config, model)
+    module = PretextModule(model, build(config["optimizer"], "optimizer"), config)
+    quiet()
+    trainer = build_trainer(config, directory, StopAtStep())
+    try:
+        fit(trainer, module, data, config, step, stats)
+        checkpoint = directory / "checkpoints" / "last.ckpt"
+        trainer.save_checkpoint(checkpoint)
+        found = trainer.validate(module, data, verbose=False)[0]["val/part_accuracy"]
+        if trainer.is_global_zero:
+            print(f"the nearest patch of another view shows the same part: {found:.1%}", flush=True)
+            announce(checkpoint)
+        return found
+    finally:
+        loggers.close(trainer.loggers)

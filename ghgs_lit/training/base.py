@@ -1,0 +1,94 @@
+"""What every LightningModule of this package shares: schedule over the run's budget, plain checkpoints."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Timer
+from torch import nn
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.training.clock import StepClock
+from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+
+
+class BudgetedModule(L.LightningModule):
+    """A module whose learning rate follows the share of the run's budget that is used.
+
+    Args:
+        model: whose parameters learn; checkpoints hold its tensors.
+        optimization: optimizer, schedule and gradient clipping.
+        config: the run's full configuration as plain data; every checkpoint contains it.
+
+    Attributes:
+        clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
+        used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
+    """
+
+    def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any]):
+        super().__init__()
+        self.model = model
+        self.optimization = optimization
+        self.config = config
+        self.used_budget = 0.0
+        self.clock = StepClock()
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        # Lightning copies structures that it does not know one tensor after the other, and waits for each.
+        return batch.to(device, non_blocking=device.type != "cpu")
+
+    def on_train_start(self) -> None:
+        # After a restart the scheduler asks for the first time when a step has been taken.
+        self.used_budget = self.progress()
+
+    def step_seed(self, batch_idx: int) -> int:
+        """Seed of the random numbers of this step; it does not depend on interruptions of the run."""
+        part = batch_idx % self.trainer.accumulate_grad_batches
+        numbers = [self.config.get("seed", 0), self.global_step, part, self.global_rank]
+        return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+    def progress(self) -> float:
+        """Share of the budget in [0, 1] that is used: of steps or of time, whichever is larger."""
+        trainer = self.trainer
+        shares = [self.global_step / trainer.max_steps] if trainer.max_steps > 0 else []
+        for timer in (c for c in trainer.callbacks if isinstance(c, Timer)):
+            used, left = timer.time_elapsed(), timer.time_remaining()
+            if left is not None:
+                share = torch.tensor(used / max(used + left, 1e-9), device=self.device)
+                # Clocks differ between processes; learning rates must not.
+                together = trainer.world_size > 1 and used > 0
+                shares.append(float(trainer.strategy.reduce(share, reduce_op="max") if together else share))
+        if not shares:
+            raise InputError("trainer.max_steps: expected steps or trainer.max_time; found neither")
+        return min(max(shares), 1.0)
+
+    @property
+    def _scaler(self) -> torch.amp.GradScaler | None:
+        """What scales the loss, so that gradients of half precision (``16-mixed``) do not vanish."""
+        return getattr(self.trainer.precision_plugin, "scaler", None)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        optimizer = self.optimization.build(self.model, fused=self._scaler is None)
+
+        def factor(_: int) -> float:
+            self.used_budget = self.progress()
+            return self.optimization.factor(self.used_budget)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_train_batch_end(self, *args: Any) -> None:
+        # Called after all callbacks: what they did since the step ended is not counted.
+        self.clock.restart()
+
+    def on_validation_end(self) -> None:
+        self.on_train_batch_end()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
+        checkpoint["format_version"] = FORMAT_VERSION
+        checkpoint["config"] = dict(self.config)
