@@ -5,6 +5,7 @@
 Measures checkpoints of `ghgs pretext` and of models, beside colours and a branch that has learned nothing,
 on validation people; overrides are those of conf/pretext.yaml. A patch's part is that of most of its pixels;
 `limbs` does not tell left from right. `true shares` has features as a branch that knows the shares would.
+Last: milliseconds of one core for a branch and for the whole encoder around it, of random weights.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
-from ghgs_lit.config import compose, resolve
+from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import SemanticBranch
 from ghgs_lit.geometry.masks import patches_around_subject
@@ -81,6 +82,16 @@ def merged_sides() -> Tensor:
     return torch.tensor([names.index(name) for name in names])
 
 
+def fastest(call: Callable[[], object], repeats: int = 30) -> float:
+    """The least CPU seconds of a call with one thread, which other processes disturb little."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
 @torch.no_grad()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -99,26 +110,30 @@ def main() -> None:
     data, limbs = build_data(config), merged_sides()
     data.prepare_data(["val"])
     right = {name: torch.zeros(2) for name in [*rows, "true shares"]}
-    seconds, count = dict.fromkeys(right, float("inf")), 0
+    count = 0
     for batch in data.val_dataloader():
         kept = KeptPatches(patches_around_subject(batch.masks, patch_size, 0), batch.images.device)
         shares = part_shares(batch, patch_size)[kept.index]
         known, part = shares.any(1), shares.argmax(1)
         count += int(known.sum())
         for name, features in {**rows, "true shares": lambda *_, shares=shares: shares.sqrt()}.items():
-            start = time.perf_counter()
             values = features(batch, kept)
-            seconds[name] = min(seconds[name], time.perf_counter() - start)
             for column, parts in enumerate((part, limbs[part])):
                 shown = neighbor_shows_part(values[known], parts[known], kept.image[known])
                 right[name][column] += shown.sum()
     print(
         f"{count} patches of {len(data.subjects('val'))} people, {config['views']['evaluation_count']} views"
     )
-    print("| features | parts | limbs | ms |\n|---|---|---|---|")
+    print("| features | parts | limbs |\n|---|---|---|")
     for name, found in right.items():
-        parts, either = (found / count).tolist()
-        print(f"| {name} | {parts:.1%} | {either:.1%} | {1e3 * seconds[name]:.1f} |")
+        print(f"| {name} | {found[0] / count:.1%} | {found[1] / count:.1%} |")
+    torch.set_num_threads(1)
+    encoder = build(config["encoder"], "encoder").eval()
+    kept = encoder.keeps(batch.masks)
+    branch = fastest(lambda: encoder.semantic(batch.images, batch.masks, kept))
+    whole = fastest(lambda: encoder(batch.images, batch.masks))
+    size = tuple(batch.images.shape)
+    print(f"the branch takes {1e3 * branch:.1f} of the encoder's {1e3 * whole:.1f} ms, photographs {size}")
 
 
 if __name__ == "__main__":
