@@ -49,7 +49,7 @@ def quiet() -> None:
     """Silence Lightning's own lines, which Hydra would print twice, and warnings that do not apply here."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
-    for message in (*messages, "The dirpath has changed"):
+    for message in (*messages, "The dirpath has changed", "overridden `transfer_batch_to_device`"):
         warnings.filterwarnings("ignore", f".*{message}.*")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ghgs_lit import GHGS
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
 from ghgs_lit.tables.records import model_variant
 from tests.helpers.people import render_boxes
@@ -84,6 +85,10 @@ def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_pat
     assert len(branch) > 10
     for name in branch:
         assert torch.equal(before[name], after[name]), name
+    model = GHGS.from_checkpoint(tmp_path / "checkpoints" / "last.ckpt")
+    for name, value in model.encoder.semantic.named_parameters():
+        assert torch.equal(value, before[f"model.encoder.semantic.{name}"]), name
+        assert not value.requires_grad
     config = json.loads((tmp_path / "metrics.json").read_text())["provenance"]["config"]
     variant = model_variant(config, "metrics.json")
     assert variant.has_semantics
