@@ -20,6 +20,11 @@ NORM_EPS = 1e-5
 OPTIONS = ("width", "depth", "heads", "channels", "parts")
 
 
+def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
+    """Square roots of shares, whose cosine is the overlap of two distributions."""
+    return (0.5 * log_shares).exp()
+
+
 class SemanticBranch(nn.Module):
     """A stem and a few blocks over the subject's patches of one view; ``ghgs pretext`` trains it.
 
@@ -95,6 +100,6 @@ class SemanticBranch(nn.Module):
         """Features of the patches in ``kept``; 0 (cosine 0 with all others) where there is no subject."""
         every = KeptPatches(kept, images.device)
         own = KeptPatches(kept.to(masks.device) & self.subject(masks), images.device)
-        features = (0.5 * self.log_shares(images, masks, own)).exp()
+        features = features_of(self.log_shares(images, masks, own))
         places = torch.searchsorted(every.index, own.index)
         return features.new_zeros(len(every.index), self.parts).index_copy(0, places, features)

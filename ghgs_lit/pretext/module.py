@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.semantic import SemanticBranch
+from ghgs_lit.encoder.semantic import SemanticBranch, features_of
 from ghgs_lit.errors import require
 from ghgs_lit.pretext.labels import part_shares
 from ghgs_lit.pretext.measure import neighbor_shows_part
@@ -62,7 +62,7 @@ class PretextModule(BudgetedModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         log_shares, shares, kept = self.model(batch)
-        features, part = (0.5 * log_shares).exp(), shares.argmax(1)
+        features, part = features_of(log_shares), shares.argmax(1)
         element = kept.image // batch.images.shape[1]
         for b in range(len(batch.images)):
             rows = shares.any(1) & (element == b)

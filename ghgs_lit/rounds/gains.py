@@ -35,7 +35,7 @@ _STEPS = 5
 
 def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
     """Gaussians and the photographs that they come from, divided by their cameras' gains."""
-    gains = torch.exp(-log_gains(gaussians.detach(), batch))
+    gains = torch.exp(-log_gains(gaussians, batch))
     images = (at_least_float32(batch.images) * gains[..., None, None]).clamp(0, 1)
     colors = gaussians.colors * gains.flatten(0, 1)[gaussians.image]
     return dataclasses.replace(gaussians, colors=colors), dataclasses.replace(batch, images=images)
