@@ -27,6 +27,7 @@ from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -131,6 +132,7 @@ def main() -> None:
     parser.add_argument("checkpoints", type=Path, nargs="+")
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--size", type=int, help="side in pixels; none: the first checkpoint's")
+    parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
     parser.add_argument("--out", type=Path, default=Path("captures.json"))
     options = parser.parse_args()
     config = resolve(compose("evaluate", ["data=synthetic", "metrics.lpips=off"]))
@@ -141,7 +143,9 @@ def main() -> None:
     data = {name: data_of(capture, options.people, size) for name, capture in CAPTURES.items()}
     results = {}
     for path in options.checkpoints:
-        method = ModelMethod(GHGS.from_checkpoint(path, device), renderer)
+        model, rounds = GHGS.from_checkpoint(path, device), options.refine_cameras
+        cameras = CameraRefinement(rounds, model, renderer) if rounds else None
+        method = ModelMethod(model, renderer, cameras=cameras)
         results[str(path)] = {
             name: means(measure(method, name, batches(capture, data["clean"], data[name]), metrics, device))
             for name, capture in CAPTURES.items()

@@ -24,7 +24,7 @@ from ghgs_lit.evaluation.baselines import nearest_view, splatted
 from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.refinement import Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.types import Batch, Targets
 from ghgs_lit.visualization.pictures import save_png, to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("checkpoints", type=Path, nargs="+")
     parser.add_argument("--size", type=int, help="side of the crops in pixels; none: the first checkpoint's")
     parser.add_argument("--refine", type=int, default=0, help="steps of optimisation of each prediction")
+    parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct all cameras first")
     parser.add_argument("--out", type=Path, default=Path("held_out"))
     options = parser.parse_args()
     config = resolve(compose("evaluate", ["data=synthetic"]))
@@ -72,6 +73,9 @@ def main() -> None:
     refinement = Refinement(options.refine, renderer) if options.refine else None
     for path in options.checkpoints:
         methods[str(path)] = ModelMethod(GHGS.from_checkpoint(path, device), renderer, refinement)
+    if options.refine_cameras:  # by the first checkpoint, from all photographs: the calibration is theirs
+        model = methods[str(options.checkpoints[0])].model
+        batch = CameraRefinement(options.refine_cameras, model, renderer)(batch.to(device))
     rows = []
     with torch.no_grad():
         for one in held_out(batch.to(device)):

@@ -17,7 +17,7 @@ from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.model import GHGS
-from ghgs_lit.refinement import Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import StepTime
@@ -168,6 +168,9 @@ def test_everything_is_measured_there(tmp_path):
         methods = {name: baseline(name, REFERENCE, build, *options) for name in BASELINES}
         methods["model"] = ModelMethod(build().eval(), REFERENCE)
         methods["refined"] = ModelMethod(build().eval(), REFERENCE, Refinement(1, REFERENCE))
+        refined = build().eval()
+        cameras = CameraRefinement(1, refined, REFERENCE)
+        methods["cameras"] = ModelMethod(refined, REFERENCE, cameras=cameras)
         found = []
         for name, method in methods.items():
             found += measure(method, name, [full_batch()], metrics.to(device), device, tmp_path, 1)

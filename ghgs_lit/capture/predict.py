@@ -14,6 +14,8 @@ from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
+from ghgs_lit.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED, file_of
@@ -24,14 +26,16 @@ class CapturePrediction:
     """What a model makes of a capture, in the user's world and unit.
 
     Attributes:
-        batch: what the model saw: crops around the subject, with their cameras.
+        batch: what the model saw: crops around the subject, with their cameras, corrected ones where asked.
         prediction: of this batch.
         seconds: run time by stage.
+        moved: pixels that correcting moved the subject by in each crop; nothing where cameras stay.
     """
 
     batch: Batch
     prediction: Prediction
     seconds: dict[str, float] = field(default_factory=dict)
+    moved: tuple[float, ...] = ()
 
     @property
     def gaussians(self) -> Gaussians:
@@ -40,7 +44,10 @@ class CapturePrediction:
 
 @torch.no_grad()
 def predict(
-    capture: Capture, model: GHGS | str | Path = SHIPPED, size: int | tuple[int, int] | None = None
+    capture: Capture,
+    model: GHGS | str | Path = SHIPPED,
+    size: int | tuple[int, int] | None = None,
+    refine_cameras: int = 0,
 ) -> CapturePrediction:
     """The Gaussians of a capture.
 
@@ -50,6 +57,8 @@ def predict(
             one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
             (checkpoints only).
+        refine_cameras: rounds that correct the cameras until the photographs agree
+            (:class:`CameraRefinement`), such as 2 for calibrations that are good to a pixel or two; 0: none.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
@@ -63,13 +72,20 @@ def predict(
     batch = capture.batch(image_size("size", size))
     cropped = time.perf_counter()
     batch = batch.to(next(model.parameters()).device)
+    seconds, moved = {"crop": cropped - begin}, ()
+    if refine_cameras:
+        taken = batch
+        batch = CameraRefinement(refine_cameras, model, Renderer())(taken)
+        moved = tuple(pixels_moved(taken, batch)[0])
+        seconds["refine_cameras"] = time.perf_counter() - cropped
+    start = time.perf_counter()
     # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
     frame = Frame.of(batch)
     prediction = frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
-    seconds = {"crop": cropped - begin, "predict": time.perf_counter() - cropped}
-    return CapturePrediction(batch, prediction, seconds)
+    seconds["predict"] = time.perf_counter() - start
+    return CapturePrediction(batch, prediction, seconds, moved)
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:

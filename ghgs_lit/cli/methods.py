@@ -9,7 +9,7 @@ from ghgs_lit.cli.inputs import MODEL_NODES, build_renderer
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.refinement import Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
@@ -17,7 +17,8 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
     """The model of ``config["checkpoint"]``, and facts about it for results.
 
     Args:
-        config: of the verb; its model is that of the checkpoint. ``refine`` may be missing: none.
+        config: of the verb; its model is that of the checkpoint. ``refine`` and
+            ``refine_cameras`` may be missing: none.
         device: where it runs.
     """
     path, renderer = config["checkpoint"], build_renderer(config, device)
@@ -33,7 +34,10 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
     if "global_step" in checkpoint:
         facts["training"] = {"steps": checkpoint["global_step"]}
     refinement = Refinement(config["refine"], renderer) if config.get("refine") else None
-    return ModelMethod(model.to(device).eval(), renderer, refinement), facts
+    model = model.to(device).eval()
+    rounds = config.get("refine_cameras")
+    cameras = CameraRefinement(rounds, model, renderer) if rounds else None
+    return ModelMethod(model, renderer, refinement, cameras), facts
 
 
 def baselines_of(

@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.export import output_options, write_prediction
 from ghgs_lit.export.video import write_mp4
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.refinement import Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement, pixels_moved
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
@@ -79,11 +80,19 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     check_size(data, model)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    begin = time.perf_counter()
+    seconds, begin = {}, time.perf_counter()
+    if config["refine_cameras"]:
+        taken = batch
+        batch = CameraRefinement(config["refine_cameras"], model, renderer)(taken)
+        seconds["refine_cameras"] = time.perf_counter() - begin
+        begin = time.perf_counter()
     prediction = model(dataclasses.replace(batch, targets=None))
     if device.type == "cuda":
         torch.cuda.synchronize()
-    facts = {"checkpoint": config["checkpoint"], "seconds": {"predict": time.perf_counter() - begin}}
+    seconds["predict"] = time.perf_counter() - begin
+    facts = {"checkpoint": config["checkpoint"], "seconds": seconds}
+    if config["refine_cameras"]:
+        facts |= cameras_moved(pixels_moved(taken, batch)[0])
     facts |= chosen_preset(model, prediction)
     prediction = refined(prediction, batch, renderer, config["refine"], facts)
     write(directory, batch, prediction, renderer, options, facts)
@@ -114,12 +123,14 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             waited = time.perf_counter() - start
             if number < len(folder.instants):
                 captures.append(pool.submit(folder.read, folder.instants[number]))
-            result = predict(capture, model, size)
+            result = predict(capture, model, size, config["refine_cameras"])
             facts = {
                 "checkpoint": config["checkpoint"],
                 "seconds": {"read": waited, **result.seconds},
                 **chosen_preset(model, result.prediction),
             }
+            if result.moved:
+                facts |= cameras_moved(result.moved)
             prediction = refined(result.prediction, result.batch, renderer, config["refine"], facts)
             start = time.perf_counter()
             place = directory / name if several else directory
@@ -146,6 +157,12 @@ def load(config: dict[str, Any]) -> tuple[GHGS, Renderer, torch.device]:
     model.load(config["checkpoint"])
     model.precision = config["precision"]
     return model.to(device).eval(), renderer, device
+
+
+def cameras_moved(pixels: Sequence[float]) -> dict[str, Any]:
+    """For the report, and printed: how far correcting the cameras moved the subject in each photograph."""
+    print(f"refine_cameras: moved by {', '.join(f'{value:.2f}' for value in pixels)} pixels", flush=True)
+    return {"refine_cameras": list(pixels)}
 
 
 def refined(

@@ -239,6 +239,7 @@ KINDS: dict[str, Kind] = {
     "optimizer.warmup": number(least=0, below=1),
     "optimizer.weight_decay": AMOUNT,
     "refine": integer(least=0),
+    "refine_cameras": integer(least=0),
     "renderer.alpha_max": SHARE,
     "renderer.antialiased": FLAG | NULL,
     "renderer.backend": TEXT,

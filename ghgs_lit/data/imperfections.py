@@ -12,6 +12,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from torch import Tensor
 
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.motion import rigid, without_common
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.types import Cameras
@@ -91,7 +92,8 @@ def miscalibrated(
     """Cameras that are off: each is turned, moved across its axis and has another focal length.
 
     A camera's error is drawn up to ``pixels``: what the corners of its mask's box move by at the subject's
-    distance (root of the mean square).
+    distance (root of the mean square). What all cameras share is taken out, as photographs do not tell where
+    a rig is: only differences between cameras can be undone.
 
     Args:
         cameras: ``V`` of one subject.
@@ -130,9 +132,44 @@ def miscalibrated(
     # Far from the world's origin these are not exactly the corners.
     true = project(points, lens, pose)[0]
     errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
+
+    def size(lens: Tensor, pose: Tensor) -> Tensor:
+        """Errors in pixels."""
+        pixels = project(points, *(matrix[:, None].expand(-1, 4, -1, -1) for matrix in (lens, pose)))[0]
+        return (pixels - true).square().sum(-1).mean(-1).sqrt()
+
     for _ in range(3):  # errors grow nearly in proportion
-        lens, pose = (matrix[:, None].expand(-1, 4, -1, -1) for matrix in moved(errors))
-        found = (project(points, lens, pose)[0] - true).square().sum(-1).mean(-1).sqrt()
-        errors = errors * (wanted / found)[:, None]
-    lens, pose = (matrix.to(cameras.intrinsics) for matrix in moved(errors))
-    return Cameras(lens, pose, cameras.height, cameras.width)
+        errors = errors * (wanted / size(*moved(errors)))[:, None]
+    lens, pose = _apart(cameras, *moved(errors))
+    largest = size(lens, pose).amax()
+    if largest > pixels:
+        lens, pose = _apart(cameras, *moved(errors * (pixels / largest)))
+    return Cameras(lens.to(cameras.intrinsics), pose.to(cameras.extrinsics), cameras.height, cameras.width)
+
+
+def _apart(
+    cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
+) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
+    """Intrinsics and extrinsics without what their differences from ``cameras`` have in common."""
+    true, middle = cameras.extrinsics.double(), look_at_point(cameras).double()
+    rotations, back = pose[:, :3, :3], true[:, :3, :3].mT
+    turn = back @ rotations  # about the subject, in the world's axes
+    vector = torch.stack(
+        (turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]), -1
+    )
+    shift = (back @ ((rotations - true[:, :3, :3]) @ middle + pose[:, :3, 3] - true[:, :3, 3])[..., None])[
+        ..., 0
+    ]
+    motions = torch.cat((vector / 2, shift), -1)
+    turn, shift = rigid(without_common(motions, true[:, 2, :3]))
+    moved = true.clone()
+    moved[:, :3, :3] = true[:, :3, :3] @ turn
+    moved[:, :3, 3] += ((true[:, :3, :3] - moved[:, :3, :3]) @ middle) + (true[:, :3, :3] @ shift[..., None])[
+        ..., 0
+    ]
+    zoom = (
+        lens.diagonal(dim1=-2, dim2=-1)[:, :2] / cameras.intrinsics.double().diagonal(dim1=-2, dim2=-1)[:, :2]
+    )
+    focal = lens.clone()
+    focal[:, [0, 1], [0, 1]] = lens[:, [0, 1], [0, 1]] / zoom.mean(0)
+    return focal, moved

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
-from ghgs_lit.refinement import Refinement
+from ghgs_lit.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Cameras, Decision, Gaussians, Prediction, Rendering
@@ -49,13 +49,16 @@ Method = Callable[[Batch], Estimate]
 
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, the renderer of its Gaussians, and what refines them before (None: nothing)."""
+    """A model, the renderer of its Gaussians, and what refines these and the cameras (None: nothing)."""
 
     model: nn.Module
     renderer: Renderer
     refinement: Refinement | None = None
+    cameras: CameraRefinement | None = None
 
     def __call__(self, batch: Batch) -> Estimate:
+        if self.cameras is not None:
+            batch = self.cameras(batch)
         prediction = self.model(batch)
         gaussians = prediction.gaussians
         if self.refinement is not None:

@@ -59,6 +59,16 @@ class Frame:
         inside = Cameras(cameras.intrinsics.to(dtype), moved.to(dtype), cameras.height, cameras.width)
         return dataclasses.replace(batch, cameras=inside)
 
+    def leave_cameras(self, inside: Cameras, world: Cameras) -> Cameras:
+        """Cameras in the frame as cameras in the world, in the precision of ``world``, those that entered."""
+        extrinsics = world.extrinsics.double().clone()
+        extrinsics[..., :3, :3] = inside.extrinsics[..., :3, :3].double() @ self.axes[:, None]
+        to_origin = (extrinsics[..., :3, :3] @ self.origin[:, None, :, None])[..., 0]
+        extrinsics[..., :3, 3] = (
+            inside.extrinsics[..., :3, 3].double() * self.metre[:, None, None] - to_origin
+        )
+        return dataclasses.replace(world, extrinsics=extrinsics.to(world.extrinsics))
+
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
         """A prediction in the frame as one in the world.
 

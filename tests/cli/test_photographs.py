@@ -55,6 +55,26 @@ def test_photographs_become_a_splat_where_the_subject_is(here, checkpoint, capsy
     assert {"read", "crop", "predict"} <= set(report["seconds"])
 
 
+def test_cameras_are_corrected_where_asked(here, checkpoint, capsys):
+    """The report says by how many pixels; the splat is where the corrected cameras see the subject."""
+    cameras = Figure(scale=1000.0).write(here / "images")
+    run = (
+        f"checkpoint={checkpoint}",
+        "formats=[ply]",
+        "turntable.frames=0",
+        "device=cpu",
+        "refine_cameras=1",
+    )
+    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", *run) == 0
+    report = json.loads((here / "splat" / "report.json").read_text())
+    moved = report["refine_cameras"]
+    assert len(moved) == 4
+    assert 0 < max(moved) < 3
+    assert f"refine_cameras: moved by {moved[0]:.2f}, {moved[1]:.2f}," in capsys.readouterr().out
+    assert report["seconds"]["refine_cameras"] > 0
+    assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95
+
+
 def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
     cameras = Figure().write(here / "images" / "000")
     shutil.copytree(here / "images" / "000", here / "images" / "001")

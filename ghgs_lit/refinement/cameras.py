@@ -1,0 +1,157 @@
+"""Extrinsics of a capture, corrected until the photographs agree with one another.
+
+A calibration that is off by a pixel or two costs a model several dB: views contradict one another. A
+prediction says where: what the other views say of a view is drawn with that view's camera and compared with
+its photograph, and the camera moves until they fit. A view's own Gaussians take no part, as they reproduce
+its photograph wherever its camera is. Bundle adjustment with a rendering loss is that of BARF (Lin et al.,
+ICCV 2021).
+
+Photographs do not tell where the whole rig is, so cameras only move beside one another
+(:mod:`ghgs_lit.geometry.motion`).
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import HEIGHT, Frame
+from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.motion import rigid, without_common
+from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
+
+Renderer = Callable[..., Rendering]
+
+#: Steps of the optimiser in each round, and its first step: radians, and half heights of the subject.
+_STEPS, _RATE = 15, 0.006
+#: Weight of the silhouettes beside that of colours.
+_OUTLINE = 0.5
+#: Metres between depths of one surface.
+_SAME = 0.05
+#: Weight of the squared motion: exact cameras stay nearly where they are.
+_STAY = 4.0
+
+
+@dataclass(frozen=True)
+class _Views:
+    """What is drawn in each of the ``n`` views of a batch, and what it is compared with."""
+
+    gaussians: Gaussians
+    own: Int[Tensor, " N"]
+    cameras: Cameras
+    photographs: Float[Tensor, "n 3 H W"]
+    silhouettes: Float[Tensor, "n H W"]
+    depths: Float[Tensor, "n H W"]
+
+
+class CameraRefinement:
+    """``refinement(batch)``: the batch with cameras that agree better.
+
+    Args:
+        rounds: how often the batch is predicted and its cameras are corrected, 1 or more; two are nearly all.
+        predict: gives the Gaussians of a batch, as a model does.
+        renderer: draws them, with gradients.
+    """
+
+    def __init__(self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer):
+        require(rounds >= 1, "refine_cameras", "1 or more rounds", rounds)
+        self.rounds, self.predict, self.renderer = rounds, predict, renderer
+
+    def __call__(self, batch: Batch) -> Batch:
+        """The batch with corrected extrinsics; targets stay as they are.
+
+        Args:
+            batch: photographs, masks and cameras, of two views or more.
+        """
+        frame = Frame.of(batch)
+        inside = frame.enter(batch)
+        for _ in range(self.rounds):
+            with torch.no_grad():
+                prediction = self.predict(inside)
+            inside = dataclasses.replace(inside, cameras=self._corrected(prediction, inside))
+        return dataclasses.replace(batch, cameras=frame.leave_cameras(inside.cameras, batch.cameras))
+
+    def _corrected(self, prediction: Prediction, batch: Batch) -> Cameras:
+        cameras = batch.cameras
+        views = _views(prediction, batch)
+        axes = cameras.extrinsics[..., 2, :3]
+        raw = torch.zeros(*axes.shape[:2], 6, dtype=axes.dtype, device=axes.device, requires_grad=True)
+        # Without an epsilon: gradients shrink with the size of the photographs.
+        optimizer = torch.optim.Adam([raw], lr=_RATE, betas=(0.8, 0.95), eps=1e-15)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
+        for _ in range(_STEPS):
+            with torch.autocast(axes.device.type, enabled=False), torch.enable_grad():
+                motion = without_common(raw, axes)
+                drawn = self.renderer(_moved(views, motion), views.cameras, background=0.0)
+                optimizer.zero_grad()
+                (_loss(drawn, views, batch) + _STAY * motion.square().sum()).backward()
+                optimizer.step()
+            schedule.step()
+        rotations, shifts = rigid(without_common(raw.detach(), axes), HEIGHT / 2)
+        extrinsics = cameras.extrinsics.clone()
+        extrinsics[..., :3, 3] += (extrinsics[..., :3, :3] @ shifts[..., None])[..., 0]
+        extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotations
+        return Cameras(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
+
+
+def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
+    """How far the subject moved in each view's photograph: the root mean square over a box around it."""
+    frame = Frame.of(before)
+    corners = HEIGHT / 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], device=before.masks.device)] * 3)
+    seen = []
+    for batch in (before, after):
+        cameras = frame.enter(batch).cameras
+        shape = (*cameras.extrinsics.shape[:2], len(corners))
+        lenses, poses = (
+            matrix[:, :, None].expand(*shape, -1, -1) for matrix in (cameras.intrinsics, cameras.extrinsics)
+        )
+        seen.append(project(corners.to(lenses).expand(*shape, 3), lenses, poses)[0])
+    return (seen[0] - seen[1]).square().sum(-1).mean(-1).sqrt().tolist()
+
+
+def _views(prediction: Prediction, batch: Batch) -> _Views:
+    """Each view as an element of its own, with the Gaussians of its element's other views."""
+    b, v = batch.masks.shape[:2]
+    gaussians = prediction.gaussians.detach()
+    element = gaussians.image // v
+    kept = [((element == i // v) & (gaussians.image != i)).nonzero()[:, 0] for i in range(b * v)]
+    counts = tuple(map(len, kept))
+    others = gaussians.select(torch.cat(kept), counts)
+    if others.metre is not None:
+        others = dataclasses.replace(others, metre=others.metre.repeat_interleave(v))
+    own = torch.repeat_interleave(torch.tensor(counts, device=element.device))
+    cameras = batch.cameras
+    lenses, poses = (matrix.flatten(0, 1)[:, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
+    apart = Cameras(lenses, poses, cameras.height, cameras.width)
+    photographs = at_least_float32(on_black(batch)).flatten(0, 1)
+    return _Views(
+        others,
+        own,
+        apart,
+        photographs,
+        coverage(batch).flatten(0, 1),
+        prediction.depth.detach().flatten(0, 1),
+    )
+
+
+def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
+    """The Gaussians of each view, moved as if its camera had moved the other way; their axes stay."""
+    rotations, shifts = (value.flatten(0, 1)[views.own] for value in rigid(motion, HEIGHT / 2))
+    means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
+    return dataclasses.replace(views.gaussians, means=means)
+
+
+def _loss(drawn: Rendering, views: _Views, batch: Batch) -> Tensor:
+    """L1 of colours and silhouettes, for each pixel of the subject; summed over elements."""
+    image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
+    # Where no other view shows the surface of the photograph, one sees through to what lies behind it.
+    same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
+    errors = same * (image - views.photographs).abs().mean(1) + _OUTLINE * (alpha - views.silhouettes).abs()
+    shape = batch.masks.shape[:2]
+    subject, errors = (each.reshape(*shape, -1).sum((1, 2)) for each in (views.silhouettes, errors))
+    return (errors / torch.where(subject > 0, subject, 1)).sum()

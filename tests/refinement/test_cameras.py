@@ -1,0 +1,129 @@
+"""Cameras of a capture: corrected where photographs contradict one another, and otherwise left alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.data.imperfections import miscalibrated
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.baselines import splats_at
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Cameras
+from tests.helpers.scenes import painted_ellipsoid, ring
+
+RENDERER = Renderer("cpu")
+
+
+@dataclasses.dataclass
+class Splats:
+    """What a model that knows the depths would predict with the cameras that it is given."""
+
+    gaussians: object
+    depth: object
+
+
+def predictor(truth):
+    """Splats at the true depth along each photograph's rays, in the subject's frame of 1.8 m."""
+    depths = (truth.depths.double() / Frame.of(truth).metre[:, None, None, None]).float()
+    return lambda batch: Splats(splats_at(batch, depths, batch.masks, sigma=0.5), depths)
+
+
+def scene(batch=1, views=4, size=70):
+    """Photographs of painted ellipsoids, with their depths."""
+    cameras = ring(batch, views, size, size)
+    images, masks, depths = painted_ellipsoid(cameras)
+    return Batch(images, masks, cameras, depths=depths)
+
+
+def off(batch, pixels=2.0, seeds=(0,)):
+    """The batch with cameras that are off by up to ``pixels``."""
+    found = [
+        miscalibrated(batch.cameras[b], batch.masks[b], pixels, np.random.default_rng(seed))
+        for b, seed in enumerate(seeds)
+    ]
+    stacked = (torch.stack([getattr(one, name) for one in found]) for name in ("intrinsics", "extrinsics"))
+    return dataclasses.replace(batch, cameras=Cameras(*stacked, batch.cameras.height, batch.cameras.width))
+
+
+def contradiction(batch, truth):
+    """Reprojection error in pixels of surface points, triangulated from where photographs show them."""
+    points = unproject_maps(truth.depths, truth.cameras)[truth.masks].double()[::7]
+    lens, pose = truth.cameras.intrinsics[0, :, None].double(), truth.cameras.extrinsics[0, :, None].double()
+    lenses, poses = (
+        batch.cameras.intrinsics[0, :, None].double(),
+        batch.cameras.extrinsics[0, :, None].double(),
+    )
+
+    def seen(points, lens, pose):
+        shape = (len(lens), len(points))
+        return project(points.expand(*shape, 3), lens.expand(*shape, 3, 3), pose.expand(*shape, 4, 4))[0]
+
+    true = seen(points, lens, pose)
+    rays = torch.cat((true, torch.ones_like(true[..., :1])), -1) @ torch.linalg.inv(lenses[:, 0]).mT
+    rays = torch.nn.functional.normalize(rays @ poses[:, 0, :3, :3], dim=-1)
+    centers = -(poses[:, 0, :3, :3].mT @ poses[:, 0, :3, 3:])[:, None]
+    across = torch.eye(3).double() - rays[..., :, None] * rays[..., None, :]
+    found = torch.linalg.solve(across.sum(0), (across @ centers).sum(0))[..., 0]
+    return float((seen(found, lenses, poses) - true).square().sum(-1).mean().sqrt())
+
+
+@pytest.mark.parametrize("views", [3, 4])
+def test_views_agree_better(views):
+    """The whole rig may stay where the errors have moved it; its cameras must fit one another."""
+    truth = scene(views=views)
+    wrong = off(truth)
+    found = CameraRefinement(3, predictor(truth), RENDERER)(wrong)
+    assert contradiction(found, truth) < 0.6 * contradiction(wrong, truth)
+    assert torch.equal(found.cameras.intrinsics, wrong.cameras.intrinsics)
+    rotation = found.cameras.extrinsics[0, :, :3, :3].double()
+    identity = torch.eye(3).double().expand(views, 3, 3)
+    torch.testing.assert_close(rotation @ rotation.mT, identity, rtol=0, atol=1e-6)
+    assert max(pixels_moved(wrong, found)[0]) > 0.3
+
+
+def test_exact_cameras_stay():
+    """A user who asks for it without need must not lose."""
+    truth = scene()
+    found = CameraRefinement(2, predictor(truth), RENDERER)(truth)
+    assert max(pixels_moved(truth, found)[0]) < 0.2
+    assert contradiction(truth, truth) < 1e-4
+
+
+def test_elements_are_corrected_as_if_alone():
+    """A result must not depend on batch mates."""
+    truth = scene(batch=2, size=42)
+    wrong = off(truth, seeds=(0, 5))
+    together = CameraRefinement(1, predictor(truth), RENDERER)(wrong)
+    for b in range(2):
+        one = Batch(wrong.images[[b]], wrong.masks[[b]], wrong.cameras[[b]])
+        own = Batch(truth.images[[b]], truth.masks[[b]], truth.cameras[[b]], depths=truth.depths[[b]])
+        alone = CameraRefinement(1, predictor(own), RENDERER)(one)
+        torch.testing.assert_close(
+            alone.cameras.extrinsics[0], together.cameras.extrinsics[b], rtol=0, atol=2e-5
+        )
+
+
+def test_any_unit_and_origin():
+    """Millimetres and a far origin: the same motion in pixels."""
+    truth = scene(size=42)
+    wrong = off(truth)
+    expected = pixels_moved(wrong, CameraRefinement(1, predictor(truth), RENDERER)(wrong))
+    far = wrong.cameras.extrinsics.double().clone()
+    far[..., :3, 3] *= 1000
+    far[..., :3, 3] -= far[..., :3, :3] @ torch.tensor([3e6, 2e5, -1e6], dtype=torch.float64)
+    cameras = Cameras(wrong.cameras.intrinsics, far, 42, 42)
+    moved = dataclasses.replace(wrong, cameras=cameras, depths=None)
+    # The refinement predicts in the subject's own frame, in which lengths are the same.
+    found = CameraRefinement(1, predictor(truth), RENDERER)(moved)
+    assert found.cameras.extrinsics.dtype == torch.float64
+    np.testing.assert_allclose(pixels_moved(moved, found), expected, atol=0.01)
+
+
+def test_no_rounds_are_refused():
+    with pytest.raises(InputError, match="refine_cameras: expected 1 or more rounds"):
+        CameraRefinement(0, predictor(scene(size=28)), RENDERER)
