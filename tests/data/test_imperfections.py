@@ -124,6 +124,26 @@ def test_calibration_errors_move_the_subject_by_their_pixels(limit):
     assert 0.3 < errors.mean() < 0.6
 
 
+def test_calibration_errors_have_nothing_in_common():
+    """Photographs do not tell where a rig is, nor its scale: what all cameras share cannot be undone."""
+    cameras, masks, _ = ring()
+    true = cameras.extrinsics
+    middle = torch.tensor([0, 0.9, 0]).double()
+    for seed in range(10):
+        found = miscalibrated(cameras, masks, 3.0, np.random.default_rng(seed))
+        zoom = found.intrinsics[:, 0, 0] / cameras.intrinsics[:, 0, 0]
+        assert zoom.std() > 1e-3
+        assert abs(zoom.mean() - 1) < 1e-6
+        back = true[:, :3, :3].mT
+        turn = back @ found.extrinsics[:, :3, :3]
+        angles = turn - turn.mT
+        assert angles.mean(0).abs().max() < 0.03 * angles.abs().max()
+        seen = found.extrinsics[:, :3, :3] @ middle + found.extrinsics[:, :3, 3]
+        shift = (back @ (seen - true[:, :3, 3])[..., None])[..., 0] - middle
+        along = (shift * true[:, 2, :3]).sum(-1)
+        assert along.mean().abs() < 0.1 * along.abs().max()
+
+
 def test_calibration_errors_do_not_depend_on_the_worlds_origin():
     """A world whose origin is a kilometre away has the same errors, up to the rounding of rotations."""
     results = []

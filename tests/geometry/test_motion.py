@@ -1,0 +1,26 @@
+"""Motions of cameras beside one another."""
+
+import torch
+
+from ghgs_lit.geometry.motion import rigid, without_common
+
+
+def test_what_cameras_share_is_taken_out_and_the_rest_stays():
+    """A turn, a shift, and a way along the optical axes that all have; differences keep their size."""
+    g = torch.Generator().manual_seed(0)
+    axes = torch.nn.functional.normalize(torch.randn(2, 4, 3, generator=g), dim=-1)
+    motions = torch.randn(2, 4, 6, generator=g)
+    shared = torch.randn(2, 1, 6, generator=g).expand(-1, 4, -1).clone()
+    apart = without_common(motions, axes)
+    torch.testing.assert_close(without_common(motions + shared, axes), apart, rtol=0, atol=1e-5)
+    assert (apart[..., :3].mean(1)).abs().max() < 1e-6
+    assert (apart[..., 3:] * axes).sum(-1).mean(1).abs().max() < 1e-6
+    turns = motions[..., :3] - motions[..., :3].mean(1, keepdim=True)
+    torch.testing.assert_close(apart[..., :3], turns)
+
+
+def test_small_motions_turn_and_shift_points():
+    """A turn by a hundredth moves a point by that share of its distance from the axis; shifts have a unit."""
+    rotation, shift = rigid(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.5]), length=2.0)
+    point = rotation @ torch.tensor([1.0, 0.0, 0.0]) + shift
+    torch.testing.assert_close(point, torch.tensor([1.0, 0.01, 1.0]), rtol=0, atol=1e-4)
