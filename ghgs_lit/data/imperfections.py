@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt, zoom
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.motion import rigid, without_common
+from ghgs_lit.geometry.motion import after_motions, motions_between, without_common
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.types import Cameras
@@ -111,10 +111,7 @@ def miscalibrated(
     distances = (poses[:, 2, :3] * look_at_point(cameras)).sum(-1) + poses[:, 2, 3]
     expected = "cameras that look at the subject"
     require(bool((distances > 0).all()), "augmentation.calibration", expected, distances.tolist())
-    masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
-    lines = [mask.any(axis).nonzero()[:, 0] for mask in masks for axis in (0, 1)]
-    ends = torch.stack([torch.stack((line[0], line[-1] + 1)) for line in lines]).reshape(count, 2, 2)
-    corners = torch.stack([ends[:, [0, 1], [i, j]] for i in (0, 1) for j in (0, 1)], 1).double()
+    corners = _corners(masks)
 
     def moved(errors: Tensor) -> tuple[Tensor, Tensor]:
         """Intrinsics and extrinsics after errors [V, 6], each in pixels about."""
@@ -127,17 +124,17 @@ def miscalibrated(
         lens[:, [0, 1], [0, 1]] *= 1 + errors[:, 5:] / half
         return lens, pose
 
-    lens, pose = (matrix[:, None].expand(-1, 4, -1, -1) for matrix in (lenses, poses))
-    points = unproject(corners, distances[:, None].expand(-1, 4), lens, pose)
-    # Far from the world's origin these are not exactly the corners.
-    true = project(points, lens, pose)[0]
-    errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
+    points = unproject(corners, distances[:, None].expand(-1, 4), _of_each(lenses), _of_each(poses))
+
+    def seen(lens: Tensor, pose: Tensor) -> Tensor:
+        """Where cameras see the corners; far from the world's origin not exactly at them."""
+        return project(points, _of_each(lens), _of_each(pose))[0]
 
     def size(lens: Tensor, pose: Tensor) -> Tensor:
         """Errors in pixels."""
-        pixels = project(points, *(matrix[:, None].expand(-1, 4, -1, -1) for matrix in (lens, pose)))[0]
-        return (pixels - true).square().sum(-1).mean(-1).sqrt()
+        return (seen(lens, pose) - seen(lenses, poses)).square().sum(-1).mean(-1).sqrt()
 
+    errors = wanted[:, None] * directions / directions.norm(dim=-1, keepdim=True)
     for _ in range(3):  # errors grow nearly in proportion
         errors = errors * (wanted / size(*moved(errors)))[:, None]
     lens, pose = _apart(cameras, *moved(errors))
@@ -147,29 +144,27 @@ def miscalibrated(
     return Cameras(lens.to(cameras.intrinsics), pose.to(cameras.extrinsics), cameras.height, cameras.width)
 
 
+def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
+    """Corners of the boxes around masks, in pixels; those of the photograph where a mask is empty."""
+    masks = torch.where(masks.any((1, 2), keepdim=True), masks, True)
+    lines = [mask.any(axis).nonzero()[:, 0] for mask in masks for axis in (0, 1)]
+    ends = torch.stack([torch.stack((line[0], line[-1] + 1)) for line in lines]).reshape(len(masks), 2, 2)
+    return torch.stack([ends[:, [0, 1], [i, j]] for i in (0, 1) for j in (0, 1)], 1).double()
+
+
+def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
+    """A camera's matrix for each of its corners."""
+    return matrices[:, None].expand(-1, 4, -1, -1)
+
+
 def _apart(
     cameras: Cameras, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
     """Intrinsics and extrinsics without what their differences from ``cameras`` have in common."""
     true, middle = cameras.extrinsics.double(), look_at_point(cameras).double()
-    rotations, back = pose[:, :3, :3], true[:, :3, :3].mT
-    turn = back @ rotations  # about the subject, in the world's axes
-    vector = torch.stack(
-        (turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]), -1
-    )
-    shift = (back @ ((rotations - true[:, :3, :3]) @ middle + pose[:, :3, 3] - true[:, :3, 3])[..., None])[
-        ..., 0
-    ]
-    motions = torch.cat((vector / 2, shift), -1)
-    turn, shift = rigid(without_common(motions, true[:, 2, :3]))
-    moved = true.clone()
-    moved[:, :3, :3] = true[:, :3, :3] @ turn
-    moved[:, :3, 3] += ((true[:, :3, :3] - moved[:, :3, :3]) @ middle) + (true[:, :3, :3] @ shift[..., None])[
-        ..., 0
-    ]
-    zoom = (
-        lens.diagonal(dim1=-2, dim2=-1)[:, :2] / cameras.intrinsics.double().diagonal(dim1=-2, dim2=-1)[:, :2]
-    )
-    focal = lens.clone()
-    focal[:, [0, 1], [0, 1]] = lens[:, [0, 1], [0, 1]] / zoom.mean(0)
-    return focal, moved
+    motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
+    focal = [0, 1]
+    zoom = lens[:, focal, focal] / cameras.intrinsics.double()[:, focal, focal]
+    lens = lens.clone()
+    lens[:, focal, focal] /= zoom.mean(0)
+    return lens, after_motions(true, motions, middle)

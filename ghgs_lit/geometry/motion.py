@@ -28,6 +28,33 @@ def without_common(
 def rigid(
     motions: Float[Tensor, "*n 6"], length: float = 1.0
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-    """Rotations, which are exact rotations up to small angles' vectors, and shifts times ``length``."""
+    """Rotations by vectors, which are theirs up to small angles, and shifts times ``length``."""
     turn, shift = motions.split(3, -1)
     return quaternion_to_matrix(torch.cat((torch.ones_like(turn[..., :1]), turn / 2), -1)), length * shift
+
+
+def motions_between(
+    before: Float[Tensor, "V 4 4"], after: Float[Tensor, "V 4 4"], middle: Float[Tensor, "3"]
+) -> Float[Tensor, "V 6"]:
+    """Small motions of points about ``middle``: what ``before`` sees after them, ``after`` sees without."""
+    back = before[:, :3, :3].mT
+    turn = back @ after[:, :3, :3]
+    turn = (turn - turn.mT) / 2
+    vector = torch.stack((turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]), -1)
+    # Differences first: far from the world's origin the two sums are large.
+    seen = (after - before)[:, :3, :3] @ middle + (after - before)[:, :3, 3]
+    return torch.cat((vector, (back @ seen[..., None])[..., 0]), -1)
+
+
+def after_motions(
+    extrinsics: Float[Tensor, "*n 4 4"],
+    motions: Float[Tensor, "*n 6"],
+    middle: Float[Tensor, "3"],
+    length: float = 1.0,
+) -> Float[Tensor, "*n 4 4"]:
+    """Cameras that see points as these see them after :func:`rigid` motions about ``middle``."""
+    rotations, shifts = rigid(motions, length)
+    moved, axes = extrinsics.clone(), extrinsics[..., :3, :3]
+    moved[..., :3, :3] = axes @ rotations
+    moved[..., :3, 3] += (axes - moved[..., :3, :3]) @ middle + (axes @ shifts[..., None])[..., 0]
+    return moved

@@ -21,7 +21,7 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.mattes import coverage, on_black
-from ghgs_lit.geometry.motion import rigid, without_common
+from ghgs_lit.geometry.motion import after_motions, rigid, without_common
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
@@ -92,10 +92,8 @@ class CameraRefinement:
                 (_loss(drawn, views, batch) + _STAY * motion.square().sum()).backward()
                 optimizer.step()
             schedule.step()
-        rotations, shifts = rigid(without_common(raw.detach(), axes), HEIGHT / 2)
-        extrinsics = cameras.extrinsics.clone()
-        extrinsics[..., :3, 3] += (extrinsics[..., :3, :3] @ shifts[..., None])[..., 0]
-        extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotations
+        motion = without_common(raw.detach(), axes)
+        extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
         return Cameras(cameras.intrinsics, extrinsics, cameras.height, cameras.width)
 
 

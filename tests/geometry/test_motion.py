@@ -2,7 +2,8 @@
 
 import torch
 
-from ghgs_lit.geometry.motion import rigid, without_common
+from ghgs_lit.geometry.motion import after_motions, motions_between, rigid, without_common
+from tests.helpers.scenes import ring
 
 
 def test_what_cameras_share_is_taken_out_and_the_rest_stays():
@@ -24,3 +25,19 @@ def test_small_motions_turn_and_shift_points():
     rotation, shift = rigid(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.5]), length=2.0)
     point = rotation @ torch.tensor([1.0, 0.0, 0.0]) + shift
     torch.testing.assert_close(point, torch.tensor([1.0, 0.01, 1.0]), rtol=0, atol=1e-4)
+
+
+def test_cameras_that_moved_tell_their_motions():
+    """Also where the middle is a kilometre away from the world's origin."""
+    middle = torch.tensor([1000.0, 1.0, -500.0], dtype=torch.float64)
+    before = ring(1, 4, 42, 42).extrinsics[0].double()
+    before[:, :3, 3] -= before[:, :3, :3] @ middle
+    motions = 1e-3 * torch.randn(4, 6, generator=torch.Generator().manual_seed(1)).double()
+    after = after_motions(before, motions, middle)
+    found = motions_between(before, after, middle)
+    torch.testing.assert_close(found, motions, rtol=1e-5, atol=1e-9)
+    point = middle + 0.3
+    rotations, shifts = rigid(motions)
+    moved = (rotations @ (point - middle)) + middle + shifts
+    seen = (before[:, :3, :3] @ moved[..., None])[..., 0] + before[:, :3, 3]
+    torch.testing.assert_close(after[:, :3, :3] @ point + after[:, :3, 3], seen, rtol=0, atol=1e-9)

@@ -1,6 +1,7 @@
 """Two processes, each with half of a batch, against one process with all of it."""
 
 import dataclasses
+import gc
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -68,4 +69,7 @@ def _process(rank: int, config: Mapping[str, Any], batch: Batch, kind: str, fold
     shared(_halves(batch)[rank].to(device)).backward()
     if rank == 0:
         torch.save(gradient_row(shared.module), f"{folder}/gradients")
+    # Before the group: as its last owner, DDP waits for gloo's thread while that waits for Python's lock.
+    del shared
+    gc.collect()
     dist.destroy_process_group()
