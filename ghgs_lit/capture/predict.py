@@ -74,8 +74,7 @@ def predict(
     batch = batch.to(next(model.parameters()).device)
     seconds, moved = {"crop": cropped - begin}, ()
     if refine_cameras:
-        taken = batch
-        batch = CameraRefinement(refine_cameras, model, Renderer())(taken)
+        taken, batch = batch, CameraRefinement(refine_cameras, model, Renderer())(batch)
         moved = tuple(pixels_moved(taken, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - cropped
     start = time.perf_counter()

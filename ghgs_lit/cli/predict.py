@@ -80,19 +80,17 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     check_size(data, model)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    seconds, begin = {}, time.perf_counter()
+    facts, seconds, begin = {"checkpoint": config["checkpoint"]}, {}, time.perf_counter()
     if config["refine_cameras"]:
-        taken = batch
-        batch = CameraRefinement(config["refine_cameras"], model, renderer)(taken)
+        taken, batch = batch, CameraRefinement(config["refine_cameras"], model, renderer)(batch)
+        facts |= cameras_moved(pixels_moved(taken, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - begin
         begin = time.perf_counter()
     prediction = model(dataclasses.replace(batch, targets=None))
     if device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - begin
-    facts = {"checkpoint": config["checkpoint"], "seconds": seconds}
-    if config["refine_cameras"]:
-        facts |= cameras_moved(pixels_moved(taken, batch)[0])
+    facts["seconds"] = seconds
     facts |= chosen_preset(model, prediction)
     prediction = refined(prediction, batch, renderer, config["refine"], facts)
     write(directory, batch, prediction, renderer, options, facts)

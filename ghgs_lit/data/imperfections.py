@@ -163,8 +163,8 @@ def _apart(
     """Intrinsics and extrinsics without what their differences from ``cameras`` have in common."""
     true, middle = cameras.extrinsics.double(), look_at_point(cameras).double()
     motions = without_common(motions_between(true, pose, middle), true[:, 2, :3])
-    focal = [0, 1]
-    zoom = lens[:, focal, focal] / cameras.intrinsics.double()[:, focal, focal]
+    both = [0, 1]
+    zoom = lens[:, both, both] / cameras.intrinsics.double()[:, both, both]
     lens = lens.clone()
-    lens[:, focal, focal] /= zoom.mean(0)
+    lens[:, both, both] /= zoom.mean(0)
     return lens, after_motions(true, motions, middle)

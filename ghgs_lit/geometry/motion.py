@@ -28,7 +28,7 @@ def without_common(
 def rigid(
     motions: Float[Tensor, "*n 6"], length: float = 1.0
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:
-    """Rotations by vectors, which are theirs up to small angles, and shifts times ``length``."""
+    """Rotation matrices, by the vectors up to second order in their angles, and shifts times ``length``."""
     turn, shift = motions.split(3, -1)
     return quaternion_to_matrix(torch.cat((torch.ones_like(turn[..., :1]), turn / 2), -1)), length * shift
 
