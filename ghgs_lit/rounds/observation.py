@@ -7,7 +7,6 @@ from torch import Tensor
 
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.projection import at_least_float32, project
-from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
@@ -47,12 +46,21 @@ def looked_up(
     gaussians: Gaussians, cameras: Cameras, maps: Float[Tensor, "B V c H W"]
 ) -> tuple[Float[Tensor, "N V c"], Float[Tensor, "N V 1"], Bool[Tensor, "N V 1"]]:
     """Values of maps where means appear in each view, their z-depths, and whether they lie in the image."""
-    views = maps.shape[1]
-    element = gaussians.image // views
-    means = gaussians.means[:, None].expand(-1, views, -1)
-    pixels, z = project(means, cameras.intrinsics[element], cameras.extrinsics[element])
-    image = element[:, None] * views + torch.arange(views, device=element.device)
-    # A value that is not finite would reach other elements.
-    found = sample(maps.flatten(0, 1).nan_to_num(), image, pixels)
-    inside = (pixels >= 0).all(-1) & (pixels[..., 0] <= cameras.width) & (pixels[..., 1] <= cameras.height)
-    return found, z[..., None], ((z > 0) & inside)[..., None]
+    means = gaussians.means.split(gaussians.splits)
+    each = [_in_element(own, cameras[b], maps[b]) for b, own in enumerate(means)]
+    return tuple(torch.cat(values) for values in zip(*each, strict=True))
+
+
+def _in_element(
+    means: Float[Tensor, "n 3"], cameras: Cameras, maps: Float[Tensor, "V c H W"]
+) -> tuple[Float[Tensor, "n V c"], Float[Tensor, "n V 1"], Bool[Tensor, "n V 1"]]:
+    """:func:`looked_up` of one element's means."""
+    size = means.new_tensor([cameras.width, cameras.height])
+    pixels, z = project(
+        means.expand(len(maps), -1, -1), cameras.intrinsics[:, None], cameras.extrinsics[:, None]
+    )
+    # Far outside is brought near: large numbers are not exact.
+    grid = (2 / size * pixels - 1).clamp(-3, 3)
+    found = F.grid_sample(maps, grid[:, None], align_corners=False)[:, :, 0]
+    can_see = (z > 0) & ((pixels >= 0) & (pixels <= size)).all(-1)
+    return found.permute(2, 0, 1), z.mT[..., None], can_see.mT[..., None]

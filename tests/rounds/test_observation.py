@@ -89,7 +89,6 @@ def test_outside_of_all_images_everything_is_0(means):
 
 
 def test_what_is_not_finite_reaches_no_other_element():
-    """Maps of a batch are sampled as one volume, between whose layers values blend."""
     batch = make_batch(3, 2)
     gaussians = splats(batch)
     expected = observe(gaussians, batch)
