@@ -1,0 +1,124 @@
+"""For which people the recalibration's parts help: differences of PSNR between rows of an ablation.
+
+    python benchmarks/when_recalibration.py runs/ablation
+
+Reads the runs of a sweep over ``ablation`` measured on ``evaluation.split=bench`` (docs/ablation.md), sorts
+the frozen people into thirds by what the paper's argument speaks of, and compares the whole method with each
+of the other rows: PSNR inside the box, averaged over seeds, Wilcoxon's test over the people of a third,
+without correction. Sorted by
+
+- limbs: the share of the skin that lies within 5 cm of another part of the body that is not its neighbour,
+- texture: the contrast of the photographs within the subject, finer than 4 pixels,
+- depth: the depth error of the row of the whole method.
+"""
+
+import argparse
+import json
+from collections import defaultdict
+from pathlib import Path
+from statistics import mean
+
+import numpy as np
+import torch.nn.functional as F
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial import cKDTree
+from scipy.stats import wilcoxon
+
+from ghgs_lit.cli.inputs import build_data
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.config.groups import read_option
+from ghgs_lit.pretext.parts import PARTS, vertex_parts
+from ghgs_lit.synthesis.bench import definition, names
+from ghgs_lit.synthesis.people.body import load_body
+from ghgs_lit.synthesis.people.generate import generate
+
+NEAR = 0.05  # metres
+#: Results: [row of the ablation][views, targets][person] has values of seeds.
+Values = dict[str, dict[tuple[int, str], dict[str, list[float]]]]
+
+
+def read(folder: Path, metric: str) -> Values:
+    """A metric of the runs of a sweep."""
+    values: Values = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for file in sorted(folder.glob("*/metrics.json")):
+        content = json.loads(file.read_text())
+        recalibration = content["provenance"]["config"]["recalibration"]
+        row = f"{recalibration['neighborhood']}, {recalibration['similarity']}"
+        for one in content["rows"]:
+            if one["method"] == "model" and one.get(metric) is not None:
+                values[row][one["views"], one["targets"]][one["subject"]].append(one[metric])
+    return values
+
+
+def neighbors() -> np.ndarray:
+    """Which parts touch each other on the body at rest."""
+    body, parts = load_body(), vertex_parts()
+    rest = body.rest(np.zeros_like(body.sample_shape(np.random.default_rng(0))[0]))[0][: len(parts)]
+    touch = np.eye(len(PARTS), dtype=bool)
+    for part in range(len(PARTS)):
+        others = cKDTree(rest[parts == part]).query(rest)[0] < 0.02
+        touch[part, np.unique(parts[others])] = True
+    return touch | touch.T
+
+
+def close_limbs(person: str, touch: np.ndarray) -> float:
+    """The share of the skin that is near to a part that is not its neighbour."""
+    vertices, parts = (
+        generate(definition()["data"]["people_seed"], int(person[1:])).body_vertices,
+        vertex_parts(),
+    )
+    near = np.zeros(len(vertices), dtype=bool)
+    for part in range(len(PARTS)):
+        own = ~touch[part][parts]
+        near[own] |= cKDTree(vertices[parts == part]).query(vertices[own])[0] < NEAR
+    return float(near.mean())
+
+
+def contrasts() -> dict[str, float]:
+    """Fine contrast of each person's photographs."""
+    data = build_data(resolve(compose("evaluate", ["data=synthetic", "evaluation.split=bench"])))
+    found = {}
+    for batch in data.evaluation_loader(4, [read_option("targets", "release")], split="bench", batch_size=1):
+        gray, masks = batch.images[0].mean(1, keepdim=True), batch.masks[0, :, None].to(batch.images)
+        inside = F.avg_pool2d(masks, 5, 1, 2)
+        fine = gray - F.avg_pool2d(gray * masks, 5, 1, 2) / inside.clamp(min=1e-3)
+        found[batch.subjects[0]] = float(fine[inside > 0.99].std())
+    return found
+
+
+def thirds(order: dict[str, float]) -> list[tuple[str, list[str]]]:
+    """People in three groups of rising values."""
+    ranked = sorted(order, key=order.__getitem__)
+    return [
+        (f"{order[part[0]]:.3g} to {order[part[-1]]:.3g}", list(part)) for part in np.array_split(ranked, 3)
+    ]
+
+
+def main() -> None:
+    """Print a table for each other row of the ablation."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", type=Path, help="folder of the sweep")
+    values, depths = (read(parser.parse_args().runs, name) for name in ("psnr_box", "depth_error_mm"))
+    whole = "xyz, product"
+    touch, texture = neighbors(), contrasts()
+    errors = {person: mean(own) for person, own in depths[whole][4, "midway"].items()}
+    orders = {"limbs": {p: close_limbs(p, touch) for p in names()}, "texture": texture, "depth, mm": errors}
+    groups = [("all", "", names())]
+    groups += [(name, span, people) for name, order in orders.items() for span, people in thirds(order)]
+    settings = sorted(values[whole])
+    for row in sorted(set(values) - {whole}):
+        columns = ["by", "of", *(f"{views} views, {targets}" for views, targets in settings)]
+        table = Table(*columns, title=f"{whole} minus {row}, dB in the box (p)")
+        for name, span, people in groups:
+            cells = []
+            for setting in settings:
+                pairs = [[mean(values[r][setting][p]) for r in (whole, row)] for p in people]
+                gains = np.subtract(*np.transpose(pairs))
+                cells.append(f"{gains.mean():+.2f} ({wilcoxon(gains).pvalue:.3f})")
+            table.add_row(name, span, *cells)
+        Console(width=180).print(table)
+
+
+if __name__ == "__main__":
+    main()
