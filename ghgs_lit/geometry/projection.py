@@ -75,8 +75,14 @@ def world_to_camera(
     points: Float[Tensor, "*batch 3"], extrinsics: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*batch 3"]:
     """World points in camera axes, ``R x + t``."""
-    points, extrinsics = at_least_float32(points), at_least_float32(extrinsics)
-    return (extrinsics[..., :3, :3] * points[..., None, :]).sum(-1) + extrinsics[..., :3, 3]
+    return torch.stack(_camera_axes(points, extrinsics), -1)
+
+
+def _camera_axes(points: Tensor, extrinsics: Tensor) -> list[Tensor]:
+    """The three coordinates of :func:`world_to_camera`; written out as in :func:`unproject`."""
+    x, y, z = at_least_float32(points).unbind(-1)
+    rows = at_least_float32(extrinsics)[..., :3, :].unbind(-2)
+    return [row[..., 0] * x + row[..., 1] * y + row[..., 2] * z + row[..., 3] for row in rows]
 
 
 def project(
@@ -85,11 +91,10 @@ def project(
     extrinsics: Float[Tensor, "*#batch 4 4"],
 ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
     """Pixels ``(u, v)`` and z-depth of world points; pixels of points with z <= 0 are meaningless."""
-    camera = world_to_camera(points, extrinsics)
+    x, y, z = _camera_axes(points, extrinsics)
     intrinsics = at_least_float32(intrinsics)
-    z = camera[..., 2]
     safe = torch.where(z > 0, z, torch.ones_like(z))
-    x, y = camera[..., 0] / safe, camera[..., 1] / safe
+    x, y = x / safe, y / safe
     u = intrinsics[..., 0, 0] * x + intrinsics[..., 0, 1] * y + intrinsics[..., 0, 2]
     v = intrinsics[..., 1, 1] * y + intrinsics[..., 1, 2]
     return torch.stack((u, v), dim=-1), z

@@ -1,10 +1,10 @@
 """Local axes of the surface that a depth map describes."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import at_least_float32, unproject
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.types import Cameras, DepthMaps
@@ -31,35 +31,35 @@ def surface_axes(
     """
     height, width = maps.depth.shape[-2:]
     depth, valid = at_least_float32(maps.depth).flatten(), maps.valid.flatten()
-    intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)[image]
+    intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)
+    fx, skew, cx, fy, cy = (intrinsics[:, i, j][image] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     extrinsics = at_least_float32(cameras.extrinsics).flatten(0, 1)
     row, column = pixel // width, pixel % width
     place = image * (height * width) + pixel
     own = depth[place]
-    footprint = own / intrinsics[:, 0, 0]
-    identity = torch.eye(4, dtype=own.dtype, device=own.device)
+    footprint = own / fx
 
-    def point(down: int, right: int) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"]]:
-        """The pixel's neighbour in camera axes, and how far it lies on the same surface, 0 to 1."""
-        v, u = row + down, column + right
-        inside = (v >= 0) & (v < height) & (u >= 0) & (u < width)
-        other = torch.where(inside, place + down * width + right, place)
-        step = (depth[other] - own).abs() / footprint
-        near = ((_OTHER - step) / (_OTHER - _SAME)).clamp(0, 1) * (inside & valid[other])
-        centers = torch.stack((u, v), -1).to(own) + 0.5
-        return unproject(centers, depth[other], intrinsics, identity), near[:, None]
+    def neighbor(step: int, inside: Bool[Tensor, " N"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """A neighbour's depth, and how far it lies on the same surface, 0 to 1."""
+        other = torch.where(inside, place + step, place)
+        exists = inside & valid[other]
+        z = torch.where(exists, depth[other], own)
+        distance = (z - own).abs() / footprint
+        return z, ((_OTHER - distance) / (_OTHER - _SAME)).clamp(0, 1) * exists
 
-    center = point(0, 0)[0]
+    def slope(
+        step: int, has_after: Bool[Tensor, " N"], has_before: Bool[Tensor, " N"]
+    ) -> Float[Tensor, " N"]:
+        """By which share depth grows from one pixel to the next."""
+        (after, near_after), (before, near_before) = neighbor(step, has_after), neighbor(-step, has_before)
+        growth = near_after * (after - own) + near_before * (own - before)
+        base = near_after * after + near_before * before + (1 - near_after) * (1 - near_before) * own
+        return growth / torch.where(base > 0, base, 1)
 
-    def tangent(down: int, right: int) -> Float[Tensor, "N 3"]:
-        (after, has_after), (before, has_before) = point(down, right), point(-down, -right)
-        level = footprint[:, None] * identity[down, :3]
-        return unit(
-            has_after * (after - center)
-            + has_before * (center - before)
-            + (1 - has_after) * (1 - has_before) * level
-        )
-
-    x, y, z = unit(torch.linalg.cross(tangent(0, 1), tangent(1, 0))).unbind(-1)
-    turn = unit(torch.stack((1 + z, -y, x, torch.zeros_like(z)), -1))
+    right, down = slope(1, column < width - 1, column > 0), slope(width, row < height - 1, row > 0)
+    # The cross product of the tangents d(z K^-1 [u v 1]) / du and / dv, multiplied by fx fy / z^2.
+    toward = 1 + right * (column + 0.5 - cx) + down * (row + 0.5 - cy)
+    x, y = -fx * right, -skew * right - fy * down
+    length = (x.square() + y.square() + toward.square()).sqrt()
+    turn = unit(torch.stack((length + toward, -y, x, torch.zeros_like(x)), -1))
     return multiply_quaternions(matrix_to_quaternion(extrinsics[:, :3, :3].mT)[image], turn)
