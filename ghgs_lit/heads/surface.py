@@ -54,7 +54,7 @@ def surface_axes(
         (after, near_after), (before, near_before) = neighbor(step, has_after), neighbor(-step, has_before)
         growth = near_after * (after - own) + near_before * (own - before)
         base = near_after * after + near_before * before + (1 - near_after) * (1 - near_before) * own
-        return growth / torch.where(base > 0, base, 1)
+        return growth / base
 
     right, down = slope(1, column < width - 1, column > 0), slope(width, row < height - 1, row > 0)
     # The cross product of the tangents d(z K^-1 [u v 1]) / du and / dv, multiplied by fx fy / z^2.

@@ -1,8 +1,9 @@
 """Between pixels and the world."""
 
 import torch
+from scipy.spatial.transform import Rotation
 
-from ghgs_lit.geometry.projection import inverse_intrinsics
+from ghgs_lit.geometry.projection import inverse_intrinsics, project, unproject
 
 
 def test_the_inverse_of_intrinsics_is_the_inverse_of_the_matrix():
@@ -13,3 +14,26 @@ def test_the_inverse_of_intrinsics_is_the_inverse_of_the_matrix():
     intrinsics = torch.cat((intrinsics, torch.eye(3, dtype=torch.float64)[None]))
     torch.testing.assert_close(inverse_intrinsics(intrinsics), torch.linalg.inv(intrinsics))
     assert inverse_intrinsics(intrinsics.half()).dtype == torch.float32
+
+
+def test_projection_is_the_product_of_matrices_and_unprojection_its_inverse():
+    """Homogeneous coordinates in float64, a camera with a skew for each point, turned and moved."""
+    generator = torch.Generator().manual_seed(0)
+    n, options = 50, {"dtype": torch.float64, "generator": generator}
+    intrinsics = torch.eye(3, dtype=torch.float64).repeat(n, 1, 1)
+    intrinsics[:, :2] = torch.tensor([[900.0, 3.0, 250.0], [0.0, 800.0, 260.0]]) * (
+        1 + torch.rand(n, 2, 3, **options)
+    )
+    extrinsics = torch.eye(4, dtype=torch.float64).repeat(n, 1, 1)
+    turns = torch.randn(n, 4, **options)
+    extrinsics[:, :3, :3] = torch.from_numpy(Rotation.from_quat(turns.numpy()).as_matrix())
+    extrinsics[:, :3, 3] = torch.randn(n, 3, **options)
+    points = 3 * torch.randn(n, 3, **options)
+    camera = extrinsics @ torch.nn.functional.pad(points, (0, 1), value=1.0)[..., None]
+    expected = (intrinsics @ camera[:, :3])[..., 0]
+    pixels, depth = project(points, intrinsics, extrinsics)
+    front = depth > 0
+    assert 10 < front.sum() < n
+    torch.testing.assert_close(depth, expected[:, 2])
+    torch.testing.assert_close(pixels[front], (expected[:, :2] / expected[:, 2:])[front])
+    torch.testing.assert_close(unproject(pixels, depth, intrinsics, extrinsics)[front], points[front])

@@ -48,11 +48,12 @@ def test_the_third_axis_is_the_inward_normal_of_an_ellipsoid():
 
 def slanted(slope_x, slope_y, dtype=torch.float64):
     """A plane z = 2 + a x + b y before a camera at the origin that looks along z, with its depths."""
-    size, focal = 20, 30.0
-    lens = torch.tensor([[focal, 0, size / 2 + 1], [0, focal, size / 2 - 2], [0, 0, 1]], dtype=dtype)
+    size, fx, fy, skew = 20, 30.0, 36.0, 3.0
+    lens = torch.tensor([[fx, skew, size / 2 + 1], [0, fy, size / 2 - 2], [0, 0, 1]], dtype=dtype)
     centers = torch.arange(size, dtype=dtype) + 0.5
     v, u = torch.meshgrid(centers, centers, indexing="ij")
-    x, y = (u - lens[0, 2]) / focal, (v - lens[1, 2]) / focal
+    y = (v - lens[1, 2]) / fy
+    x = (u - lens[0, 2] - skew * y) / fx
     depth = 2 / (1 - slope_x * x - slope_y * y)
     cameras = Cameras(lens[None, None], torch.eye(4, dtype=dtype)[None, None], size, size)
     return depth[None, None], cameras
@@ -64,6 +65,7 @@ def test_planes_are_exact_up_to_their_border(a, b):
     depth, cameras = slanted(a, b)
     valid = torch.ones_like(depth, dtype=torch.bool)
     valid[..., 7:9, 3:5] = False
+    depth[~valid] += 0.01  # near the plane, yet not the subject's
     image, pixel = valid.flatten(0, 1).flatten(1).nonzero(as_tuple=True)
     normal = quaternion_to_matrix(surface_axes(DepthMaps(depth, valid, depth), cameras, image, pixel))[..., 2]
     expected = torch.nn.functional.normalize(torch.tensor([-a, -b, 1.0], dtype=depth.dtype), dim=0)

@@ -29,9 +29,10 @@ def splats(batch):
     )
 
 
-def test_a_gaussian_sees_itself_in_its_own_view():
+@pytest.mark.parametrize("size", [(56, 56), (42, 84)])
+def test_a_gaussian_sees_itself_in_its_own_view(size):
     """Colour equal to the photograph's, inside the mask, not hidden."""
-    batch = make_batch(2, 3)
+    batch = make_batch(2, 3, *size)
     gaussians = splats(batch)
     each = observe(gaussians, batch)
     assert each.shape == (len(gaussians), 3, CHANNELS)
