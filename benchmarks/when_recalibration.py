@@ -28,6 +28,7 @@ from scipy.stats import wilcoxon
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.groups import read_option
+from ghgs_lit.errors import require
 from ghgs_lit.pretext.parts import PARTS, vertex_parts
 from ghgs_lit.synthesis.bench import definition, names
 from ghgs_lit.synthesis.people.body import load_body
@@ -64,10 +65,8 @@ def neighbors() -> np.ndarray:
 
 def close_limbs(person: str, touch: np.ndarray) -> float:
     """The share of the skin that is near to a part that is not its neighbour."""
-    vertices, parts = (
-        generate(definition()["data"]["people_seed"], int(person[1:])).body_vertices,
-        vertex_parts(),
-    )
+    seed, parts = definition()["data"]["people_seed"], vertex_parts()
+    vertices = generate(seed, int(person[1:])).body_vertices
     near = np.zeros(len(vertices), dtype=bool)
     for part in range(len(PARTS)):
         own = ~touch[part][parts]
@@ -99,8 +98,9 @@ def main() -> None:
     """Print a table for each other row of the ablation."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", type=Path, help="folder of the sweep")
-    values, depths = (read(parser.parse_args().runs, name) for name in ("psnr_box", "depth_error_mm"))
-    whole = "xyz, product"
+    folder, whole = parser.parse_args().runs, "xyz, product"
+    values, depths = (read(folder, name) for name in ("psnr_box", "depth_error_mm"))
+    require(whole in values, "runs", f"{folder}/<run>/metrics.json of the whole method", sorted(values))
     touch, texture = neighbors(), contrasts()
     errors = {person: mean(own) for person, own in depths[whole][4, "midway"].items()}
     orders = {"limbs": {p: close_limbs(p, touch) for p in names()}, "texture": texture, "depth, mm": errors}

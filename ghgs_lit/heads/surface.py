@@ -33,7 +33,6 @@ def surface_axes(
     depth, valid = at_least_float32(maps.depth).flatten(), maps.valid.flatten()
     intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)
     fx, skew, cx, fy, cy = (intrinsics[:, i, j][image] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
-    extrinsics = at_least_float32(cameras.extrinsics).flatten(0, 1)
     row, column = pixel // width, pixel % width
     place = image * (height * width) + pixel
     own = depth[place]
@@ -62,4 +61,5 @@ def surface_axes(
     x, y = -fx * right, -skew * right - fy * down
     length = (x.square() + y.square() + toward.square()).sqrt()
     turn = unit(torch.stack((length + toward, -y, x, torch.zeros_like(x)), -1))
+    extrinsics = at_least_float32(cameras.extrinsics).flatten(0, 1)
     return multiply_quaternions(matrix_to_quaternion(extrinsics[:, :3, :3].mT)[image], turn)

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
+from torch import library
 from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only
@@ -290,7 +291,7 @@ def _copy_from(source, target, non_blocking=False):
 
 
 # Indexing by lists and a few others come from C++ without passing through the mode.
-_library = torch.library.Library("aten", "IMPL")
+_library = library.Library("aten", "IMPL")
 _library.impl("empty_strided", _empty_strided, "PrivateUse1")
 _library.impl("empty.memory_format", _empty, "PrivateUse1")
 _library.impl("_copy_from", _copy_from, "PrivateUse1")
