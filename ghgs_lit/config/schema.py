@@ -234,6 +234,7 @@ KINDS: dict[str, Kind] = {
     "optimizer.eps": POSITIVE,
     "optimizer.freeze_until.*": SHARE,
     "optimizer.lr": POSITIVE,
+    "optimizer.matrix_lr": POSITIVE | NULL,
     "optimizer.skip_nonfinite": integer(least=0),
     "optimizer.start_factor": SHARE,
     "optimizer.warmup": number(least=0, below=1),

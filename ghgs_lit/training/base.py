@@ -44,6 +44,16 @@ class BudgetedModule(L.LightningModule):
     def on_train_start(self) -> None:
         # After a restart the scheduler asks for the first time when a step has been taken.
         self.used_budget = self.progress()
+        self._apply_options()
+
+    def _apply_options(self) -> None:
+        """Put this run's options of the optimizer in place of those of the checkpoint that it resumes."""
+        optimizer, schedule = self.optimizers(), self.lr_schedulers()
+        for number, (group, option) in enumerate(zip(optimizer.param_groups, self._options, strict=True)):
+            # The rate itself has the schedule's factor of the step that comes next.
+            rate = group["lr"] * option["lr"] / schedule.base_lrs[number]
+            group.update(option, lr=rate, initial_lr=option["lr"])
+            schedule.base_lrs[number] = option["lr"]
 
     def step_seed(self, batch_idx: int) -> int:
         """Seed of the random numbers of this step; it does not depend on interruptions of the run."""
@@ -73,6 +83,8 @@ class BudgetedModule(L.LightningModule):
 
     def configure_optimizers(self) -> dict[str, Any]:
         optimizer = self.optimization.build(self.model, fused=self._scaler is None)
+        groups = optimizer.param_groups
+        self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 
         def factor(_: int) -> float:
             self.used_budget = self.progress()

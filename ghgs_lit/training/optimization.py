@@ -1,4 +1,4 @@
-"""How the weights are trained: AdamW, a linear schedule over the run's budget, gradient clipping."""
+"""How the weights are trained: AdamW or Muon, a linear schedule over the run's budget, gradient clipping."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,17 +9,20 @@ from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelP
 from torch import nn
 
 from ghgs_lit.errors import require
+from ghgs_lit.training.muon import Muon
 
 
 @dataclass(frozen=True)
 class Optimization:
-    """AdamW whose learning rate rises linearly to ``lr`` and then falls linearly.
+    """AdamW or Muon, whose learning rate rises linearly to ``lr`` and then falls linearly.
 
     The schedule depends on the share of the run's budget that is used: of steps or of time, whichever is
     larger.
 
     Args:
         lr: highest learning rate.
+        matrix_lr: highest learning rate of matrices, which then take the steps of
+            :class:`~ghgs_lit.training.muon.Muon`; None: AdamW for all parameters.
         betas, eps, weight_decay: of AdamW.
         warmup: share of the run in which the learning rate rises.
         start_factor, end_factor: first and last learning rate as fractions of ``lr``.
@@ -35,6 +38,7 @@ class Optimization:
     """
 
     lr: float
+    matrix_lr: float | None = None
     betas: Sequence[float] = (0.9, 0.999)
     eps: float = 1e-8
     weight_decay: float = 1e-5
@@ -47,6 +51,8 @@ class Optimization:
 
     def __post_init__(self):
         require(self.lr > 0, "optimizer.lr", "a positive number", self.lr)
+        positive = self.matrix_lr is None or self.matrix_lr > 0
+        require(positive, "optimizer.matrix_lr", "a positive number or null", self.matrix_lr)
         betas_fit = len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)
         require(betas_fit, "optimizer.betas", "two numbers in [0, 1)", list(self.betas))
         require(self.eps > 0, "optimizer.eps", "a positive number", self.eps)
@@ -75,19 +81,22 @@ class Optimization:
         for prefix in self.freeze_until:
             known = any(name.startswith(prefix) for name in names)
             require(known, f"optimizer.freeze_until.{prefix}", "the beginning of a parameter's name", prefix)
-        return torch.optim.AdamW(
-            [p for p in model.parameters() if p.requires_grad],
-            lr=self.lr,
-            betas=tuple(self.betas),
-            eps=self.eps,
-            weight_decay=self.weight_decay,
-            fused=fused,
-        )
+        parameters = [p for p in model.parameters() if p.requires_grad]
+        options = {
+            "lr": self.lr,
+            "betas": tuple(self.betas),
+            "eps": self.eps,
+            "weight_decay": self.weight_decay,
+            "fused": fused,
+        }
+        if self.matrix_lr is None:
+            return torch.optim.AdamW(parameters, **options)
+        return Muon(parameters, matrix_lr=self.matrix_lr, **options)
 
     def drop_frozen_gradients(self, model: nn.Module, progress: float) -> None:
         """Remove the gradients of the parameters that are frozen at the share ``progress`` of the run.
 
-        AdamW then leaves these parameters unchanged, without weight decay.
+        The optimizer then leaves these parameters unchanged, without weight decay.
         """
         frozen = tuple(prefix for prefix, share in self.freeze_until.items() if progress < share)
         if not frozen:

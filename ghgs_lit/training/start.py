@@ -51,7 +51,16 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
         found = content_digest(checkpoint)
         require(found == digest, f"{path}: digest", f"{str(digest)[:12]}..., as written", f"{found[:12]}...")
     load_strictly(model, model_state(checkpoint), path)
+    _check_optimizer(path, checkpoint["config"], config)
     return checkpoint["global_step"], differences(checkpoint["config"], config)
+
+
+def _check_optimizer(path: str | Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to go on with Muon from the averages of AdamW, and the other way round."""
+    key = "optimizer.matrix_lr"
+    old, new = flatten(before).get(key), flatten(now).get(key)
+    expected = f"{'null' if old is None else 'a learning rate'}, as in {path}"
+    require((old is None) == (new is None), key, expected, new)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -270,6 +270,7 @@ def test_callbacks_write_pictures_and_numbers(tmp_path):
     ("values", "key"),
     [
         ({"lr": 0.0}, r"optimizer\.lr"),
+        ({"lr": 1.0, "matrix_lr": 0.0}, r"optimizer\.matrix_lr"),
         ({"lr": 1.0, "betas": [0.9, 1.0]}, r"optimizer\.betas"),
         ({"lr": 1.0, "warmup": 1.0}, r"optimizer\.warmup"),
         ({"lr": 1.0, "clip": 0.0}, r"optimizer\.clip"),

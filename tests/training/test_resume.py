@@ -249,6 +249,33 @@ def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
         check_resume(path, Other(), CONFIG)
 
 
+def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
+    """From the first resumed step on, the rate is what the schedule has of the new one."""
+    with pytest.raises(PowerCut):
+        fit(tmp_path, Cut(8))
+    changed = module()
+    changed.optimization = Optimization(lr=0.005, warmup=0.1, betas=(0.5, 0.9), freeze_until={"shift": 0.4})
+    monkeypatch.setattr("tests.training.test_resume.module", lambda: changed)
+    fit(tmp_path, Cut(), resume=tmp_path / "checkpoints" / "last.ckpt")
+    rates = [float(row["train/learning_rate"]) for row in rows(tmp_path) if "train/learning_rate" in row]
+    parts = ((Optimization(lr=0.05, warmup=0.1), range(6)), (changed.optimization, range(6, STEPS)))
+    expected = [part.lr * part.factor(step / STEPS) for part, steps in parts for step in steps]
+    assert rates == pytest.approx(expected, rel=1e-5)
+    assert changed.optimizers().param_groups[0]["betas"] == (0.5, 0.9)
+
+
+@pytest.mark.parametrize(("old", "new"), [(None, 0.02), (0.02, None)])
+def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
+    """Muon cannot go on from the averages of AdamW, nor AdamW from Muon's."""
+    path = tmp_path / "a.ckpt"
+    content = {"state_dict": {f"model.{k}": v for k, v in Standin().state_dict().items()}}
+    before, now = ({**CONFIG, "optimizer": {"lr": 0.05, "matrix_lr": rate}} for rate in (old, new))
+    content |= {"config": before, "format_version": 1, "global_step": 5, "optimizer_states": []}
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"optimizer\.matrix_lr: expected .*a\.ckpt; found"):
+        check_resume(path, Standin(), now)
+
+
 def test_an_optimizer_whose_state_was_changed_is_refused(tmp_path):
     """Broken averages of the gradient would be trained on in silence: the checkpoint has a digest of all."""
     path = tmp_path / "checkpoints" / "last.ckpt"

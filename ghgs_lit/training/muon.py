@@ -1,0 +1,111 @@
+"""AdamW with Muon's orthogonal steps for matrices (K. Jordan et al., 2024, github.com/KellerJordan/Muon).
+
+A step moves all directions of a matrix equally far, not only the few that the gradient is full of. Step
+lengths are those of J. Liu et al., "Muon is Scalable for LLM Training", 2025. PyTorch's ``torch.optim.Muon``
+takes matrices only; here weights of convolutions are matrices of their output channels, too.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+# Newton-Schulz: odd polynomials that take singular values in (0, 1] close to 1 (Jordan et al.).
+COEFFICIENTS = (3.4445, -4.7750, 2.0315)
+ITERATIONS = 5
+MOMENTUM = 0.95
+# AdamW's steps have about this root mean square (Liu et al., section 2.2).
+ROOT_MEAN_SQUARE = 0.2
+# Matrices with fewer rows or columns (outputs of heads, tokens, biases) are left to AdamW.
+SMALLEST_SIDE = 16
+
+
+def is_matrix(parameter: nn.Parameter) -> bool:
+    """Whether ``parameter`` is a matrix, or a convolution's weight, with at least 16 rows and columns."""
+    if parameter.dim() < 2:
+        return False
+    rows = parameter.shape[0]
+    return min(rows, parameter.numel() // max(rows, 1)) >= SMALLEST_SIDE
+
+
+def orthogonalized(matrices: Tensor) -> Tensor:
+    """The matrices with singular values of about 1 (0.7 to 1.2) in place of their own.
+
+    The iterations run on the smaller Gram matrix.
+
+    Args:
+        matrices: [N, R, C], float32 or wider. Singular values below 1e-3 of the largest end below 1; a
+            matrix of zeros stays one.
+
+    Returns:
+        [N, R, C].
+    """
+    if matrices.shape[-2] > matrices.shape[-1]:
+        return orthogonalized(matrices.mT).mT
+    a, b, c = COEFFICIENTS
+    largest = matrices.abs().amax(dim=(-2, -1), keepdim=True)
+    matrices = matrices / torch.where(largest > 0, largest, 1)  # so that no square underflows
+    gram = matrices @ matrices.mT
+    square = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]  # of the Frobenius norm
+    square = torch.where(square > 0, square, 1)
+    gram = gram / square
+    product = matrices / square.sqrt()
+    for _ in range(ITERATIONS):
+        polynomial = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
+        polynomial.diagonal(dim1=-2, dim2=-1).add_(a)
+        product = polynomial @ product
+        gram = polynomial @ gram @ polynomial
+    return product
+
+
+class Muon(torch.optim.AdamW):
+    """Muon for the matrices among ``parameters``, AdamW for all others.
+
+    Args:
+        parameters: of the model.
+        matrix_lr: learning rate of matrices, in units of AdamW's: steps are as long as AdamW's of this rate.
+        **options: of AdamW, for the other parameters; weight decay is for both.
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter], matrix_lr: float, **options: Any):
+        parameters = list(parameters)
+        others = [p for p in parameters if not is_matrix(p)]
+        matrices = [p for p in parameters if is_matrix(p)]
+        groups = [{"params": others, "orthogonal": False}]
+        groups.append({"params": matrices, "orthogonal": True, "lr": matrix_lr})
+        super().__init__([group for group in groups if group["params"]], **options)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Tensor] | None = None) -> Tensor | None:
+        """One step; the gradients of matrices are used up."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            if group["orthogonal"]:
+                self._step_matrices(group)
+        super().step()
+        return loss
+
+    def _step_matrices(self, group: dict[str, Any]) -> None:
+        """Move the matrices, and take their gradients away, so that AdamW leaves them alone."""
+        same_shape: dict[tuple[int, int], list[tuple[nn.Parameter, Tensor]]] = {}
+        for parameter in group["params"]:
+            if parameter.grad is None:
+                continue
+            state = self.state[parameter]
+            if not state:  # AdamW's loading of a state asks for a step
+                state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
+            state["step"] += 1
+            average = state["momentum"].lerp_(parameter.grad, 1 - MOMENTUM)
+            direction = parameter.grad.lerp(average, MOMENTUM).flatten(1)  # Nesterov's
+            same_shape.setdefault(tuple(direction.shape), []).append((parameter, direction))
+            parameter.grad = None
+        for (rows, columns), pairs in same_shape.items():
+            steps = orthogonalized(torch.stack([direction for _, direction in pairs]))
+            length = group["lr"] * ROOT_MEAN_SQUARE * max(rows, columns) ** 0.5
+            for (parameter, _), step in zip(pairs, steps, strict=True):
+                parameter.mul_(1 - group["lr"] * group["weight_decay"])
+                parameter.sub_(length * step.view_as(parameter))
