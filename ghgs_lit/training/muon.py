@@ -17,12 +17,12 @@ ITERATIONS = 5
 MOMENTUM = 0.95
 # AdamW's steps have about this root mean square (Liu et al., section 2.2).
 ROOT_MEAN_SQUARE = 0.2
-# Matrices with fewer rows or columns (outputs of heads, tokens, biases) are left to AdamW.
-SMALLEST_SIDE = 16
+# What has fewer rows or columns (tokens, biases, heads of one or two channels) is left to AdamW.
+SMALLEST_SIDE = 3
 
 
 def is_matrix(parameter: nn.Parameter) -> bool:
-    """Whether ``parameter`` is a matrix, or a convolution's weight, with at least 16 rows and columns."""
+    """Whether ``parameter`` is a matrix, or a convolution's weight, with at least 3 rows and columns."""
     if parameter.dim() < 2:
         return False
     rows = parameter.shape[0]

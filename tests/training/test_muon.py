@@ -14,7 +14,7 @@ OPTIONS = {"lr": 0.01, "betas": (0.9, 0.98), "eps": 1e-8, "weight_decay": 0.1}
 
 
 class Small(nn.Module):
-    """A convolution, a matrix and what Muon leaves to AdamW."""
+    """A convolution, matrices and what Muon leaves to AdamW."""
 
     def __init__(self):
         super().__init__()
@@ -22,7 +22,7 @@ class Small(nn.Module):
         self.conv = nn.Parameter(torch.randn(16, 4, 3, 3, generator=generator))
         self.square = nn.Parameter(torch.randn(24, 24, generator=generator))
         self.tall = nn.Parameter(torch.randn(64, 24, generator=generator))
-        self.output = nn.Parameter(torch.randn(3, 24, generator=generator))
+        self.output = nn.Parameter(torch.randn(2, 24, generator=generator))
         self.token = nn.Parameter(torch.randn(1, 2, 1, 64, generator=generator))
         self.bias = nn.Parameter(torch.randn(16, generator=generator))
 
@@ -35,7 +35,7 @@ def set_gradients(model, seed):
 
 
 def test_what_counts_as_a_matrix():
-    """Convolutions and linear layers with 16 rows and columns; no outputs, tokens, biases."""
+    """Convolutions and linear layers from 3 rows and columns on; no tokens, biases, heads of two channels."""
     found = [name for name, parameter in Small().named_parameters() if is_matrix(parameter)]
     assert found == ["conv", "square", "tall"]
 
