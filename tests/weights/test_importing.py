@@ -301,6 +301,7 @@ def test_switches_that_differ_from_the_releases_are_listed():
     assert found == ["unprojection.tokens=subject for release"]
     assert any("depth_head.parameterization" in line for line in differences(config("compat=none")))
     assert differences(config(), config()) == []
+    assert differences(config(), {"encoder": config()["encoder"]}) == []
 
 
 def test_tiny_files_have_the_published_structure():
