@@ -32,7 +32,7 @@ def is_matrix(parameter: nn.Parameter) -> bool:
 def orthogonalized(matrices: Tensor) -> Tensor:
     """The matrices with singular values of about 1 (0.7 to 1.2) in place of their own.
 
-    The iterations run on the smaller Gram matrix.
+    The polynomials are found from the smaller Gram matrix, for all matrices of a shape at once.
 
     Args:
         matrices: [N, R, C], float32 or wider. Singular values below 1e-3 of the largest end below 1; a

@@ -38,6 +38,8 @@ def test_what_counts_as_a_matrix():
     """Convolutions and linear layers from 3 rows and columns on; no tokens, biases, heads of two channels."""
     found = [name for name, parameter in Small().named_parameters() if is_matrix(parameter)]
     assert found == ["conv", "square", "tall", "wide"]
+    shapes = [(3, 3), (3, 1, 3), (2, 9), (9, 2), (9,), ()]
+    assert [is_matrix(nn.Parameter(torch.zeros(shape))) for shape in shapes] == [True, True] + 4 * [False]
 
 
 @pytest.mark.parametrize("shape", [(3, 16, 16), (2, 16, 144), (2, 144, 16), (1, 64, 24)])
