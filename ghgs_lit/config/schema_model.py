@@ -84,6 +84,7 @@ MODEL: dict[str, Kind] = {
     "model.pad": TEXT,
     "rounds.count": COUNT,
     "rounds.depths": COUNT,
+    "rounds.exchange": WIDTH | NULL,
     "rounds.gains": FLAG,
     "rounds.hidden": WIDTH,
     "rounds.reach": SHARE,

@@ -21,6 +21,7 @@ from ghgs_lit.geometry.projection import at_least_float32, unproject_maps
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points
@@ -72,6 +73,8 @@ class Rounds(nn.Module):
         depths: at how many depths around the current one a round compares the photographs.
         reach: how far these lie from it in the first round, as a share of the distance from near to far.
         gains: whether photographs of cameras whose exposure differs are made alike first.
+        exchange: channels in which Gaussians of neighbouring pixels tell each other what they know after each
+            look (:class:`Exchange`); None: they do not.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class Rounds(nn.Module):
         depths: int = 8,
         reach: float = 0.25,
         gains: bool = False,
+        exchange: int | None = None,
     ):
         super().__init__()
         require(count >= 1, "rounds.count", "1 or more", count)
@@ -90,6 +94,8 @@ class Rounds(nn.Module):
         require(drawn, "rounds.training_counts", "numbers of 1 or more", list(training_counts))
         require(0 < reach <= 1, "rounds.reach", "a share above 0, at most 1", reach)
         self.count, self.training_counts = count, tuple(training_counts)
+        expected = "null or a number of channels"
+        require(exchange is None or exchange >= 1, "rounds.exchange", expected, exchange)
         self.depths, self.reach, self.gains = depths, reach, gains
         self.view = nn.Sequential(
             nn.Linear(CHANNELS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
@@ -100,6 +106,7 @@ class Rounds(nn.Module):
             nn.Linear(inputs, 2 * hidden), nn.ReLU(), nn.Linear(2 * hidden, hidden), nn.ReLU()
         )
         self.memory = nn.Linear(hidden, hidden)
+        self.exchange = None if exchange is None else Exchange(hidden, exchange)
         self.change = nn.Sequential(nn.Linear(hidden, 1 + RAW_VALUES))
         nn.init.zeros_(self.change[-1].weight)
         nn.init.zeros_(self.change[-1].bias)
@@ -137,6 +144,8 @@ class Rounds(nn.Module):
         most = count if torch.is_grad_enabled() else at_once(memory.device, _AT_ONCE, count)
         parts = even_parts(count, most)
         memory = torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
+        if self.exchange is not None:
+            memory = self.exchange(memory, Windows.of(state.raw, batch))
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step

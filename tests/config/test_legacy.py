@@ -20,7 +20,7 @@ NEW = ("model.check_inputs", "skip.budget_db", "skip.max_rel_diff")
 NEW += ("depth_head.dpt.rectified_skip", "gaussian_head.dpt.rectified_skip")
 NEW += ("gaussian_head.low_pass", "gaussian_head.antialiased", "model.frame")
 NEW += ("gaussian_head.axes", "gaussian_head.attributes.inward")
-NEW += ("encoder.semantic", "optimizer.matrix_lr")
+NEW += ("encoder.semantic", "optimizer.matrix_lr", "rounds.exchange")
 TODAY = {
     "demo": ["experiment=demo"],
     "release": ["experiment=thuman2", "encoder=vggt_nano", "compat=release"],

@@ -9,6 +9,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.losses import terms
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
+from ghgs_lit.rounds import Rounds
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
 from tests.helpers.scenes import make_batch
 
@@ -19,6 +20,7 @@ def model(*overrides, kick=0.0, seed=0):
     found = make_model(*RECURRENT, *overrides, seed=seed).eval()
     if kick:
         torch.nn.init.normal_(found.rounds.change[-1].weight, std=kick)
+        torch.nn.init.normal_(found.rounds.exchange.hear.weight, std=kick)
     return found
 
 
@@ -105,6 +107,8 @@ def test_half_precision_gives_finite_values():
 def test_options_are_checked():
     with pytest.raises(InputError, match=r"rounds\.reach"):
         GHGS.from_config(config(*RECURRENT, "rounds.reach=0"))
+    with pytest.raises(InputError, match=r"rounds\.exchange: expected null or a number of channels"):
+        Rounds(8, exchange=0)
     with pytest.raises(InputError, match=r"rounds: expected .* bounds"):
         GHGS.from_config(
             config(
