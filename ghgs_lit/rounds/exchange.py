@@ -30,7 +30,8 @@ class Windows(NamedTuple):
         height = max((extent.bottom - extent.top for extent in filled), default=1)
         width = max((extent.right - extent.left for extent in filled), default=1)
         corners = [(extent.top, extent.left) if extent.count else (0, 0) for extent in batch.extents]
-        top, left = raw.pixel.new_tensor(corners)[raw.image].unbind(1)
+        corners = torch.tensor(corners).to(raw.pixel.device, non_blocking=True)
+        top, left = corners[raw.image].unbind(1)
         full = batch.masks.shape[-1]
         row, column = raw.pixel // full - top, raw.pixel % full - left
         return cls((raw.image * height + row) * width + column, (len(corners), height, width))

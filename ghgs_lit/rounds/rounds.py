@@ -123,8 +123,9 @@ class Rounds(nn.Module):
             gaussians, batch = equalized(state.gaussians, batch)
             state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
+        windows = None if self.exchange is None else Windows.of(state.raw, batch)
         for number in range(self._drawn() if self.training else self.count):
-            change, memory = self._round(states[-1], batch, memory, 0.5**number)
+            change, memory = self._round(states[-1], batch, memory, windows, 0.5**number)
             states.append(_moved(states[-1], activate, batch, *change))
         return tuple(states)
 
@@ -132,7 +133,7 @@ class Rounds(nn.Module):
         return self.training_counts[int(torch.randint(len(self.training_counts), ()))]
 
     def _round(
-        self, state: State, batch: Batch, memory: Tensor, size: float
+        self, state: State, batch: Batch, memory: Tensor, windows: Windows | None, size: float
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """New depths and changes of raw attributes, and what the next round remembers."""
         gaussians = state.gaussians.detach()
@@ -145,7 +146,7 @@ class Rounds(nn.Module):
         parts = even_parts(count, most)
         memory = torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
         if self.exchange is not None:
-            memory = self.exchange(memory, Windows.of(state.raw, batch))
+            memory = self.exchange(memory, windows)
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
