@@ -62,6 +62,9 @@ def chamfer(
 def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: bool = False) -> Scalar:
     """Mean |z - true z| over the subject's pixels with a true depth; 0 where there are none.
 
+    Of a model with rounds the sum over the depths before the first round and after each, as the sequence loss
+    of RAFT (Teed and Deng, ECCV 2020) without its weights.
+
     Args:
         prediction: its depth, where valid.
         rendering: not used.
@@ -78,4 +81,4 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
     rounds = prediction.rounds or (prediction.depth_maps,)
     errors = [(torch.where(used, at_least_float32(maps.depth), truth) - truth).abs() for maps in rounds]
     errors = [error / truth if relative else error for error in errors]
-    return sum(error.sum() for error in errors) / (used.sum().clamp(min=1) * len(errors))
+    return sum(error.sum() for error in errors) / used.sum().clamp(min=1)
