@@ -156,8 +156,9 @@ def test_batches_are_copied_there_without_a_wait():
     assert batch.body_vertices[0].device == batch.targets.cameras.extrinsics.device == DEVICE
 
 
-def test_everything_is_measured_there(tmp_path):
+def test_everything_is_measured_there(tmp_path, monkeypatch):
     """The model, refined too, and all baselines, with all metrics and pictures: rows are those of the CPU."""
+    monkeypatch.setattr("ghgs_lit.refinement.cameras._STEPS", 3)
     metrics = ImageMetrics(regions=("image", "box", "subject"), lpips="off")
 
     def rows(device):
