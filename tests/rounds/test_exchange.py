@@ -92,7 +92,9 @@ def test_images_without_a_subject(filled):
     masks[filled] = blobs()[filled]
     raw, batch = scene(masks)
     known, exchange = torch.randn(len(raw.image), KNOWN, dtype=torch.float64), trained()
-    found = exchange(known, Windows.of(raw, batch)).detach().numpy()
+    windows = Windows.of(raw, batch)
+    assert windows.shape == ((3, 10, 8) if filled else (3, 1, 1))
+    found = exchange(known, windows).detach().numpy()
     assert found.shape == known.shape
     assert np.allclose(found, expected(exchange, raw, known), rtol=0, atol=1e-12)
 

@@ -109,6 +109,7 @@ def test_options_are_checked():
         GHGS.from_config(config(*RECURRENT, "rounds.reach=0"))
     with pytest.raises(InputError, match=r"rounds\.exchange: expected null or a number of channels"):
         Rounds(8, exchange=0)
+    assert model("rounds.exchange=null").rounds.exchange is None
     with pytest.raises(InputError, match=r"rounds: expected .* bounds"):
         GHGS.from_config(
             config(
