@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from ghgs_lit.config import compose
+from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
 from ghgs_lit.losses import terms
 from ghgs_lit.model import GHGS
@@ -110,7 +110,7 @@ def test_options_are_checked():
         GHGS.from_config(config(*RECURRENT, "rounds.reach=0"))
     with pytest.raises(InputError, match=r"rounds\.exchange: expected null or a number of channels"):
         Rounds(8, exchange=0)
-    compose("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"])
+    resolve(compose("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"]))
     assert model("rounds.exchange=null").rounds.exchange is None
     with pytest.raises(InputError, match=r"rounds: expected .* bounds"):
         GHGS.from_config(
