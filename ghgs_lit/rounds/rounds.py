@@ -93,9 +93,9 @@ class Rounds(nn.Module):
         drawn = len(training_counts) > 0 and min(training_counts) >= 1
         require(drawn, "rounds.training_counts", "numbers of 1 or more", list(training_counts))
         require(0 < reach <= 1, "rounds.reach", "a share above 0, at most 1", reach)
-        self.count, self.training_counts = count, tuple(training_counts)
         expected = "null or a number of channels"
         require(exchange is None or exchange >= 1, "rounds.exchange", expected, exchange)
+        self.count, self.training_counts = count, tuple(training_counts)
         self.depths, self.reach, self.gains = depths, reach, gains
         self.view = nn.Sequential(
             nn.Linear(CHANNELS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
@@ -145,7 +145,7 @@ class Rounds(nn.Module):
         most = count if torch.is_grad_enabled() else at_once(memory.device, _AT_ONCE, count)
         parts = even_parts(count, most)
         memory = torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
-        if self.exchange is not None:
+        if windows is not None:
             memory = self.exchange(memory, windows)
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
