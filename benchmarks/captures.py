@@ -1,6 +1,6 @@
 """What imperfect captures cost a model: built-in people, photographed in ten ways, with the same targets.
 
-    python benchmarks/captures.py model.ckpt [model.ckpt ...] --out captures.json
+    python benchmarks/captures.py model.ckpt [model.ckpt ...] --baselines all --out captures.json
 
 Each capture has one trouble, the last one all of them. Targets are always those of the clean rig, so that a
 loss is one of the prediction. Prints PSNR on the clean rig and what each capture loses, whole and in the box.
@@ -19,13 +19,14 @@ import torch
 from ghgs_lit import GHGS
 from ghgs_lit.capture.predict import trained_size
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
+from ghgs_lit.cli.methods import baselines_of
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.groups import read_option
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import even_positions, subject_rng
-from ghgs_lit.evaluation.measure import ModelMethod, measure
+from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.refinement import CameraRefinement
 from ghgs_lit.types import Batch
@@ -102,14 +103,15 @@ def batches(
 
 
 def means(rows: list[dict]) -> dict[str, float]:
-    """PSNR by target and region, and the error of depth, over the subjects."""
+    """PSNR by target and region, and the error of depth where the method has one, over the subjects."""
     found = {
         f"{target}_{name}": sum(row[name] for row in rows if row["targets"] == target)
         / sum(row["targets"] == target for row in rows)
         for target in _TARGETS
         for name in ("psnr", "psnr_box")
     }
-    return found | {"depth_error_mm": sum(row["depth_error_mm"] for row in rows) / len(rows)}
+    errors = [row["depth_error_mm"] for row in rows if row.get("depth_error_mm") is not None]
+    return found | ({"depth_error_mm": sum(errors) / len(errors)} if errors else {})
 
 
 def table(results: Mapping[str, dict[str, float]]) -> str:
@@ -127,9 +129,22 @@ def table(results: Mapping[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
+def methods_of(options: argparse.Namespace, config: Mapping[str, Any]) -> Iterator[tuple[str, Method]]:
+    """Every checkpoint and every baseline, one in memory at a time."""
+    device, rounds = pick_device(config["device"]), options.refine_cameras
+    renderer = build_renderer(config, device)
+    for path in options.checkpoints:
+        model = GHGS.from_checkpoint(path, device)
+        cameras = CameraRefinement(rounds, model, renderer) if rounds else None
+        yield str(path), ModelMethod(model, renderer, cameras=cameras)
+    names = "all" if options.baselines == ["all"] else options.baselines
+    yield from baselines_of(names, config, device).items()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("checkpoints", type=Path, nargs="+")
+    parser.add_argument("--baselines", nargs="*", default=[], help="as for ghgs evaluate, or all")
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--size", type=int, help="side in pixels; none: the first checkpoint's")
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
@@ -137,21 +152,18 @@ def main() -> None:
     options = parser.parse_args()
     config = resolve(compose("evaluate", ["data=synthetic", "metrics.lpips=off"]))
     device = pick_device(config["device"])
-    renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
+    metrics = build(config["metrics"], "metrics").to(device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
     size = list(image_size("size", size))
     data = {name: data_of(capture, options.people, size) for name, capture in CAPTURES.items()}
     results = {}
-    for path in options.checkpoints:
-        model, rounds = GHGS.from_checkpoint(path, device), options.refine_cameras
-        cameras = CameraRefinement(rounds, model, renderer) if rounds else None
-        method = ModelMethod(model, renderer, cameras=cameras)
-        results[str(path)] = {
+    for method_name, method in methods_of(options, config):
+        results[method_name] = {
             name: means(measure(method, name, batches(capture, data["clean"], data[name]), metrics, device))
             for name, capture in CAPTURES.items()
         }
         print(
-            f"{path}, {options.people} people, {size[0]} x {size[1]}\n{table(results[str(path)])}\n",
+            f"{method_name}, {options.people} people, {size[0]} x {size[1]}\n{table(results[method_name])}\n",
             flush=True,
         )
         write_text_atomically(options.out, json.dumps(results, indent=1))

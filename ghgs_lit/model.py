@@ -21,7 +21,7 @@ from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
-from ghgs_lit.kernels.precision import PRECISIONS, precision_of
+from ghgs_lit.kernels.precision import PRECISIONS, fast_precision, precision_of
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.rounds import Rounds, State
 from ghgs_lit.skipping import AutoSkip, auto_skip
@@ -215,7 +215,8 @@ class GHGS(nn.Module):
         Args:
             path: of the checkpoint; that of the package where none is given.
             map_location: device of the model.
-            dtype: of the encoder (None: as in the file); the heads are float32 or wider.
+            dtype: of the encoder (None: as in the file, on a CPU float32 in place of a half precision that it
+                lacks); the heads are float32 or wider.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -223,18 +224,26 @@ class GHGS(nn.Module):
                 fit its config.
         """
         model = cls.from_config(read_checkpoint(path)["config"], empty=STAGES)
-        model.load(path, dtype)
+        model.load(path, dtype, map_location)
         return model.to(map_location).eval()
 
-    def load(self, path: str | Path, dtype: torch.dtype | None = None) -> None:
-        """Take the weights of a checkpoint; arguments and errors as in :meth:`from_checkpoint`."""
+    def load(self, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu") -> None:
+        """Take the weights of a checkpoint.
+
+        Args:
+            path, dtype: as for :meth:`from_checkpoint`.
+            device: where they will be moved to.
+
+        Raises:
+            InputError, FileNotFoundError: as for :meth:`from_checkpoint`.
+        """
         checkpoint = read_checkpoint(path)
         require_fit(self, model_state(checkpoint), path)
         self.check_preset(checkpoint, path)
 
         def precision(name: str, stored: torch.dtype) -> torch.dtype:
             if name.startswith("encoder."):
-                return dtype or stored
+                return dtype or fast_precision(stored, torch.device(device))
             return torch.promote_types(stored, torch.float32)
 
         state = cast(lambda: model_state(read_checkpoint(path)), precision)

@@ -190,7 +190,7 @@ def cases_of(
     for name, change in choices:
         skip = presets[name]
         config = case_config(source, skip, readers, change, shared)
-        model = _model(source, config, state, seed).to(device).eval()
+        model = _model(source, config, state, seed, device).to(device).eval()
         state = state or model.state_dict()
         model.precision = config["precision"]
         # A preset's promise is about the preset alone.
@@ -203,13 +203,15 @@ def cases_of(
     return cases
 
 
-def _model(source: Source, config: dict[str, Any], state: dict[str, Tensor], seed: int) -> GHGS:
+def _model(
+    source: Source, config: dict[str, Any], state: dict[str, Tensor], seed: int, device: torch.device
+) -> GHGS:
     """A model with the tensors of ``state``; the first one, where there are none yet, gets its own."""
     if not state and source.checkpoint is None:
         return random_model(config, seed)
     model = GHGS.from_config(config, empty=STAGES)
     if not state:
-        model.load(source.checkpoint)
+        model.load(source.checkpoint, device=device)
         return model
     require_fit(model, state, "knobs")
     model.load_state_dict(state, assign=True)

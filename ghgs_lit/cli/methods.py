@@ -23,7 +23,7 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
     """
     path, renderer = config["checkpoint"], build_renderer(config, device)
     model = GHGS.from_config(config, empty=STAGES)
-    model.load(path)
+    model.load(path, device=device)
     model.precision = config["precision"]
     checkpoint = read_checkpoint(path)
     facts: dict[str, Any] = {

@@ -152,7 +152,7 @@ def load(config: dict[str, Any]) -> tuple[GHGS, Renderer, torch.device]:
     device = pick_device(config["device"])
     renderer = build_renderer(config, device)
     model = GHGS.from_config(config, empty=STAGES)
-    model.load(config["checkpoint"])
+    model.load(config["checkpoint"], device=device)
     model.precision = config["precision"]
     return model.to(device).eval(), renderer, device
 

@@ -17,6 +17,22 @@ def has_bfloat16(device: torch.device) -> bool:
     return any(found is True for name, found in capabilities.items() if "bf16" in name)
 
 
+def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
+    """In what weights are computed with: float32 in place of a half precision that the processor lacks.
+
+    Products and convolutions in float16 take four times as long as in float32 on a CPU, and lose digits.
+
+    Args:
+        stored: of the weights in their file.
+        device: where they are used.
+    """
+    if device.type == "cpu" and (
+        stored == torch.float16 or (stored == torch.bfloat16 and not has_bfloat16(device))
+    ):
+        return torch.float32
+    return stored
+
+
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     """The autocast context of a forward pass.
 

@@ -141,7 +141,7 @@ def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
     out = tmp_path / "out.ckpt"
     import_weights(config(), out, vggt, release, dtype)
     half = getattr(torch, dtype)
-    model = GHGS.from_checkpoint(out)
+    model = GHGS.from_checkpoint(out, dtype=half)
     assert {p.dtype for p in model.encoder.parameters()} == {half}
     assert {p.dtype for p in (*model.depth_head.parameters(), *model.gaussian_head.parameters())} == {
         torch.float32

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.kernels import precision
 from ghgs_lit.model import GHGS
-from ghgs_lit.weights.checkpoint import read_checkpoint, write_checkpoint
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, write_checkpoint
 from ghgs_lit.weights.inference import write_inference
 from tests.helpers.models import config, make_model
 from tests.helpers.verbs import ghgs
@@ -56,3 +57,20 @@ def test_what_half_precision_cannot_hold_is_refused(tmp_path):
     write_inference(path, tmp_path / "b.ckpt", "bfloat16")
     with pytest.raises(InputError, match="expected another file than the checkpoint"):
         write_inference(path, path, "float16")
+
+
+@pytest.mark.parametrize("has_bfloat16", [True, False])
+@pytest.mark.parametrize("stored", [torch.float16, torch.bfloat16, torch.float32])
+def test_half_precision_is_computed_where_the_processor_has_it(
+    checkpoint, tmp_path, monkeypatch, stored, has_bfloat16
+):
+    """An encoder in float16 is slow on a CPU; a GPU keeps it, and who asks for it."""
+    monkeypatch.setattr(precision, "has_bfloat16", lambda _: has_bfloat16)
+    write_inference(checkpoint, tmp_path / "b.ckpt", str(stored).removeprefix("torch."))
+    kept = stored == torch.bfloat16 and has_bfloat16
+    model, asked = (GHGS.from_checkpoint(tmp_path / "b.ckpt", dtype=dtype) for dtype in (None, stored))
+    assert {p.dtype for p in model.encoder.parameters()} == {stored if kept else torch.float32}
+    assert {p.dtype for p in asked.encoder.parameters()} == {stored}
+    assert precision.fast_precision(stored, torch.device("cuda")) == stored
+    for name, tensor in model_state(read_checkpoint(tmp_path / "b.ckpt")).items():
+        assert torch.equal(model.state_dict()[name].float(), tensor.float())
