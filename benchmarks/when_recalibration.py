@@ -31,8 +31,8 @@ from ghgs_lit.config.groups import read_option
 from ghgs_lit.errors import require
 from ghgs_lit.pretext.parts import PARTS, vertex_parts
 from ghgs_lit.synthesis.bench import definition, names
+from ghgs_lit.synthesis.jobs import SyntheticSource
 from ghgs_lit.synthesis.people.body import load_body
-from ghgs_lit.synthesis.people.generate import generate
 
 NEAR = 0.05  # metres
 #: Results: [row of the ablation][views, targets][person] has values of seeds.
@@ -66,7 +66,7 @@ def neighbors() -> np.ndarray:
 def close_limbs(person: str, touch: np.ndarray) -> float:
     """The share of the skin that is near to a part that is not its neighbour."""
     seed, parts = definition()["data"]["people_seed"], vertex_parts()
-    vertices = generate(seed, int(person[1:])).body_vertices
+    vertices = SyntheticSource(seed).load(person).body_vertices
     near = np.zeros(len(vertices), dtype=bool)
     for part in range(len(PARTS)):
         own = ~touch[part][parts]

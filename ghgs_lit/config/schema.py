@@ -155,6 +155,7 @@ KINDS: dict[str, Kind] = {
     "data.masks": TEXT | TEXTS,
     "data.name": TEXT,
     "data.people.*": COUNT,
+    "data.active.*": integer(least=0),
     "data.people_seed": integer(least=0),
     "data.pin_memory": FLAG,
     "data.pixel_centers": TEXT,

@@ -17,7 +17,14 @@ from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import Split, split_names
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis import bench, people
-from ghgs_lit.synthesis.jobs import RenderSettings, Source, SyntheticSource, identity, render_people
+from ghgs_lit.synthesis.jobs import (
+    ACTIVE,
+    RenderSettings,
+    Source,
+    SyntheticSource,
+    identity,
+    render_people,
+)
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
 
@@ -49,6 +56,7 @@ class Synthetic(_Renderable):
 
     Attributes:
         people: number of people, ``{train: n, val: n}``; a larger number extends the same cache.
+        active: number of further people, in poses of sport and dance, likewise.
         people_seed: seed of the people.
         cache_dir: folder of the caches (null: ``$GHGS_CACHE`` or ``~/.cache/ghgs_lit``).
     """
@@ -58,6 +66,7 @@ class Synthetic(_Renderable):
 
     root: str = field(init=False, default="")
     people: Mapping[str, int]
+    active: Mapping[str, int] = field(default_factory=dict)
     people_seed: int = 0
     cache_dir: str | None = None
 
@@ -66,6 +75,8 @@ class Synthetic(_Renderable):
         for phase in PHASES:
             count = self.people.get(phase, 0)
             require(0 < count < self.FIRST_VAL, f"data.people.{phase}", "at least 1", count)
+            count = self.active.get(phase, 0)
+            require(0 <= count < self.FIRST_VAL, f"data.active.{phase}", "at least 0", count)
         settings = {**identity(self.rig, self.render, self.people_seed), "people": people_version()}
         key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
@@ -82,7 +93,8 @@ class Synthetic(_Renderable):
         if phase == bench.SPLIT:
             return bench.names()
         first = 0 if phase == "train" else self.FIRST_VAL
-        return [f"p{first + i:07d}" for i in range(self.people[phase])]
+        numbers = (("p", self.people[phase]), (ACTIVE, self.active.get(phase, 0)))
+        return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
         """Render the people of ``splits`` that the cache lacks.

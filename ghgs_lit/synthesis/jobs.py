@@ -50,14 +50,18 @@ class Source(Protocol):
         """Degrees about y that the first camera is turned by, to look at the front."""
 
 
+#: First letter of the names of generated people in poses of sport and dance.
+ACTIVE = "a"
+
+
 @dataclass(frozen=True)
 class SyntheticSource:
-    """Generated people, named ``p<index>``."""
+    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``."""
 
     seed: int
 
     def load(self, name: str) -> Person:
-        return people.generate(self.seed, int(name[1:]))
+        return people.generate(self.seed, int(name[1:]), active=name.startswith(ACTIVE))
 
     def facing(self, name: str) -> float:
         return 0.0

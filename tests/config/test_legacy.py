@@ -21,6 +21,7 @@ NEW += ("depth_head.dpt.rectified_skip", "gaussian_head.dpt.rectified_skip")
 NEW += ("gaussian_head.low_pass", "gaussian_head.antialiased", "model.frame")
 NEW += ("gaussian_head.axes", "gaussian_head.attributes.inward")
 NEW += ("encoder.semantic", "optimizer.matrix_lr", "rounds.exchange")
+NEW += ("data.active.train", "data.active.val")
 TODAY = {
     "demo": ["experiment=demo"],
     "release": ["experiment=thuman2", "encoder=vggt_nano", "compat=release"],

@@ -71,8 +71,8 @@ def generated(monkeypatch):
     """Boxes in place of people; the list of what was made."""
     made = []
 
-    def generate(seed, index):
-        made.append((seed, index))
+    def generate(seed, index, active=False):
+        made.append((seed, index, "active") if active else (seed, index))
         rng = np.random.default_rng([seed, index])
         return box_person(f"p{index}", rng.integers(60, 255, 3), (0.5, rng.uniform(1.5, 1.9), 0.3))
 
@@ -99,6 +99,14 @@ def test_generated_people_are_rendered_once_and_extended(tmp_path, generated):
     assert more.dataset.root == data.dataset.root
     assert len(more.subjects("train")) == 3
     assert len(synthetic(tmp_path).subjects("train")) == 2
+    moving = synthetic(tmp_path, active={"val": 1})
+    moving.prepare_data()
+    assert generated[4:] == [(0, 1_000_000, "active")]
+    assert moving.dataset.root == data.dataset.root
+    assert [list(moving.subjects(phase)) for phase in ("train", "val")] == [
+        ["p0000000", "p0000001"],
+        ["p1000000", "a1000000"],
+    ]
 
 
 def test_the_cache_is_named_after_every_setting(tmp_path):
@@ -127,6 +135,8 @@ def test_generated_people_must_have_the_views_that_are_asked_for(tmp_path):
         synthetic(tmp_path, render={"size": 28, "views": [0]})
     with pytest.raises(InputError, match=r"data\.people\.val: expected at least 1; found 0"):
         synthetic(tmp_path, people={"train": 2})
+    with pytest.raises(InputError, match=r"data\.active\.train: expected at least 0; found -1"):
+        synthetic(tmp_path, active={"train": -1})
 
 
 def test_rig_draws_do_not_depend_on_other_subjects():

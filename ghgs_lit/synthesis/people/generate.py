@@ -33,12 +33,13 @@ MAX_YAW = 30.0  # degrees to either side
 MAX_POSES = 6  # drawn until the arms are clear of the trunk, each with the arms further apart
 
 
-def generate(seed: int, index: int) -> Person:
+def generate(seed: int, index: int, active: bool = False) -> Person:
     """Generate person `index` of the family `seed`: the same person on every machine, up to rounding.
 
     Args:
         seed: number of the family, at least 0.
         index: number of the person, at least 0.
+        active: in a pose of sport or dance in place of standing or walking (:func:`.pose.sample_pose`).
 
     Returns:
         An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of
@@ -54,7 +55,7 @@ def generate(seed: int, index: int) -> Person:
     shape_rng, pose_rng, cloth_rng, look_rng = streams
     body = load_body()
     coefficients, female, age = body.sample_shape(shape_rng)
-    figure = pose_figure(body, coefficients, pose_rng)
+    figure = pose_figure(body, coefficients, pose_rng, active)
     outfit = sample_outfit(cloth_rng, female)
     look = sample_complexion(look_rng, female, age)
     cut = sample_haircut(look_rng, female)
@@ -71,16 +72,18 @@ def generate(seed: int, index: int) -> Person:
     ground = min(float(part.vertices[:, 1].min()) for part in parts)
     middle = 0.5 * (figure.posed.min(0) + figure.posed.max(0))
     origin = np.array([middle[0], ground, middle[2]])
-    person = Person(f"person_{seed}_{index:04d}", tuple(parts), figure.posed)
+    person = Person(f"{'active' if active else 'person'}_{seed}_{index:04d}", tuple(parts), figure.posed)
     return person.mapped(lambda vertices: (vertices - origin) @ turn.T)
 
 
-def pose_figure(body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator) -> Figure:
+def pose_figure(
+    body: BodyModel, coefficients: np.ndarray, rng: np.random.Generator, active: bool = False
+) -> Figure:
     """The naked person in a random pose in which the arms do not run into the trunk."""
     rest, joints = body.rest(coefficients)
     faces = triangles(body.surfaces["body"].quads)
     for attempt in range(MAX_POSES):
-        transforms = sample_pose(body, joints, rng, widen=attempt / (MAX_POSES - 1))
+        transforms = sample_pose(body, joints, rng, widen=attempt / (MAX_POSES - 1), active=active)
         posed = skin(rest[:BODY_VERTICES], body.weights[:BODY_VERTICES], transforms)
         if arm_depth(posed, faces) < 0.012:
             break

@@ -1,4 +1,4 @@
-"""Standing poses within the limits of human joints: gestures for the arms, stances for the legs.
+"""Poses on two feet within the limits of human joints: gestures for the arms, stances for the legs.
 
 Arms are posed by forward kinematics: a direction of the upper arm, an elbow angle, and where the forearm
 points. Legs are posed by inverse kinematics: the soles are placed on the ground and the knees follow, so feet
@@ -31,10 +31,16 @@ GESTURES = {
     "wave": ((1.0, -0.20, 0.12), (-0.05, 1.0, 0.25), (92, 20), (-30, 25), (14, 10)),
     "raised": ((0.55, 0.85, 0.14), (-0.10, 1.0, 0.25), (26, 16), (-20, 30), (22, 15)),
     "reach": ((0.42, 0.30, 0.95), (-0.1, 0.8, 0.6), (34, 14), (0, 30), (20, 12)),
+    "overhead": ((0.85, 0.60, 0.20), (-0.85, 0.75, 0.0), (82, 22), (0, 30), (25, 15)),
+    "folded": ((0.42, -0.85, 0.50), (-0.90, 0.30, 0.55), (98, 10), (10, 20), (30, 15)),
+    "back": ((0.40, -0.75, -0.65), (0.0, -0.2, -1.0), (12, 8), (0, 30), (25, 15)),
 }
 EVERYDAY = ("relaxed", "relaxed", "loose", "loose", "away", "akimbo", "guard", "offer")
 STRIKING = ("point", "side", "wave", "raised", "reach")
+SPORT = (*STRIKING, "overhead", "folded", "back", "guard", "akimbo")
 STANCES = ("stand", "contrapposto", "walk", "step", "crouch", "wide")
+#: Of people in motion, with the least and greatest share of its length to which a leg is bent.
+BENT = {"lunge": (0.62, 0.95), "squat": (0.45, 0.85), "cross": (0.98, 1.0), "crouch": (0.55, 0.8)}
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,7 @@ class _Skeleton:
 
 
 def sample_pose(
-    body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0
+    body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
 ) -> np.ndarray:
     """Draw a pose.
 
@@ -64,15 +70,19 @@ def sample_pose(
         joints: [b, 3] at rest, of one shape.
         rng: random numbers.
         widen: 0 to 1, how far the arms move away from the body.
+        active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or walking.
 
     Returns:
         Transforms [b, 3, 4] of the bones from rest to pose.
     """
-    stance = str(rng.choice(STANCES, p=(0.24, 0.22, 0.22, 0.12, 0.08, 0.12)))
+    if active:
+        stance = str(rng.choice(list(BENT), p=(0.4, 0.3, 0.2, 0.1)))
+    else:
+        stance = str(rng.choice(STANCES, p=(0.24, 0.22, 0.22, 0.12, 0.08, 0.12)))
     local = np.tile(np.eye(3), (len(joints), 1, 1))
     pelvis = _bend_trunk(body, local, stance, rng)
     skeleton = _Skeleton(body, joints, _compose(body.bone_parents, local))
-    gestures = _gestures(stance, rng)
+    gestures = tuple(rng.choice(SPORT, 2)) if active else _gestures(stance, rng)
     stride = rng.uniform(0.25, 0.5) * rng.choice((-1, 1))  # of the left foot, in lengths of the leg
     for side, gesture in zip((1, -1), gestures, strict=True):
         _pose_arm(skeleton, side, gesture, widen, -stride * side if stance == "walk" else 0.0, rng)
@@ -100,6 +110,8 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
         lean += rng.uniform(10, 20)
     elif stance == "walk":
         twist *= 0.5
+    elif stance in ("lunge", "squat"):
+        lean, side = lean + rng.uniform(0, 18), 2 * side
     pelvis = Rotation.from_euler("zxy", [tilt, 0.35 * lean, 0.25 * twist], degrees=True).as_matrix()
     local[body.bone("root")] = pelvis
     nod, turn, roll = rng.uniform(-9, 9) - 0.6 * lean, rng.uniform(-30, 30) - 0.5 * twist, rng.uniform(-6, 6)
@@ -223,7 +235,9 @@ def _pose_legs(
     centre = np.mean(ankles, 0) - np.mean(hips, 0)
     if stance == "contrapposto":  # the leg with the higher hip carries the weight
         centre += 0.3 * (ankles[0] - ankles[1]) * (1 if hips[0][1] > hips[1][1] else -1)
-    bend = rng.uniform(0.55, 0.8) if stance == "crouch" else 1.0
+    elif stance == "lunge":  # towards the foot in front
+        centre += rng.uniform(0.0, 0.2) * (ankles[0] - ankles[1]) * np.sign(stride)
+    bend = rng.uniform(*BENT[stance]) if stance in BENT else 1.0
     heights = []
     for ankle, hip, (thigh, shin) in zip(ankles, hips, lengths, strict=True):
         reach = 0.994 * (thigh + shin) * (bend**0.35)
@@ -251,6 +265,13 @@ def _feet(
             heel = rng.uniform(14, 32) if z < 0 and stance == "walk" else 0.0
         elif stance in ("wide", "crouch"):
             x, yaw = side * half * rng.uniform(1.5, 2.1), side * rng.uniform(10, 26)
+        elif stance == "lunge":
+            x, z, yaw = side * half * 0.8, 0.9 * leg * stride * side, 0.6 * yaw
+            heel = rng.uniform(18, 42) if z < 0 else 0.0
+        elif stance == "squat":
+            x, yaw = side * half * rng.uniform(2.0, 3.2), side * rng.uniform(20, 45)
+        elif stance == "cross":
+            x, z = -side * half * rng.uniform(0.0, 0.5), side * np.sign(stride) * rng.uniform(0.08, 0.14)
         elif stance == "contrapposto" and side * stride > 0:
             x, z, yaw = side * half * 1.35, rng.uniform(0.03, 0.14), side * rng.uniform(14, 32)
         feet.append((x, z, yaw, heel))
