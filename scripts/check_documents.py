@@ -73,6 +73,7 @@ SMALL = [
     (r"^(ghgs benchmark task=scaling .*)",
      r"\1 encoder=vggt_nano 'scaling={share: [0.1, 0.2], views: [2, 3], size: [56, 70], batch: [1]}'",
      "small photographs"),
+    (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
     (r"^(python benchmarks/part_awareness\.py.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"^(tensorboard .*)", r"timeout 20 \1 --port 0 || [ $? = 124 ]", "a server: stopped after 20 s"),
