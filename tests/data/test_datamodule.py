@@ -39,7 +39,7 @@ def test_flat_keys_are_divided_among_data_set_and_options():
 )
 def test_a_wrong_key_names_the_class_and_the_key(module, key, line):
     """A misspelt key must never be swallowed."""
-    with pytest.raises(InputError, match=f"data key: expected one of apply_mask, .* for {line}"):
+    with pytest.raises(InputError, match=f"data key: expected one of (active, )?apply_mask, .* for {line}"):
         module(V4, RELEASE, size=28, **{key: 1})
 
 
