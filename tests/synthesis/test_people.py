@@ -111,6 +111,9 @@ def test_same_numbers_same_person(people):
     """The cache of rendered people relies on it: the same two numbers give the same arrays."""
     again = generate(7, 2)
     assert again.name == people[2].name
+    standing = generate(7, 4)  # the same person in another pose
+    assert (standing.name, people[4].name) == ("person_7_0004", "active_7_0004")
+    assert np.abs(standing.body_vertices - people[4].body_vertices).max() > 0.2
     np.testing.assert_array_equal(again.body_vertices, people[2].body_vertices)
     for one, two in zip(again.parts, people[2].parts, strict=True):
         np.testing.assert_array_equal(one.vertices, two.vertices)
@@ -230,7 +233,7 @@ def test_arms_stay_out_of_the_trunk(active):
 def test_people_in_motion_spread_bend_and_cross_their_legs():
     """What standing people never show: feet a leg's length apart, deep knees, feet on the other's side."""
     body = load_body()
-    apart, across, high = [], [], []
+    apart, along, across, high = [], [], [], []
     for active in (False, True):
         found = []
         for index in range(24):
@@ -243,9 +246,11 @@ def test_people_in_motion_spread_bend_and_cross_their_legs():
             found.append(((left - right)[[0, 2]], root[1] / leg))
         steps = np.array([step for step, _ in found])
         apart.append(np.linalg.norm(steps, axis=1).max())
+        along.append(np.abs(steps[:, 1]).max())
         across.append(steps[:, 0].min())
         high.append(min(height for _, height in found))
     assert apart[1] > apart[0] + 0.1
+    assert along[1] > along[0] + 0.1
     assert apart[1] > 0.7
     assert across[1] < 0.0 < across[0]
     assert high[1] < high[0] - 0.08
