@@ -129,10 +129,11 @@ def table(results: Mapping[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def methods_of(options: argparse.Namespace, config: Mapping[str, Any]) -> Iterator[tuple[str, Method]]:
-    """Every checkpoint and every baseline, one in memory at a time."""
-    device, rounds = pick_device(config["device"]), options.refine_cameras
-    renderer = build_renderer(config, device)
+def methods_of(
+    options: argparse.Namespace, config: Mapping[str, Any], device: torch.device
+) -> Iterator[tuple[str, Method]]:
+    """Every checkpoint, one in memory at a time, and every baseline."""
+    renderer, rounds = build_renderer(config, device), options.refine_cameras
     for path in options.checkpoints:
         model = GHGS.from_checkpoint(path, device)
         cameras = CameraRefinement(rounds, model, renderer) if rounds else None
@@ -157,7 +158,7 @@ def main() -> None:
     size = list(image_size("size", size))
     data = {name: data_of(capture, options.people, size) for name, capture in CAPTURES.items()}
     results = {}
-    for method_name, method in methods_of(options, config):
+    for method_name, method in methods_of(options, config, device):
         results[method_name] = {
             name: means(measure(method, name, batches(capture, data["clean"], data[name]), metrics, device))
             for name, capture in CAPTURES.items()

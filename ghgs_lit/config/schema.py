@@ -135,6 +135,7 @@ KINDS: dict[str, Kind] = {
     "vggt": PATH,
     # data
     "data": NULL,
+    "data.active.*": integer(least=0),
     "data.apply_mask": FLAG,
     "data.batch_size": COUNT,
     "data.bodies": TEXTS,
@@ -155,7 +156,6 @@ KINDS: dict[str, Kind] = {
     "data.masks": TEXT | TEXTS,
     "data.name": TEXT,
     "data.people.*": COUNT,
-    "data.active.*": integer(least=0),
     "data.people_seed": integer(least=0),
     "data.pin_memory": FLAG,
     "data.pixel_centers": TEXT,

@@ -11,7 +11,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.training import start
 from ghgs_lit.weights import importing, names
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
 from ghgs_lit.weights.exporting import export_weights
 from ghgs_lit.weights.importing import Source, match_files
 from ghgs_lit.weights.reading import cast
@@ -141,6 +141,7 @@ def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
     out = tmp_path / "out.ckpt"
     import_weights(config(), out, vggt, release, dtype)
     half = getattr(torch, dtype)
+    assert model_state(read_checkpoint(out))["encoder.aggregator.camera_token"].dtype == half
     model = GHGS.from_checkpoint(out, dtype=half)
     assert {p.dtype for p in model.encoder.parameters()} == {half}
     assert {p.dtype for p in (*model.depth_head.parameters(), *model.gaussian_head.parameters())} == {
