@@ -1,8 +1,8 @@
-"""Frames a second of a live view: ``python benchmarks/live.py [--presets none,exact,balanced,fast]``.
+"""Frames a second of a live view: ``python benchmarks/live.py [checkpoint=shipped] [presets=[exact,fast]]``.
 
 From decoded photographs and masks in memory (uint8) to the finished picture (uint8) of another view, with
-random weights. The presets take turns, so that drift of the machine hits all alike. Times are medians of
-``--repeats`` frames.
+random weights where no checkpoint is named. The presets take turns, so that drift of the machine hits all
+alike. Times are medians of ``--repeats`` frames.
 """
 
 import argparse
@@ -16,9 +16,10 @@ from torch import Tensor
 
 from ghgs_lit.benchmark.machine import in_words, machine_facts
 from ghgs_lit.benchmark.measure import order
-from ghgs_lit.benchmark.presets import Case, Source, cases_of, presets_of, readers_of_skip
+from ghgs_lit.benchmark.presets import Case, readers_of_skip
 from ghgs_lit.benchmark.scene import ellipsoid_batch
 from ghgs_lit.benchmark.stages import TOTAL, SecondsProbe, forward, top_level
+from ghgs_lit.cli.benchmark import check_options, configured_cases
 from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.kernels.allocation import keep_freed_memory
@@ -45,7 +46,6 @@ def frame(case: Case, batch: Batch, photographs: Tensor, device: torch.device) -
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--presets", default="none,exact,balanced,fast", help="files of conf/skip")
     parser.add_argument("--repeats", type=int, default=50, help="frames of each preset")
     parser.add_argument(
         "--share", type=float, default=0.15, help="part of the photographs that the subject covers"
@@ -54,18 +54,15 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=252, help="side of the photographs in pixels")
     parser.add_argument("--target", type=int, default=512, help="side of the picture in pixels")
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument(
-        "options", nargs="*", help="further overrides of `ghgs benchmark`, such as device=cuda"
-    )
+    parser.add_argument("options", nargs="*", help="overrides of `ghgs benchmark`, such as device=cuda")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     keep_freed_memory()  # as the command line does
     cfg = compose("benchmark", options.options)
     config = resolve(cfg)
     device = pick_device(config["device"])
-    shared = {name: config[name] for name in ("renderer", "precision")}
-    presets = presets_of(options.presets.split(","), config["skip"])
-    cases = cases_of(Source("model", config, None), presets, readers_of_skip(cfg), {}, shared, device)
+    check_options(config, options.options)
+    cases = configured_cases(config, readers_of_skip(cfg), device)
     batch, photographs = scene(options.share, options.views, options.size, options.target)
     batch = batch.to(device)
     seconds: list[dict[str, list[float]]] = [defaultdict(list) for _ in cases]

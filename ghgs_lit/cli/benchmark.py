@@ -3,6 +3,7 @@
 import itertools
 import math
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +45,14 @@ def run(cfg: DictConfig) -> None:
         cfg.checkpoint = SHIPPED
     cfg = cfg if cfg.task == "scaling" else with_trained_data(cfg)
     config = save_config(cfg, directory)
-    _check(config)
+    check_options(config, overrides())
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     with threads(config["threads"]):
         if cfg.task == "peers":
             content = peers(cfg, config, directory, device)
         else:
-            cases = _cases(config, readers_of_skip(cfg), device)
+            cases = configured_cases(config, readers_of_skip(cfg), device)
             measured = _presets if cfg.task == "presets" else _scaling
             content = measured(cases, config, device)
         content = {"task": config["task"], "machine": machine_facts(device), **content}
@@ -63,7 +64,16 @@ def run(cfg: DictConfig) -> None:
         raise SystemExit(1)
 
 
-def _check(config: dict[str, Any]) -> None:
+def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
+    """Refuse what cannot be measured.
+
+    Args:
+        config: of ``ghgs benchmark``, resolved.
+        given: overrides that were asked for.
+
+    Raises:
+        InputError: a value out of range, or an option that has no effect beside the others.
+    """
     timing = config["timing"]
     for key, least in (("warmup", 0), ("repeats", 1)):
         value = timing[key]
@@ -78,7 +88,7 @@ def _check(config: dict[str, Any]) -> None:
         require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
         return
     # A checkpoint brings its own model: what is asked for beside it must not be ignored in silence.
-    for key in (text.split("=", 1)[0].lstrip("+~") for text in overrides()):
+    for key in (text.split("=", 1)[0].lstrip("+~") for text in given):
         if is_below(key, [name for name in (*KNOBS, "ablation", "compat") if name not in _APPLIED]):
             raise InputError(f"{key}: expected no option of the model beside a checkpoint (knobs={{...}})")
 
@@ -87,8 +97,19 @@ def _check(config: dict[str, Any]) -> None:
 _APPLIED = ("skip", "renderer", "precision")
 
 
-def _cases(config: dict[str, Any], readers: dict[str, str], device: torch.device) -> list[Case]:
-    """Every source in every preset; for errors the yardstick is always among them."""
+def configured_cases(
+    config: Mapping[str, Any], readers: Mapping[str, str], device: torch.device
+) -> list[Case]:
+    """Every source in every preset; for errors the yardstick is always among them.
+
+    Args:
+        config: of ``ghgs benchmark``, resolved.
+        readers: of :func:`readers_of_skip`.
+        device: of the models.
+
+    Raises:
+        FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.
+    """
     names = config["presets"]
     if config["task"] == "presets":
         names = list(dict.fromkeys([YARDSTICK, *names]))
