@@ -55,7 +55,7 @@ def main() -> None:
     parser.add_argument("--target", type=int, default=512, help="side of the picture in pixels")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("options", nargs="*", help="overrides of `ghgs benchmark`, such as device=cuda")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     torch.set_num_threads(options.threads)
     keep_freed_memory()  # as the command line does
     cfg = compose("benchmark", options.options)
