@@ -1,0 +1,32 @@
+"""``benchmarks/live.py``: which models it times."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+from ghgs_lit.benchmark.measure import threads
+from ghgs_lit.errors import InputError
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "live.py"
+SMALL = ["--size", "56", "--target", "32", "--repeats", "2", "--threads", "1"]
+
+
+def live(monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *options])
+    with threads(1):  # and those of before afterwards
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+
+
+def test_a_checkpoint_in_each_number_of_rounds(monkeypatch, capsys):
+    knobs = "knobs={rounds.count:[1,2]}"
+    live(monkeypatch, "checkpoint=shipped", *SMALL, "presets=[exact]", knobs)
+    rows = [line.split("|")[1].strip() for line in capsys.readouterr().out.splitlines() if line[:2] == "| "]
+    counts = [f"{name} rounds.count={count}" for name in ("none", "exact") for count in (1, 2)]
+    assert rows == ["ms", "none", *counts]
+
+
+def test_an_option_of_the_model_beside_a_checkpoint_is_refused(monkeypatch):
+    with pytest.raises(InputError, match="encoder"):
+        live(monkeypatch, "checkpoint=shipped", *SMALL, "encoder=vggt_small")
