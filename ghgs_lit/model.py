@@ -97,6 +97,8 @@ class GHGS(nn.Module):
         self.pad, self.frame, self.matte, self.check_inputs, self.auto = pad, frame, matte, check_inputs, auto
         #: Where features of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | PhotographCache | None = None
+        #: Whether predictions hold the Gaussians before each round, too.
+        self.keeps_drafts = False
         self.precision = "inherit"
 
     @property
@@ -155,7 +157,7 @@ class GHGS(nn.Module):
             last.depth_maps,
             decisions,
             rounds=tuple(state.depth_maps for state in states),
-            drafts=tuple(state.gaussians for state in states[:-1]),
+            drafts=tuple(state.gaussians for state in states[:-1]) if self.keeps_drafts else (),
         )
         return prediction if padding is None else padding.cut_prediction(prediction)
 

@@ -358,7 +358,8 @@ class Prediction(_TensorStruct):
     ``depth`` is meaningful where ``depth_valid``.
 
     ``decisions`` has one of each element with ``skip=auto``, none otherwise. ``rounds`` are the depths before
-    the first round and after each (the last is ``depth_maps``), ``drafts`` the Gaussians before each.
+    the first round and after each (the last is ``depth_maps``), ``drafts`` the Gaussians before each, where
+    the model keeps them.
     """
 
     gaussians: Gaussians

@@ -68,7 +68,7 @@ def top_level(names: Any) -> list[str]:
     return [name for name in names if "." not in name and name not in (OTHER, TOTAL)]
 
 
-@torch.no_grad()
+@torch.inference_mode()
 def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Probe) -> tuple[Prediction, Rendering]:
     """Predict the Gaussians of a batch and render its targets, while ``probe`` watches."""
     with watched(model, probe), inside(TOTAL, probe):

@@ -22,7 +22,7 @@ def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     # The argument is chosen, not the result: a root at 0 would have an infinite gradient.
     squared = scaled.square().sum(-1, keepdim=True).masked_fill(is_zero, 1.0)
     direction = (scaled * squared.rsqrt()).masked_fill(is_zero, 0.0)
-    if least == 0:
+    if least == 0 or not direction.requires_grad:
         return direction
     share = (largest * squared.detach().sqrt() / least).clamp(max=1)
     return direction.detach() + share * (direction - direction.detach())

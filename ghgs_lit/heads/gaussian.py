@@ -16,7 +16,7 @@ from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
-from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
+from ghgs_lit.geometry.rotations import multiply_quaternions, rotate
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
@@ -283,8 +283,7 @@ class GaussianHead(nn.Module):
         )
         if self.axes == "surface":
             axes = surface_axes(depth_maps, batch.cameras, image, pixel)
-            offset = (quaternion_to_matrix(axes) * offset[:, None]).sum(-1)
-            quaternions = multiply_quaternions(axes, quaternions)
+            offset, quaternions = rotate(axes, offset), multiply_quaternions(axes, quaternions)
         if batch.alpha is not None:
             opacities = opacities * batch.alpha.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
         colors = batch.once(surface_colors).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]

@@ -1,7 +1,10 @@
 """Local axes of the surface that a depth map describes."""
 
+from math import inf
+
 import torch
-from jaxtyping import Bool, Float, Int
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
@@ -30,32 +33,28 @@ def surface_axes(
         image, pixel: which pixels (``b * V + v``, row-major index).
     """
     height, width = maps.depth.shape[-2:]
-    depth, valid = at_least_float32(maps.depth).flatten(), maps.valid.flatten()
+    depth = at_least_float32(maps.depth)
+    own = depth.flatten(0, 1).flatten(1)[image, pixel]
     intrinsics = at_least_float32(cameras.intrinsics).flatten(0, 1)
     fx, skew, cx, fy, cy = (intrinsics[:, i, j][image] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     row, column = pixel // width, pixel % width
-    place = image * (height * width) + pixel
-    own = depth[place]
+    # A pixel that is not valid, or beyond the border, is infinitely far away.
+    around = F.pad(depth.masked_fill(~maps.valid, inf), (1, 1, 1, 1), value=inf).flatten()
+    place = (image * (height + 2) + row + 1) * (width + 2) + column + 1
     footprint = own / fx
 
-    def neighbor(step: int, inside: Bool[Tensor, " N"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-        """A neighbour's depth, and how far it lies on the same surface, 0 to 1."""
-        other = torch.where(inside, place + step, place)
-        exists = inside & valid[other]
-        z = torch.where(exists, depth[other], own)
-        distance = (z - own).abs() / footprint
-        return z, ((_OTHER - distance) / (_OTHER - _SAME)).clamp(0, 1) * exists
+    def neighbor(step: int) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """How much deeper a neighbour is where it lies on the same surface, and how far it does, 0 to 1."""
+        deeper = around[place + step] - own
+        near = ((_OTHER - deeper.abs() / footprint) / (_OTHER - _SAME)).clamp(0, 1)
+        return near * torch.where(near > 0, deeper, 0), near
 
-    def slope(
-        step: int, has_after: Bool[Tensor, " N"], has_before: Bool[Tensor, " N"]
-    ) -> Float[Tensor, " N"]:
+    def slope(step: int) -> Float[Tensor, " N"]:
         """By which share depth grows from one pixel to the next."""
-        (after, near_after), (before, near_before) = neighbor(step, has_after), neighbor(-step, has_before)
-        growth = near_after * (after - own) + near_before * (own - before)
-        base = near_after * after + near_before * before + (1 - near_after) * (1 - near_before) * own
-        return growth / base
+        (after, near_after), (before, near_before) = neighbor(step), neighbor(-step)
+        return (after - before) / ((1 + near_after * near_before) * own + after + before)
 
-    right, down = slope(1, column < width - 1, column > 0), slope(width, row < height - 1, row > 0)
+    right, down = slope(1), slope(width + 2)
     # The cross product of the tangents d(z K^-1 [u v 1]) / du and / dv, multiplied by fx fy / z^2.
     toward = 1 + right * (column + 0.5 - cx) + down * (row + 0.5 - cy)
     x, y = -fx * right, -skew * right - fy * down

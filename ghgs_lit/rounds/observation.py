@@ -22,6 +22,9 @@ CHANNELS = 11
 def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
     """What each input view shows of each Gaussian of its element: :data:`CHANNELS` values.
 
+    The first view is that of the Gaussian's own image; the others follow in their order, from the last to the
+    first again.
+
     Args:
         gaussians: with the images that they come from.
         batch: photographs, masks and cameras.
@@ -38,8 +41,11 @@ def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[
     color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
     behind = torch.tanh((z - depth) / _BEHIND)
     values = torch.cat((color - gaussians.colors[:, None], error, mask, alpha, behind), -1)
-    is_own = F.one_hot(gaussians.image % views, views)[..., None]
-    return torch.cat((torch.where(can_see, values, 0), can_see.to(values), is_own.to(values)), -1)
+    values = torch.cat((torch.where(can_see, values, 0), can_see.to(values)), -1)
+    own_first = (gaussians.image[:, None] + torch.arange(views, device=values.device)) % views
+    values = values.gather(1, own_first[..., None].expand_as(values))
+    is_own = torch.arange(views, device=values.device) == 0
+    return torch.cat((values, is_own.to(values).expand(len(values), -1)[..., None]), -1)
 
 
 def looked_up(

@@ -10,6 +10,7 @@ optimizers of splats (G3R, Chen et al., ECCV 2024; ReSplat, Xu et al., 2025).
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from jaxtyping import Float
@@ -27,7 +28,7 @@ from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points
 
 #: Gaussians whose views go through the network at once.
-_AT_ONCE = 1024
+_AT_ONCE = 2048
 #: Of :class:`Search`: how far from near to far a Gaussian is, and the distance between them.
 _PLACE = 2
 
@@ -98,12 +99,18 @@ class Rounds(nn.Module):
         self.count, self.training_counts = count, tuple(training_counts)
         self.depths, self.reach, self.gains = depths, reach, gains
         self.view = nn.Sequential(
-            nn.Linear(CHANNELS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
+            nn.Linear(CHANNELS, hidden),
+            nn.ReLU(inplace=True),
+            nn.Linear(hidden, hidden),
+            nn.ReLU(inplace=True),
         )
         self.start = nn.Linear(channels, hidden)
         inputs = 4 * hidden + depths + _PLACE + 3
         self.update = nn.Sequential(
-            nn.Linear(inputs, 2 * hidden), nn.ReLU(), nn.Linear(2 * hidden, hidden), nn.ReLU()
+            nn.Linear(inputs, 2 * hidden),
+            nn.ReLU(inplace=True),
+            nn.Linear(2 * hidden, hidden),
+            nn.ReLU(inplace=True),
         )
         self.memory = nn.Linear(hidden, hidden)
         self.exchange = None if exchange is None else Exchange(hidden, exchange)
@@ -155,10 +162,9 @@ class Rounds(nn.Module):
     def _remembered(
         self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
     ) -> Float[Tensor, "n h"]:
-        """The memory after a look at what each view shows and what is known beside it."""
-        views, is_own = self.view(each), each[..., -1:]
-        others = views * (1 - is_own)
-        seen = ((views * is_own).sum(1), others.sum(1) / max(1, views.shape[1] - 1), others.amax(1))
+        """The memory after a look at what each view shows, the own one first, and what is known beside it."""
+        own, *others = self.view(each).unbind(1)
+        seen = (own, sum(others) / len(others), reduce(torch.maximum, others))
         return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
 
     @torch.no_grad()

@@ -52,6 +52,7 @@ class GHGSModule(BudgetedModule):
         self.token_budgets = token_budgets
         self.guard = Guard(optimization.skip_nonfinite)
         self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
+        model.keeps_drafts = True  # validation shows what each round is worth
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         """The prediction for a batch, and its Gaussians as the batch's target cameras see them."""

@@ -6,7 +6,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, quaternion_to_matrix
+from ghgs_lit.geometry.rotations import (
+    matrix_to_quaternion,
+    multiply_quaternions,
+    quaternion_to_matrix,
+    rotate,
+)
 
 
 def test_quaternions_of_matrices_and_their_products():
@@ -19,3 +24,6 @@ def test_quaternions_of_matrices_and_their_products():
     torch.testing.assert_close(
         quaternion_to_matrix(product), matrices @ matrices.roll(1, 0), atol=1e-12, rtol=0
     )
+    moved = rotate(found, torch.from_numpy(vectors).flip(0))
+    expected = Rotation.from_rotvec(vectors).apply(vectors[::-1])
+    torch.testing.assert_close(moved, torch.from_numpy(expected), atol=1e-12, rtol=0)

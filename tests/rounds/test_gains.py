@@ -120,11 +120,10 @@ def test_the_model_equalizes_before_its_rounds():
     """Colours of the Gaussians are those of the equalized photographs; without the option they are not."""
     batch = painted()
     dark = seen_with(batch, drawn(batch))
+    models = [make_model("model=recurrent", "skip=exact", f"rounds.gains={on}") for on in ("false", "true")]
+    models[1].keeps_drafts = True
     with torch.no_grad():
-        plain, equal = (
-            make_model("model=recurrent", "skip=exact", f"rounds.gains={on}").eval()(dark)
-            for on in ("false", "true")
-        )
+        plain, equal = (model.eval()(dark) for model in models)
     photos = dark.images.flatten(0, 1).flatten(2).mT
     own = photos[plain.gaussians.image, plain.gaussians.pixel]
     torch.testing.assert_close(plain.gaussians.colors, own)

@@ -2,15 +2,19 @@
 
 import dataclasses
 
+import lightning.pytorch as L
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import terms
+from ghgs_lit.losses import Losses, terms
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import Rounds
+from ghgs_lit.training import GHGSModule, Optimization
+from ghgs_lit.types import Targets
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
 from tests.helpers.scenes import make_batch
 
@@ -19,6 +23,7 @@ RECURRENT = ("model=recurrent", "skip=exact", "rounds.hidden=16", "rounds.depths
 
 def model(*overrides, kick=0.0, seed=0):
     found = make_model(*RECURRENT, *overrides, seed=seed).eval()
+    found.keeps_drafts = True
     if kick:
         torch.nn.init.normal_(found.rounds.change[-1].weight, std=kick)
         torch.nn.init.normal_(found.rounds.exchange.hear.weight, std=kick)
@@ -130,5 +135,22 @@ def test_what_padding_added_is_cut_off_every_round():
         found = model("model.pad=multiple", "model.frame=world", kick=0.1)(batch)
     assert torch.equal(found.rounds[-1].depth, found.depth)
     assert {maps.depth.shape for maps in found.rounds} == {batch.masks.shape}
+    assert found.drafts
     for draft in found.drafts:
         assert torch.equal(draft.pixel, found.gaussians.pixel)
+
+
+def test_validation_shows_what_each_round_is_worth():
+    """PSNR and depth error before each round: those of the whole model where rounds change nothing."""
+    batch = make_batch(1, 3)
+    batch = dataclasses.replace(batch, targets=Targets(batch.images, batch.masks, batch.cameras))
+    trained = GHGSModule(
+        model("rounds.gains=false"), render, Losses({"render_l1": 1.0}), Optimization(lr=1.0), {}
+    )
+    trainer = L.Trainer(
+        accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False
+    )
+    (found,) = trainer.validate(trained, DataLoader([batch], batch_size=None), verbose=False)
+    for name in ("psnr", "depth_error_mm"):
+        before = [found[f"val/{name}_before_round_{number}"] for number in (1, 2)]
+        assert before == pytest.approx([found[f"val/{name}"]] * 2, rel=1e-4)
