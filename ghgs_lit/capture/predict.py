@@ -57,8 +57,8 @@ def predict(
             one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
             (checkpoints only).
-        refine_cameras: rounds that correct the cameras until the photographs agree
-            (:class:`CameraRefinement`), such as 2 for calibrations that are good to a pixel or two; 0: none.
+        refine_cameras: rounds, at most, that correct the cameras until the photographs agree
+            (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
