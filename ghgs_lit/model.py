@@ -97,7 +97,7 @@ class GHGS(nn.Module):
         self.pad, self.frame, self.matte, self.check_inputs, self.auto = pad, frame, matte, check_inputs, auto
         #: Where features of a frozen encoder are looked up and kept; None: they are computed each time.
         self.feature_cache: FeatureCache | PhotographCache | None = None
-        #: Whether predictions hold the Gaussians before each round, too.
+        #: Whether predictions outside of training hold the Gaussians before each round, too.
         self.keeps_drafts = False
         self.precision = "inherit"
 
@@ -149,6 +149,7 @@ class GHGS(nn.Module):
             if self.rounds is not None:
                 states = self.rounds(states[0], self.gaussian_head.activate, batch)
         last = states[-1]
+        drafts = states[:-1] if self.keeps_drafts and not self.training else ()
         prediction = Prediction(
             last.gaussians,
             last.depth_maps.depth,
@@ -157,7 +158,7 @@ class GHGS(nn.Module):
             last.depth_maps,
             decisions,
             rounds=tuple(state.depth_maps for state in states),
-            drafts=tuple(state.gaussians for state in states[:-1]) if self.keeps_drafts else (),
+            drafts=tuple(state.gaussians for state in drafts),
         )
         return prediction if padding is None else padding.cut_prediction(prediction)
 

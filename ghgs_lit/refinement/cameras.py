@@ -110,8 +110,8 @@ class CameraRefinement:
             schedule.step()
         is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
         motion = without_common(raw.detach(), axes)
-        moved = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
-        extrinsics = torch.where(is_better[:, None, None, None], moved, cameras.extrinsics)
+        extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
+        extrinsics = torch.where(is_better[:, None, None, None], extrinsics, cameras.extrinsics)
         return dataclasses.replace(cameras, extrinsics=extrinsics), is_better
 
 

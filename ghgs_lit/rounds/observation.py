@@ -42,10 +42,11 @@ def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[
     behind = torch.tanh((z - depth) / _BEHIND)
     values = torch.cat((color - gaussians.colors[:, None], error, mask, alpha, behind), -1)
     values = torch.cat((torch.where(can_see, values, 0), can_see.to(values)), -1)
-    own_first = (gaussians.image[:, None] + torch.arange(views, device=values.device)) % views
+    place = torch.arange(views, device=values.device)
+    own_first = (gaussians.image[:, None] + place) % views
     values = values.gather(1, own_first[..., None].expand_as(values))
-    is_own = torch.arange(views, device=values.device) == 0
-    return torch.cat((values, is_own.to(values).expand(len(values), -1)[..., None]), -1)
+    is_own = (place == 0).to(values).expand(len(values), -1)
+    return torch.cat((values, is_own[..., None]), -1)
 
 
 def looked_up(

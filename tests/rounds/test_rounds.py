@@ -41,6 +41,7 @@ def test_untrained_rounds_change_nothing():
         assert torch.equal(getattr(found.gaussians, name), getattr(expected.gaussians, name)), name
     assert len(found.rounds) == 3
     assert len(found.drafts) == 2
+    assert not model("rounds.gains=false").train()(batch).drafts  # nothing reads them
     assert torch.equal(found.depth, found.rounds[-1].depth)
 
 
