@@ -3,14 +3,23 @@
 From decoded photographs and masks in memory (uint8) to the finished picture (uint8) of another view, with
 random weights where no checkpoint is named. The presets take turns, so that drift of the machine hits all
 alike. Times are medians of ``--repeats`` frames.
+
+Small frames hardly use a second core. ``--in-flight 2`` gives each of two processes one of two threads and
+every other frame: more frames a second, each of which takes longer. Frames a second are then those whose
+pictures have come back, in their order.
 """
 
 import argparse
 import dataclasses
+import multiprocessing
 import time
 from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from statistics import median, quantiles
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,6 +35,9 @@ from ghgs_lit.kernels.allocation import keep_freed_memory
 from ghgs_lit.types import Batch
 from ghgs_lit.visualization.pictures import to_uint8
 
+#: Frames of each process that are drawn before it is another preset's turn.
+_BLOCK = 5
+
 
 def scene(share: float, views: int, size: int, target: int) -> tuple[Batch, Tensor]:
     """A scene with a target between the first two views; photographs [1, V, H, W, 3] uint8."""
@@ -35,13 +47,61 @@ def scene(share: float, views: int, size: int, target: int) -> tuple[Batch, Tens
     return batch, (batch.images.movedim(2, -1) * 255).byte()
 
 
-def frame(case: Case, batch: Batch, photographs: Tensor, device: torch.device) -> dict[str, float]:
-    """Predict and draw one picture; the seconds of its stages."""
-    probe, started = SecondsProbe(device), time.perf_counter()
-    images = (photographs.to(device).float() / 255).movedim(-1, 2)
-    _, rendering = forward(case.model, case.renderer, dataclasses.replace(batch, images=images), probe)
-    to_uint8(rendering.image[0, 0])
-    return {**probe.seconds(), TOTAL: time.perf_counter() - started}
+@dataclasses.dataclass(frozen=True)
+class Live:
+    """What draws the frames: models, and the cameras and photographs of a scene."""
+
+    cases: list[Case]
+    batch: Batch
+    photographs: Tensor
+    device: torch.device
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> "Live":
+        torch.set_num_threads(max(1, options.threads // options.in_flight))
+        keep_freed_memory()  # as the command line does
+        cfg = compose("benchmark", options.options)
+        config = resolve(cfg)
+        device = pick_device(config["device"])
+        check_options(config, options.options)
+        cases = configured_cases(config, readers_of_skip(cfg), device)
+        batch, photographs = scene(options.share, options.views, options.size, options.target)
+        return cls(cases, batch.to(device), photographs, device)
+
+    def frame(self, case: int, photographs: Tensor) -> tuple[dict[str, float], np.ndarray]:
+        """Predict and draw one picture; the seconds of its stages, and the picture."""
+        model, renderer = self.cases[case].model, self.cases[case].renderer
+        probe, started = SecondsProbe(self.device), time.perf_counter()
+        images = (photographs.to(self.device).float() / 255).movedim(-1, 2)
+        _, rendering = forward(model, renderer, dataclasses.replace(self.batch, images=images), probe)
+        picture = to_uint8(rendering.image[0, 0])
+        return {**probe.seconds(), TOTAL: time.perf_counter() - started}, picture
+
+
+#: Of a process that draws every other frame.
+_own: Live
+
+
+def _start(options: argparse.Namespace) -> None:
+    global _own
+    _own = Live.of(options)
+
+
+def _drawn(case: int, photographs: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+    return _own.frame(case, torch.from_numpy(photographs))
+
+
+#: Draws a number of frames of a case: the seconds of the stages of each.
+Draw = Callable[[int, int], list[dict[str, float]]]
+
+
+def one_by_one(live: Live, case: int, count: int) -> list[dict[str, float]]:
+    return [live.frame(case, live.photographs)[0] for _ in range(count)]
+
+
+def in_flight(pool: ProcessPoolExecutor, live: Live, case: int, count: int) -> list[dict[str, float]]:
+    frames = [live.photographs.numpy()] * count
+    return [seconds for seconds, _ in pool.map(partial(_drawn, case), frames)]
 
 
 def main() -> None:
@@ -54,36 +114,47 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=252, help="side of the photographs in pixels")
     parser.add_argument("--target", type=int, default=512, help="side of the picture in pixels")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--in-flight", type=int, default=1, help="frames at a time, each in a process")
     parser.add_argument("options", nargs="*", help="overrides of `ghgs benchmark`, such as device=cuda")
     options = parser.parse_intermixed_args()
-    torch.set_num_threads(options.threads)
-    keep_freed_memory()  # as the command line does
-    cfg = compose("benchmark", options.options)
-    config = resolve(cfg)
-    device = pick_device(config["device"])
-    check_options(config, options.options)
-    cases = configured_cases(config, readers_of_skip(cfg), device)
-    batch, photographs = scene(options.share, options.views, options.size, options.target)
-    batch = batch.to(device)
-    seconds: list[dict[str, list[float]]] = [defaultdict(list) for _ in cases]
-    for turn in range(-2, options.repeats):
-        for number in order(turn, len(cases)):
-            for stage, value in frame(cases[number], batch, photographs, device).items():
-                if turn >= 0:
-                    seconds[number][stage].append(value)
-    report(cases, seconds, device)
+    if options.in_flight < 1:
+        parser.error(f"--in-flight: expected 1 or more; found {options.in_flight}")
+    live = Live.of(options)
+    if options.in_flight == 1:
+        measured(live, partial(one_by_one, live), options.repeats, 1)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.in_flight, context, _start, (options,)) as pool:
+        measured(live, partial(in_flight, pool, live), options.repeats, _BLOCK * options.in_flight)
 
 
-def report(cases: list[Case], seconds: list[dict[str, list[float]]], device: torch.device) -> None:
+def measured(live: Live, draw: Draw, repeats: int, block: int) -> None:
+    """Let the presets draw ``block`` frames in turn until each has ``repeats``, and report."""
+    seconds: list[dict[str, list[float]]] = [defaultdict(list) for _ in live.cases]
+    rates: list[list[float]] = [[] for _ in live.cases]
+    for turn in range(-2, -(-repeats // block)):
+        for number in order(turn, len(live.cases)):
+            started = time.perf_counter()
+            frames = draw(number, block)
+            rate = block / (time.perf_counter() - started)
+            if turn < 0:
+                continue
+            rates[number].append(rate)
+            for stage, value in ((name, value) for found in frames for name, value in found.items()):
+                seconds[number][stage].append(value)
+    report(live, seconds, rates)
+
+
+def report(live: Live, seconds: list[dict[str, list[float]]], rates: list[list[float]]) -> None:
     """Print milliseconds by stage and frames a second in Markdown."""
     names = [*top_level(seconds[0]), "other", TOTAL]
-    print(in_words(machine_facts(device)))
+    print(in_words(machine_facts(live.device)))
     print("\n| ms | " + " | ".join([*names, "quartiles", "frames a second"]) + " |")
     print("|---" * (len(names) + 3) + "|")
-    for case, found in zip(cases, seconds, strict=True):
-        low, middle, high = (1e3 * value for value in quantiles(found[TOTAL], n=4))
+    for case, found, rate in zip(live.cases, seconds, rates, strict=True):
+        low, _, high = (1e3 * value for value in quantiles(found[TOTAL], n=4))
         cells = [f"{1e3 * median(found[name]):.1f}" for name in names]
-        print(f"| {case.label} | " + " | ".join(cells) + f" | {low:.0f} to {high:.0f} | {1e3 / middle:.1f} |")
+        print(f"| {case.label} | " + " | ".join(cells) + f" | {low:.0f} to {high:.0f} | {median(rate):.1f} |")
 
 
 if __name__ == "__main__":

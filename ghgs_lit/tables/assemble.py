@@ -24,6 +24,7 @@ BASELINES = {
     "per_scene": "Per-scene 3DGS",
     "body_depth": "Splats at the body's mean depth",
     "true_depth": "Splats at the true depth",
+    "true_discs": "Discs at the true depth",
     "untrained": "Untrained model",
 }
 

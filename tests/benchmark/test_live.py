@@ -1,6 +1,7 @@
 """``benchmarks/live.py``: which models it times."""
 
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -30,3 +31,13 @@ def test_a_checkpoint_in_each_number_of_rounds(monkeypatch, capsys):
 def test_an_option_of_the_model_beside_a_checkpoint_is_refused(monkeypatch):
     with pytest.raises(InputError, match="encoder"):
         live(monkeypatch, "checkpoint=shipped", *SMALL, "encoder=vggt_small")
+
+
+def test_frames_in_flight_are_drawn_by_processes():
+    """Each of which has a part of the threads; the table is that of one frame after the other."""
+    options = [*SMALL, "--in-flight", "2", "presets=[exact]"]
+    done = subprocess.run([sys.executable, SCRIPT, *options], capture_output=True, text=True, check=True)
+    lines = [line.split("|") for line in done.stdout.splitlines() if line[:2] == "| "]
+    assert [line[1].strip() for line in lines] == ["ms", "none", "exact"]
+    assert lines[0][-2].strip() == "frames a second"
+    assert all(float(line[-2]) > 0 for line in lines[1:])

@@ -11,7 +11,13 @@ from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.baselines.images import black, nearest_view
 from ghgs_lit.evaluation.baselines.per_scene import PerScene
 from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
-from ghgs_lit.evaluation.baselines.splats import body_depth, splats_at, splatted, true_depth
+from ghgs_lit.evaluation.baselines.splats import (
+    body_depth,
+    splats_at,
+    splatted,
+    true_depth,
+    true_discs,
+)
 from ghgs_lit.evaluation.measure import Method, ModelMethod, Renderer
 
 __all__ = ["BASELINES", "baseline", "black", "nearest_view", "splats_at", "splatted"]
@@ -23,7 +29,7 @@ DEPTHS = {
     "photo_depth": photo_depth,
     "true_depth": true_depth,
 }
-BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
+BASELINES = ("black", "nearest_view", *DEPTHS, "true_discs", "per_scene", "untrained")
 
 
 def baseline(
@@ -44,7 +50,10 @@ def baseline(
     """
     choice("baselines", name, BASELINES)
     if name in DEPTHS:
-        return partial(splatted, depth_of=DEPTHS[name], renderer=renderer, **splats)
+        form = partial(splats_at, **splats)
+        return partial(splatted, depth_of=DEPTHS[name], renderer=renderer, form=form)
+    if name == "true_discs":
+        return partial(true_discs, renderer=renderer)
     if name == "per_scene":
         return PerScene(renderer, **per_scene)
     if name == "untrained":

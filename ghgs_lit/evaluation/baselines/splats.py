@@ -7,9 +7,17 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, Renderer
-from ghgs_lit.geometry.mattes import surface_colors
-from ghgs_lit.geometry.projection import unproject_maps, world_to_camera
-from ghgs_lit.types import Batch, Gaussians
+from ghgs_lit.geometry.mattes import coverage, surface_colors, with_matte
+from ghgs_lit.geometry.projection import at_least_float32, unproject_maps, world_to_camera
+from ghgs_lit.geometry.rotations import rotate
+from ghgs_lit.heads.surface import surface_axes
+from ghgs_lit.types import Batch, DepthMaps, Gaussians
+
+#: Of :func:`discs_at`, as ``model=recurrent`` starts: standard deviations along the surface and across it and
+#: distance behind it in footprints of a pixel, opacity, and the rendering's low-pass filter.
+_ALONG, _ACROSS, _INWARD, _OPACITY, _LOW_PASS = 0.5, 0.1, 0.4, 0.8, 0.1
+#: Share of the subject above which :func:`true_discs` give a pixel a disc.
+_MATTE = 0.125
 
 
 def splats_at(
@@ -38,6 +46,35 @@ def splats_at(
     )
 
 
+def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
+    """Discs on the surface that depth maps describe, as Gaussian heads with ``axes=surface`` start.
+
+    Args:
+        batch: gives cameras, colours and mattes.
+        depth: as for :func:`splats_at`.
+        valid: likewise.
+    """
+    places = valid.flatten(0, 1).flatten(1).nonzero()
+    image, pixel = places.unbind(1)
+    intrinsics = at_least_float32(batch.cameras.intrinsics)
+    focal = intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].prod(-1).sqrt()
+    footprint = (depth / focal[..., None, None])[valid][:, None]
+    axes = surface_axes(DepthMaps(depth, valid, valid.to(depth)), batch.cameras, image, pixel)
+    inward = rotate(axes, footprint * footprint.new_tensor([0.0, 0.0, _INWARD]))
+    return Gaussians(
+        means=unproject_maps(depth, batch.cameras)[valid] + inward,
+        quaternions=axes,
+        scales=footprint * footprint.new_tensor([_ALONG, _ALONG, _ACROSS]),
+        opacities=_OPACITY * coverage(batch)[valid],
+        colors=batch.once(surface_colors).movedim(2, -1)[valid],
+        splits=tuple(valid.flatten(1).sum(1).tolist()),
+        image=image,
+        pixel=pixel,
+        low_pass=_LOW_PASS,
+        antialiased=True,
+    )
+
+
 def body_depth(batch: Batch) -> Tensor:
     """Mean depth of the body's vertices in each view, as maps [B, V, H, W] in metres."""
     if batch.body_vertices is None:
@@ -52,7 +89,7 @@ def body_depth(batch: Batch) -> Tensor:
 def true_depth(batch: Batch) -> Tensor:
     """Depth maps [B, V, H, W] of the data, metres."""
     if batch.depths is None:
-        raise InputError("baselines: true_depth expects depth maps in the data; found none")
+        raise InputError("baselines: true_depth and true_discs expect depth maps in the data; found none")
     return batch.depths
 
 
@@ -60,8 +97,7 @@ def splatted(
     batch: Batch,
     depth_of: Callable[[Batch], Tensor],
     renderer: Renderer,
-    sigma: float = 0.3,
-    opacity: float = 0.9,
+    form: Callable[[Batch, Tensor, Tensor], Gaussians] = splats_at,
 ) -> Estimate:
     """The subject's pixels as splats at a depth that is not learned.
 
@@ -69,10 +105,15 @@ def splatted(
         batch: inputs and targets.
         depth_of: gives depths of the inputs [B, V, H, W], metres.
         renderer: draws the splats.
-        sigma, opacity: as for :func:`splats_at`.
+        form: gives splats of a batch at depths, for the pixels that are valid.
     """
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)
-    gaussians = splats_at(batch, depth, valid, sigma, opacity)
+    gaussians = form(batch, depth, valid)
     image = renderer(gaussians, batch.targets.cameras).image
     return Estimate(image, depth, valid, gaussians.splits)
+
+
+def true_discs(batch: Batch, renderer: Renderer) -> Estimate:
+    """Discs at the true depth, of pixels at the rim, too, where the data have mattes."""
+    return splatted(with_matte(batch, _MATTE), true_depth, renderer, discs_at)

@@ -102,7 +102,10 @@ def test_black_and_untrained():
     assert estimate.gaussians == (144, 144)
 
 
-@pytest.mark.parametrize(("name", "field"), [("body_depth", "body_vertices"), ("true_depth", "depths")])
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [("body_depth", "body_vertices"), ("true_depth", "depths"), ("true_discs", "depths")],
+)
 def test_what_the_data_lacks_is_an_error(name, field):
     """A baseline that the data cannot support is refused, as is an unknown name."""
     batch = dataclasses.replace(example_batch(), **{field: None})

@@ -1,9 +1,20 @@
 """Splats at a depth that is not learned."""
 
+import dataclasses
+
 import torch
 
-from ghgs_lit.evaluation.baselines.splats import splats_at
-from tests.helpers.scenes import make_batch, with_soft_rims
+from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth, true_discs
+from ghgs_lit.geometry.mattes import with_matte
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.heads.gaussian import RawGaussians
+from ghgs_lit.metrics import psnr
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, DepthMaps, Points, Targets
+from tests.helpers.scenes import make_batch, painted_ellipsoid, ring, with_soft_rims
+
+RENDERER = Renderer("cpu")
 
 
 def test_splats_have_the_surfaces_own_colors():
@@ -15,3 +26,37 @@ def test_splats_have_the_surfaces_own_colors():
     expected = (batch.images.movedim(2, -1)[valid] / share).clamp(max=1)
     assert (share < 0.9).sum() > 20
     torch.testing.assert_close(found, expected)
+
+
+def test_discs_are_those_that_the_recurrent_model_starts_from():
+    """The model's own Gaussian head gives them for raw values of 0 at the same points."""
+    config = resolve(compose("train", ["model=recurrent"]))
+    head = build(config["gaussian_head"], "gaussian_head", dim_latent=64)
+    batch = with_matte(with_soft_rims(make_batch(2, 3)), config["model"]["matte"])
+    valid = batch.masks & (batch.depths > 0)
+    image, pixel = valid.flatten(0, 1).flatten(1).nonzero().unbind(1)
+    n = len(image)
+    splits = tuple(valid.flatten(1).sum(1).tolist())
+    zeros = (torch.zeros(n, 3), torch.zeros(n, 3), torch.zeros(n, 4), torch.zeros(n), torch.zeros(n, 3))
+    raw = RawGaussians(torch.zeros(n, head.decoder.full_channels), *zeros, image, pixel, splits)
+    maps = DepthMaps(batch.depths, valid, batch.depths)
+    tokens = (torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.zeros(0, dtype=torch.long))
+    points = Points(unproject_maps(batch.depths, batch.cameras), valid, *tokens)
+    expected = head.activate(raw, batch, points, maps)
+    found = discs_at(batch, batch.depths, valid)
+    for field in dataclasses.fields(found):
+        value = getattr(found, field.name)
+        torch.testing.assert_close(value, getattr(expected, field.name), msg=lambda m, f=field: f.name + m)
+
+
+def test_discs_draw_the_surface_better_than_round_splats():
+    """At twice the size of the inputs, too, and between two of them."""
+    inputs, seen = (ring(1, n, 56, 56) for n in (4, 8))
+    images, masks, depths = painted_ellipsoid(inputs)
+    for cameras in (seen, seen.resized(112, 112)):
+        cameras = cameras[:, 1:2]
+        truth, inside, _ = painted_ellipsoid(cameras)
+        batch = Batch(images, masks, inputs, depths=depths, targets=Targets(truth, inside, cameras))
+        splats, discs = splatted(batch, true_depth, RENDERER), true_discs(batch, RENDERER)
+        found = [psnr(drawn.image[0], truth[0]).item() for drawn in (splats, discs)]
+        assert found[1] > found[0] + 3
