@@ -1,9 +1,11 @@
-"""What imperfect captures cost a model: built-in people, photographed in ten ways, with the same targets.
+"""What imperfect captures cost a model: built-in people, photographed in eleven ways, with the same targets.
 
     python benchmarks/captures.py model.ckpt [model.ckpt ...] --baselines all --out captures.json
 
-Each capture has one trouble, the last one all of them. Targets are always those of the clean rig, so that a
-loss is one of the prediction. Prints PSNR on the clean rig and what each capture loses, whole and in the box.
+Each capture has one trouble, the last one all of them. Photographs are taken before a background, twice as
+large as what the model sees, and go the way of a user's (``Capture``): they are cropped to the subject.
+Targets are always those of the clean rig, so that a loss is one of the prediction. Prints PSNR of exact
+photographs and what each capture loses, whole and in the box.
 """
 
 import argparse
@@ -14,9 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.ndimage import zoom
 
 from ghgs_lit import GHGS
+from ghgs_lit.capture.capture import Capture, Photograph
 from ghgs_lit.capture.predict import trained_size
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
 from ghgs_lit.cli.methods import baselines_of
@@ -36,6 +41,11 @@ _RING, _VIEWS = 16, 4
 _EVEN = even_positions(_RING, _VIEWS)
 _UNEVEN = [0, 5, 7, 12]
 _TARGETS = ("release", "midway")
+#: Sides of photographs over those of their crops. Limits in pixels are of the crops.
+_LARGER = 2
+_PIXELS = ("mask_offset", "mask_ragged", "calibration")
+#: Colours of a background: cells along a side, and how much they differ.
+_PATTERNS = ((3, 0.35), (12, 0.15), (40, 0.06))
 _HELD = {"camera_pitch": 6.0, "camera_roll": 8.0, "camera_look_at": 0.08}
 _COLORS = {"exposure": 0.5, "white_balance": 0.25}
 _OUTLINES = {"mask_offset": 1.5, "mask_ragged": 2.0}
@@ -44,11 +54,15 @@ _PIECES = {"mask_hole": 0.12, "mask_hole_chance": 1.0}
 
 @dataclass(frozen=True)
 class Imperfection:
-    """How a capture differs: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`."""
+    """How a capture differs: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`.
+
+    Photographs have exact mattes, or ``masks`` of 0 and 1.
+    """
 
     rig: Mapping[str, Any] = field(default_factory=dict)
     positions: list[int] = field(default_factory=lambda: _EVEN)
     augmentation: Mapping[str, float] = field(default_factory=dict)
+    masks: bool = False
 
 
 CAPTURES = {
@@ -59,13 +73,15 @@ CAPTURES = {
     "rolled, tilted, shifted": Imperfection(_HELD),
     "uneven angles": Imperfection(positions=_UNEVEN),
     "exposure, white balance": Imperfection(augmentation=_COLORS),
-    "masks off and ragged": Imperfection(augmentation=_OUTLINES),
-    "masks with holes": Imperfection(augmentation=_PIECES),
+    "masks in place of mattes": Imperfection(masks=True),
+    "masks off and ragged": Imperfection(augmentation=_OUTLINES, masks=True),
+    "masks with holes": Imperfection(augmentation=_PIECES, masks=True),
     "calibration up to 3 px": Imperfection(augmentation={"calibration": 3.0}),
     "all at once": Imperfection(
         {"radius": [2.67, 2.67], "pitch": [-28.0, -28.0], "fill": [0.7, 0.7], **_HELD},
         _UNEVEN,
         {**_COLORS, **_OUTLINES, **_PIECES, "calibration": 3.0},
+        masks=True,
     ),
 }
 
@@ -90,16 +106,50 @@ def data_of(capture: Imperfection, people: int, size: list[int]) -> PhotographsD
 
 
 def batches(
-    capture: Imperfection, clean: PhotographsDataModule, own: PhotographsDataModule
+    capture: Imperfection,
+    clean: PhotographsDataModule,
+    own: PhotographsDataModule,
+    size: tuple[int, int],
+    refine_masks: int,
 ) -> Iterator[Batch]:
-    """Inputs as ``capture`` has them, with the targets of the clean rig."""
-    augmentation = Augmentation(**capture.augmentation)
+    """Crops of ``size`` of the photographs that ``capture`` takes, with the targets of the clean rig."""
     targets = [read_option("targets", name) for name in _TARGETS]
     for batch in clean.evaluation_loader(_VIEWS, targets, batch_size=1):
-        seen = own.evaluation_batch(batch.subjects[0], views=_VIEWS)
-        yield augmentation.imperfections(
-            dataclasses.replace(seen, targets=batch.targets), [subject_rng(0, batch.subjects[0])]
-        )
+        subject = batch.subjects[0]
+        taken = photographed(capture, own.evaluation_batch(subject, views=_VIEWS))
+        seen = taken.batch(size, refine_masks)
+        cameras = seen.cameras.to(torch.float32)  # for baselines
+        yield dataclasses.replace(seen, cameras=cameras, targets=batch.targets)
+
+
+def photographed(capture: Imperfection, batch: Batch) -> Capture:
+    """One subject as a capture has it, from photographs of it on black: before a background."""
+    subject = batch.subjects[0]
+    limits = {k: v * (_LARGER if k in _PIXELS else 1) for k, v in capture.augmentation.items()}
+    colors = Augmentation(**{k: v for k, v in limits.items() if k in _COLORS})
+    seen, wrong = (
+        augmentation.imperfections(batch, [subject_rng(0, subject)])
+        for augmentation in (colors, Augmentation(**limits))
+    )
+    behind = backgrounds(_VIEWS, *batch.masks.shape[2:], subject_rng(1, subject))
+    images = seen.images + (1 - batch.alpha[:, :, None]) * torch.from_numpy(behind).float()
+    mattes = wrong.masks.float() if capture.masks else batch.alpha
+    pixels = (255 * images[0].movedim(1, -1)).round().byte().numpy()
+    shares = (255 * mattes[0]).round().byte().numpy()
+    matrices = (wrong.cameras.intrinsics[0].double().numpy(), wrong.cameras.extrinsics[0].double().numpy())
+    views = zip(batch.views[0], pixels, shares, *matrices, strict=True)
+    return Capture(subject, tuple(Photograph(*view) for view in views))
+
+
+def backgrounds(views: int, height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Cloudy patterns [V, 3, h, w] of large and small patches, with noise."""
+    found = (
+        0.5 + rng.uniform(-0.2, 0.2, (views, 3, 1, 1)) + 0.02 * rng.standard_normal((views, 3, height, width))
+    )
+    for cells, deviation in _PATTERNS:
+        patches = rng.uniform(-deviation, deviation, (views, 3, cells, cells))
+        found = found + zoom(patches, (1, 1, height / cells, width / cells), order=1)
+    return found.clip(0, 1)
 
 
 def means(rows: list[dict]) -> dict[str, float]:
@@ -148,6 +198,7 @@ def main() -> None:
     parser.add_argument("--baselines", nargs="*", default=[], help="as for ghgs evaluate, or all")
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--size", type=int, help="side in pixels; none: the first checkpoint's")
+    parser.add_argument("--refine-masks", type=int, default=0, help="pixels that masks may be off by")
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
     parser.add_argument("--out", type=Path, default=Path("captures.json"))
     options = parser.parse_args()
@@ -155,12 +206,22 @@ def main() -> None:
     device = pick_device(config["device"])
     metrics = build(config["metrics"], "metrics").to(device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
-    size = list(image_size("size", size))
-    data = {name: data_of(capture, options.people, size) for name, capture in CAPTURES.items()}
+    size = image_size("size", size)
+    clean = data_of(CAPTURES["clean"], options.people, list(size))
+    larger = [_LARGER * side for side in size]
+    own = {name: data_of(capture, options.people, larger) for name, capture in CAPTURES.items()}
     results = {}
     for method_name, method in methods_of(options, config, device):
         results[method_name] = {
-            name: means(measure(method, name, batches(capture, data["clean"], data[name]), metrics, device))
+            name: means(
+                measure(
+                    method,
+                    name,
+                    batches(capture, clean, own[name], size, options.refine_masks),
+                    metrics,
+                    device,
+                )
+            )
             for name, capture in CAPTURES.items()
         }
         print(

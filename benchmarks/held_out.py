@@ -30,14 +30,14 @@ from ghgs_lit.visualization.pictures import save_png, to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
-def held_out(batch: Batch) -> Iterator[Batch]:
-    """A batch for each photograph, which is its target; the others are its inputs."""
+def held_out(batch: Batch, given: Batch) -> Iterator[Batch]:
+    """A batch for each photograph: that of ``given`` is the target, the others of ``batch`` the inputs."""
     count = batch.masks.shape[1]
     for i in range(count):
         others = [j for j in range(count) if j != i]
         name = ((batch.views[0][i],),)
         targets = Targets(
-            batch.images[:, [i]], batch.masks[:, [i]], batch.cameras[:, [i]], name, protocols=("held_out",)
+            given.images[:, [i]], given.masks[:, [i]], batch.cameras[:, [i]], name, protocols=("held_out",)
         )
         yield dataclasses.replace(
             batch,
@@ -57,6 +57,9 @@ def main() -> None:
     parser.add_argument("checkpoints", type=Path, nargs="+")
     parser.add_argument("--size", type=int, help="side of the crops in pixels; none: the first checkpoint's")
     parser.add_argument("--refine", type=int, default=0, help="steps of optimisation of each prediction")
+    parser.add_argument(
+        "--refine-masks", type=int, default=0, help="pixels that masks of inputs may be off by"
+    )
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct all cameras first")
     parser.add_argument("--out", type=Path, default=Path("held_out"))
     options = parser.parse_args()
@@ -64,7 +67,9 @@ def main() -> None:
     device = pick_device(config["device"])
     renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
-    batch = Capture.read(options.images, options.cameras).batch(image_size("size", size))
+    capture, size = Capture.read(options.images, options.cameras), image_size("size", size)
+    # Targets are as their masks have them, whatever the inputs are.
+    batch, given = capture.batch(size, options.refine_masks), capture.batch(size).to(device)
     batch = Frame.of(batch).enter(batch)  # baselines compute in float32
     methods: dict[str, Method] = {
         "nearest view": nearest_view,
@@ -78,7 +83,7 @@ def main() -> None:
         batch = CameraRefinement(options.refine_cameras, model, renderer)(batch.to(device))
     rows = []
     with torch.no_grad():
-        for one in held_out(batch.to(device)):
+        for one in held_out(batch.to(device), given):
             images = [one.targets.images[0, 0]]
             for name, method in methods.items():
                 rows += measure(method, name, [one], metrics, device)

@@ -1,5 +1,6 @@
 """A user's photographs of one instant, and the batch that a model sees of them."""
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -7,12 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from ghgs_lit.capture.matting import refined_matte
 from ghgs_lit.data.resampling import area_image
 from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
 _SHARE = 0.8
+#: Mattes are found in photographs of at most this times the size of their crops.
+_FINER = 2
 
 
 @dataclass(frozen=True)
@@ -70,15 +74,17 @@ class Capture:
         require(len(found) == 1, str(images), "one instant (CaptureFolder reads several)", len(found))
         return folder.read(found[0])
 
-    def batch(self, size: tuple[int, int]) -> Batch:
+    def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
         """What a model sees: crops around the subject on a black background, a batch of one element.
 
         Cameras are in the user's world, in float64, which a world far from its origin needs.
 
         Args:
             size: (height, width) of the crops in pixels.
+            refine_masks: by how many pixels of a crop the outlines of masks may be wrong; mattes are then
+                found in the photographs (:func:`refined_matte`). 0: masks are right.
         """
-        crops = [crop_to_subject(photograph, size) for photograph in self.photographs]
+        crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
         images, mattes = (
             torch.from_numpy(np.stack([getattr(crop, name) for crop in crops])) for name in ("image", "matte")
         )
@@ -96,12 +102,12 @@ class Capture:
         )
 
 
-def crop_to_subject(photograph: Photograph, size: tuple[int, int]) -> Photograph:
+def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:
     """The subject in the middle of an image of ``size`` (height, width); its camera is that of the crop.
 
     Beyond the photograph and beside the subject the crop is black. A large photograph's sharp mask becomes a
     soft matte. Where the subject is cut by the photograph's border the crop ends there, too: black beside it
-    would say that the subject ends.
+    would say that the subject ends. ``refine_masks`` is that of :meth:`Capture.batch`.
     """
     rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
     extents = [(int(found[0]), int(found[-1]) + 1) for found in (rows, columns)]
@@ -117,13 +123,31 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int]) -> Photograph
     intrinsics[:2] *= factors[:, None]
     image, matte = _cut(photograph.image, spans), _cut(photograph.matte, spans)
     # Before it is made smaller: the background has no part in the pixels of the rim.
-    premultiplied = np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
+    if refine_masks:
+        image, matte = _refined(photograph.name, image, matte, size, refine_masks)
+    else:
+        image = np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
     return replace(
-        photograph,
-        image=area_image(premultiplied, *size),
-        matte=area_image(matte, *size),
-        intrinsics=intrinsics,
+        photograph, image=area_image(image, *size), matte=area_image(matte, *size), intrinsics=intrinsics
     )
+
+
+def _refined(
+    name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`refined_matte` of a cut, which is made smaller first where it is much larger than the crop."""
+    sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
+    image, matte = area_image(image, *sides), area_image(matte, *sides)
+    subject, found = refined_matte(image, matte, pixels * sides[0] / size[0])
+    share = (found > 127).sum() / max((matte > 127).sum(), 1)
+    if 0.5 <= share <= 2:
+        return subject, found
+    warnings.warn(
+        f"refine_masks: expected colours of {name} that tell the subject from what is behind it; found"
+        f" {share:.2g} times the mask's area, so that the mask stays as it is",
+        stacklevel=4,
+    )
+    return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8), matte
 
 
 def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:

@@ -30,12 +30,14 @@ class CapturePrediction:
         prediction: of this batch.
         seconds: run time by stage.
         moved: pixels that correcting moved the subject by in each crop; nothing where cameras stay.
+        changed: which share of the subject refining changed in each crop; nothing where masks stay.
     """
 
     batch: Batch
     prediction: Prediction
     seconds: dict[str, float] = field(default_factory=dict)
     moved: tuple[float, ...] = ()
+    changed: tuple[float, ...] = ()
 
     @property
     def gaussians(self) -> Gaussians:
@@ -48,6 +50,7 @@ def predict(
     model: GHGS | str | Path = SHIPPED,
     size: int | tuple[int, int] | None = None,
     refine_cameras: int = 0,
+    refine_masks: int = 0,
 ) -> CapturePrediction:
     """The Gaussians of a capture.
 
@@ -59,6 +62,8 @@ def predict(
             (checkpoints only).
         refine_cameras: rounds, at most, that correct the cameras until the photographs agree
             (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
+        refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then found in the
+            photographs (:func:`ghgs_lit.capture.matting.refined_matte`). 0: masks are right.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
@@ -70,13 +75,19 @@ def predict(
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     begin = time.perf_counter()
     batch = capture.batch(image_size("size", size))
-    cropped = time.perf_counter()
+    start = time.perf_counter()
+    seconds, moved, changed = {"crop": start - begin}, (), ()
+    if refine_masks:
+        given, batch = batch, capture.batch(image_size("size", size), refine_masks)
+        difference = (batch.alpha - given.alpha).abs().sum((-2, -1)) / given.alpha.sum((-2, -1))
+        changed = tuple(difference[0].tolist())
+        seconds["refine_masks"] = time.perf_counter() - start
     batch = batch.to(next(model.parameters()).device)
-    seconds, moved = {"crop": cropped - begin}, ()
+    start = time.perf_counter()
     if refine_cameras:
         taken, batch = batch, CameraRefinement(refine_cameras, model, Renderer())(batch)
         moved = tuple(pixels_moved(taken, batch)[0])
-        seconds["refine_cameras"] = time.perf_counter() - cropped
+        seconds["refine_cameras"] = time.perf_counter() - start
     start = time.perf_counter()
     # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
     frame = Frame.of(batch)
@@ -84,7 +95,7 @@ def predict(
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
-    return CapturePrediction(batch, prediction, seconds, moved)
+    return CapturePrediction(batch, prediction, seconds, moved, changed)
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:

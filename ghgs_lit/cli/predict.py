@@ -75,6 +75,8 @@ def run(cfg: DictConfig) -> None:
 
 def predict_subject(config: dict[str, Any], directory: Path) -> None:
     """Predict a subject of a data set."""
+    expected = "0 without images=...: photographs of data sets are on black"
+    require(config["refine_masks"] == 0, "refine_masks", expected, config["refine_masks"])
     options, (model, renderer, device) = output_options(config), load(config)
     data = build_data(config)
     check_size(data, model)
@@ -121,12 +123,14 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             waited = time.perf_counter() - start
             if number < len(folder.instants):
                 captures.append(pool.submit(folder.read, folder.instants[number]))
-            result = predict(capture, model, size, config["refine_cameras"])
+            result = predict(capture, model, size, config["refine_cameras"], config["refine_masks"])
             facts = {
                 "checkpoint": config["checkpoint"],
                 "seconds": {"read": waited, **result.seconds},
                 **chosen_preset(model, result.prediction),
             }
+            if result.changed:
+                facts |= masks_changed(result.changed)
             if result.moved:
                 facts |= cameras_moved(result.moved)
             prediction = refined(result.prediction, result.batch, renderer, config["refine"], facts)
@@ -161,6 +165,14 @@ def cameras_moved(pixels: Sequence[float]) -> dict[str, Any]:
     """For the report, and printed: how far correcting the cameras moved the subject in each photograph."""
     print(f"refine_cameras: moved by {', '.join(f'{value:.2f}' for value in pixels)} pixels", flush=True)
     return {"refine_cameras": list(pixels)}
+
+
+def masks_changed(shares: Sequence[float]) -> dict[str, Any]:
+    """For the report, and printed: which share of the subject refining changed in each photograph."""
+    print(
+        f"refine_masks: changed by {', '.join(f'{share:.1%}' for share in shares)} of the subject", flush=True
+    )
+    return {"refine_masks": list(shares)}
 
 
 def refined(

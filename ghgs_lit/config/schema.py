@@ -242,6 +242,7 @@ KINDS: dict[str, Kind] = {
     "optimizer.weight_decay": AMOUNT,
     "refine": integer(least=0),
     "refine_cameras": integer(least=0),
+    "refine_masks": integer(least=0),
     "renderer.alpha_max": SHARE,
     "renderer.antialiased": FLAG | NULL,
     "renderer.backend": TEXT,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from imageio_ffmpeg import read_frames
 from plyfile import PlyData
+from scipy.ndimage import binary_dilation
 
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.figures import PARTS, Figure
@@ -73,6 +74,23 @@ def test_cameras_are_corrected_where_asked(here, checkpoint, capsys):
     assert f"refine_cameras: moved by {moved[0]:.2f}, {moved[1]:.2f}," in capsys.readouterr().out
     assert report["seconds"]["refine_cameras"] > 0
     assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95
+
+
+def test_masks_are_refined_where_asked(here, checkpoint, capsys):
+    """The report says by how much; photographs of data sets have nothing beside the subject."""
+    figure = Figure()
+    figure.masks = np.stack([binary_dilation(mask, iterations=2) for mask in figure.masks])
+    cameras = figure.write(here / "images")
+    run = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu", "refine_masks=3")
+    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", *run) == 0
+    report = json.loads((here / "splat" / "report.json").read_text())
+    assert len(report["refine_masks"]) == 4
+    assert 0.1 < min(report["refine_masks"]) < max(report["refine_masks"]) < 0.6
+    printed = capsys.readouterr()
+    assert f"refine_masks: changed by {report['refine_masks'][0]:.1%}, " in printed.out
+    assert report["seconds"]["refine_masks"] > 0
+    assert ghgs("predict", "data=synthetic", *run) == 1
+    assert "refine_masks: expected 0 without images=..." in capsys.readouterr().err
 
 
 def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
