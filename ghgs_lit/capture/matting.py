@@ -42,7 +42,7 @@ def refined_matte(
     for share, trust in _PASSES:
         inside = found > 0.5
         window = _window(inside, int(pixels) + 2)
-        is_open = _is_open(inside[window], share * pixels)
+        is_open = _to_other_side(inside[window]) <= share * pixels
         found[window] = _matte(colors[window], found[window], is_open, trust)
     premultiplied = estimate_foreground_ml(colors, found) * found[..., None]
     return tuple(np.round(255 * part.clip(0, 1)).astype(np.uint8) for part in (premultiplied, found))
@@ -54,15 +54,13 @@ def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]
     return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)
 
 
-def _is_open(inside: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
-    """Where the matte is sought: up to ``reach`` from the outline, which the image's border is not."""
-    if inside.all() or not inside.any():
-        return np.zeros_like(inside)
-    return _to_other_side(inside) <= reach
-
-
 def _to_other_side(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Distance in pixels to the nearest pixel on the other side of the outline."""
+    """Distance in pixels to the nearest pixel on the other side of the outline; infinite without one.
+
+    The image's border is no outline.
+    """
+    if inside.all() or not inside.any():
+        return np.full(inside.shape, np.inf)
     return np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
 
 
@@ -91,4 +89,4 @@ def _matte(
 def _with_thin_rim(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """The matte, 0 or 1 but at its outline: elsewhere there are traces of the mask and of textures."""
     inside = matte > 0.5
-    return np.where(_to_other_side(inside) <= _RIM, matte, inside) if inside.any() else np.zeros_like(matte)
+    return np.where(_to_other_side(inside) <= _RIM, matte, inside)

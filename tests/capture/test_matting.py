@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
 from ghgs_lit import Capture
-from ghgs_lit.capture import matting
+from ghgs_lit.capture import capture, matting
 from ghgs_lit.capture.matting import refined_matte
 from tests.helpers.figures import Figure
 
@@ -117,6 +117,31 @@ def test_the_matte_is_the_least_of_the_energy(monkeypatch):
     found = matting._matte(colors, given, is_open, trust)
     np.testing.assert_allclose(found[is_open], expected, atol=1e-6)
     assert (found[~is_open] == given[~is_open]).all()
+
+
+@pytest.mark.parametrize("value", [0.3, 0.7])
+def test_a_matte_without_an_outline_has_no_rim(value):
+    assert (matting._with_thin_rim(np.full((9, 7), value)) == round(value)).all()
+
+
+@pytest.mark.parametrize("height", [128, 512])
+def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, height):
+    """Or at that of the photograph where it is smaller; limits are in pixels of the crops."""
+    calls = []
+
+    def record(image, matte, pixels):
+        calls.append((image.shape[:2], matte.shape, pixels))
+        return image, matte
+
+    monkeypatch.setattr(capture, "refined_matte", record)
+    figure = Figure(height=height, width=height * 3 // 4)
+    taken = Capture.read(tmp_path, figure.write(tmp_path))
+    cut = [int(1 / capture._SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
+    taken.batch((112, 84), 4)
+    for (size, same, pixels), rows in zip(calls, cut, strict=True):
+        assert size == same
+        assert size[0] == pytest.approx(min(rows, 2 * 112), abs=2)
+        assert pixels == 4 * size[0] / 112
 
 
 def test_crops_of_wrong_masks_hold_the_subject_alone(tmp_path):
