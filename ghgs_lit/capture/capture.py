@@ -126,7 +126,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     if refine_masks:
         image, matte = _refined(photograph.name, image, matte, size, refine_masks)
     else:
-        image = np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
+        image = _on_black(image, matte)
     return replace(
         photograph, image=area_image(image, *size), matte=area_image(matte, *size), intrinsics=intrinsics
     )
@@ -147,7 +147,12 @@ def _refined(
         f" {share:.2g} times the mask's area, so that the mask stays as it is",
         stacklevel=4,
     )
-    return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8), matte
+    return _on_black(image, matte), matte
+
+
+def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """The image multiplied by its matte."""
+    return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
 
 
 def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
