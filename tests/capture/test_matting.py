@@ -119,6 +119,21 @@ def test_the_matte_is_the_least_of_the_energy(monkeypatch):
     assert (found[~is_open] == given[~is_open]).all()
 
 
+def test_colors_of_both_sides_are_mixed_to_the_photograph():
+    """By the least change of what lies near; inside and outside colours are the photograph's."""
+    colors = np.random.default_rng(2).uniform(size=(7, 6, 3))
+    matte = np.repeat(np.array([1.0, 1.0, 0.8, 0.3, 0.0, 0.0])[None], 7, 0)
+    found = matting._subject_colors(colors, matte)
+    subject, behind = (matting._near(colors, side) for side in (matte == 1, matte == 0))
+    for share, column in ((0.8, 2), (0.3, 3)):
+        mix = np.array([[share, 1 - share]])
+        missing = colors[3, column] - mix @ np.stack((subject[3, column], behind[3, column]))
+        expected = subject[3, column] + (np.linalg.pinv(mix) @ missing)[0]
+        np.testing.assert_allclose(found[3, column], expected, atol=1e-12)
+    sure = (matte == 0) | (matte == 1)
+    assert (found[sure] == colors[sure]).all()
+
+
 @pytest.mark.parametrize("value", [0.3, 0.7])
 def test_a_matte_without_an_outline_has_no_rim(value):
     assert (matting._with_thin_rim(np.full((9, 7), value)) == round(value)).all()
