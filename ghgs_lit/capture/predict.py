@@ -73,15 +73,8 @@ def predict(
         size = size or trained_size(read_checkpoint(path)["config"])
         model = _model(path, path.stat().st_mtime_ns)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
-    begin = time.perf_counter()
-    batch = capture.batch(image_size("size", size))
-    start = time.perf_counter()
-    seconds, moved, changed = {"crop": start - begin}, (), ()
-    if refine_masks:
-        given, batch = batch, capture.batch(image_size("size", size), refine_masks)
-        difference = (batch.alpha - given.alpha).abs().sum((-2, -1)) / given.alpha.sum((-2, -1))
-        changed = tuple(difference[0].tolist())
-        seconds["refine_masks"] = time.perf_counter() - start
+    seconds, moved = {}, ()
+    batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
     batch = batch.to(next(model.parameters()).device)
     start = time.perf_counter()
     if refine_cameras:
@@ -96,6 +89,22 @@ def predict(
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
     return CapturePrediction(batch, prediction, seconds, moved, changed)
+
+
+def _crops(
+    capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
+) -> tuple[Batch, tuple[float, ...]]:
+    """What the model sees, and by how much refining changed each matte; notes the run time of both."""
+    start = time.perf_counter()
+    given = capture.batch(size)
+    seconds["crop"] = time.perf_counter() - start
+    if not refine_masks:
+        return given, ()
+    start = time.perf_counter()
+    batch = capture.batch(size, refine_masks)
+    seconds["refine_masks"] = time.perf_counter() - start
+    changed = (batch.alpha - given.alpha).abs().sum((-2, -1)) / given.alpha.sum((-2, -1))
+    return batch, tuple(changed[0].tolist())
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
