@@ -16,9 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.ndimage import zoom
 
 from ghgs_lit import GHGS
 from ghgs_lit.capture.capture import Capture, Photograph
@@ -30,6 +28,7 @@ from ghgs_lit.config.groups import read_option
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
@@ -44,8 +43,6 @@ _TARGETS = ("release", "midway")
 #: Sides of photographs over those of their crops. Limits in pixels are of the crops.
 _LARGER = 2
 _PIXELS = ("mask_offset", "mask_ragged", "calibration")
-#: Colours of a background: cells along a side, and how much they differ.
-_PATTERNS = ((3, 0.35), (12, 0.15), (40, 0.06))
 _HELD = {"camera_pitch": 6.0, "camera_roll": 8.0, "camera_look_at": 0.08}
 _COLORS = {"exposure": 0.5, "white_balance": 0.25}
 _OUTLINES = {"mask_offset": 1.5, "mask_ragged": 2.0}
@@ -139,17 +136,6 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
     matrices = (wrong.cameras.intrinsics[0].double().numpy(), wrong.cameras.extrinsics[0].double().numpy())
     views = zip(batch.views[0], pixels, shares, *matrices, strict=True)
     return Capture(subject, tuple(Photograph(*view) for view in views))
-
-
-def backgrounds(views: int, height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Cloudy patterns [V, 3, h, w] of large and small patches, with noise."""
-    found = (
-        0.5 + rng.uniform(-0.2, 0.2, (views, 3, 1, 1)) + 0.02 * rng.standard_normal((views, 3, height, width))
-    )
-    for cells, deviation in _PATTERNS:
-        patches = rng.uniform(-deviation, deviation, (views, 3, cells, cells))
-        found = found + zoom(patches, (1, 1, height / cells, width / cells), order=1)
-    return found.clip(0, 1)
 
 
 def means(rows: list[dict]) -> dict[str, float]:

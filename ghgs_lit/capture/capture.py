@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ghgs_lit.capture.matting import refined_matte
+from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.data.resampling import area_image
 from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras

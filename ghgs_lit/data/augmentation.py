@@ -4,15 +4,18 @@ A batch is a function of (seed, step, index) alone, as its samples are, so that 
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.config.settings import image_size, set_fields
-from ghgs_lit.data.imperfections import color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras
 
@@ -34,6 +37,10 @@ class Augmentation:
         exposure, white_balance: in stops, as for :func:`color_gains`. Targets keep theirs.
         mask_offset, mask_ragged, mask_hole, mask_hole_chance: as for :func:`imperfect_mask`. The inputs are
             black outside their masks, as those of a capture.
+        background: share of the samples with such masks that were taken before :func:`backgrounds`, which a
+            mask that is too large shows; behind the others it is black.
+        refined: share of the samples before a background whose masks were refined
+            (:func:`ghgs_lit.data.matting.refined_matte`), as a capture's are with ``refine_masks``.
         calibration: in pixels, as for :func:`miscalibrated`. Targets keep their true cameras, depth maps the
             z-depths in the true cameras: the loss on depth asks for the distance of the surface, not for one
             that makes up for the error of a camera.
@@ -48,6 +55,8 @@ class Augmentation:
     mask_ragged: float = 0.0
     mask_hole: float = 0.0
     mask_hole_chance: float = 0.0
+    background: float = 0.0
+    refined: float = 0.0
     calibration: float = 0.0
 
     def __post_init__(self) -> None:
@@ -59,7 +68,8 @@ class Augmentation:
             ordered = len(limits) == 2 and 0 < limits[0] <= limits[1]
             require(ordered, "augmentation.target_scale", "[least, greatest] above 0", list(limits))
             set_fields(self, target_scale=limits)
-        require(self.chance <= 1, "augmentation.chance", "at most 1", self.chance)
+        for name in ("chance", "background", "refined"):
+            require(getattr(self, name) <= 1, f"augmentation.{name}", "at most 1", getattr(self, name))
         for field in dataclasses.fields(self)[2:]:
             value = getattr(self, field.name)
             require(value >= 0, f"augmentation.{field.name}", "at least 0", value)
@@ -104,7 +114,7 @@ class Augmentation:
             batch: with at least two views.
             rngs: random numbers of each element. Whether one thing varies changes nothing about another.
         """
-        streams = [rng.spawn(3) for rng in rngs]
+        streams = [rng.spawn(4) for rng in rngs]
         images, masks, cameras, alpha = batch.images, batch.masks, batch.cameras, batch.alpha
         if self.exposure or self.white_balance:
             views = masks.shape[1]
@@ -119,11 +129,46 @@ class Augmentation:
             )
             cameras = Cameras(lenses, poses, cameras.height, cameras.width)
         if self.mask_offset or self.mask_ragged or self.mask_hole:
-            masks = torch.stack([self._masks(masks[b], s[2]) for b, s in enumerate(streams)])
-            images = images * masks[:, :, None]
-            if alpha is not None:  # what a segmentation takes for the subject it takes for all of a pixel
-                alpha = torch.where(masks > batch.masks, 1, alpha * masks)
+            known = masks.to(images) if alpha is None else alpha
+            found = [
+                self._segmented(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
+            ]
+            images, masks, mattes = (torch.stack(parts) for parts in zip(*found, strict=True))
+            alpha = None if alpha is None else mattes
         return dataclasses.replace(batch, images=images, masks=masks, cameras=cameras, alpha=alpha)
+
+    def _segmented(
+        self,
+        images: Float[Tensor, "V 3 h w"],
+        masks: Bool[Tensor, "V h w"],
+        mattes: Float[Tensor, "V h w"],
+        outlines: np.random.Generator,
+        behind: np.random.Generator,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Images, masks and mattes of one sample as a segmentation gives them."""
+        wrong = self._masks(masks, outlines)
+        has_background, is_refined = behind.uniform(size=2) < (self.background, self.refined)
+        if not has_background:
+            # What a segmentation takes for the subject it takes for all of a pixel.
+            return images * wrong[:, None], wrong, torch.where(wrong > masks, 1, mattes * wrong)
+        patterns = torch.from_numpy(backgrounds(*masks.shape, behind)).to(images)
+        # Brightened colours may be more than their share of a pixel.
+        photographs = (images + (1 - mattes[:, None]) * patterns).clamp(max=1)
+        if not is_refined:
+            return photographs * wrong[:, None], wrong, wrong.to(images)
+        bytes_ = (255 * photographs).round().byte().movedim(1, -1).numpy()
+        pixels = max(1, math.ceil(self.mask_offset + self.mask_ragged))
+        pairs = [
+            refined_matte(image, 255 * mask, pixels)
+            for image, mask in zip(bytes_, wrong.byte().numpy(), strict=True)
+        ]
+        subjects, found = (
+            torch.from_numpy(np.stack(each)).to(images) / 255 for each in zip(*pairs, strict=True)
+        )
+        kept = (found > 0.5).flatten(1).any(1)[:, None, None]  # no mask is emptied
+        found = torch.where(kept, found, wrong.to(images))
+        images = torch.where(kept[:, None], subjects.movedim(-1, 1), photographs * wrong[:, None])
+        return images, found > 0.5, found
 
     def _masks(self, masks: Tensor, rng: np.random.Generator) -> Tensor:
         limits = (self.mask_offset, self.mask_ragged, self.mask_hole, self.mask_hole_chance)

@@ -21,6 +21,8 @@ from ghgs_lit.types import Cameras
 _GAMMA = 2.2
 # Side of the bumps of a ragged outline in pixels.
 _BUMP = 6
+# Patches of backgrounds: how many along a side, and how much their colours differ. Noise of single pixels.
+_PATCHES, _NOISE = ((3, 0.35), (12, 0.15), (40, 0.06)), 0.02
 
 
 def color_gains(
@@ -84,6 +86,18 @@ def imperfect_mask(
         v, u = np.ogrid[: mask.shape[0], : mask.shape[1]]
         result &= (v - rows[middle]) ** 2 + (u - columns[middle]) ** 2 >= radius**2
     return result if result.any() else mask
+
+
+def backgrounds(
+    views: int, height: int, width: int, rng: np.random.Generator
+) -> Float[np.ndarray, "V 3 h w"]:
+    """What is behind a subject, another for each camera: cloudy patterns of large and small patches."""
+    size = (views, 3, height, width)
+    found = 0.5 + rng.uniform(-0.2, 0.2, (views, 3, 1, 1)) + _NOISE * rng.standard_normal(size)
+    for cells, deviation in _PATCHES:
+        patches = rng.uniform(-deviation, deviation, (views, 3, cells, cells))
+        found += zoom(patches, (1, 1, height / cells, width / cells), order=1)
+    return found.clip(0, 1)
 
 
 def miscalibrated(

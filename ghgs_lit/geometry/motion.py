@@ -10,17 +10,28 @@ from torch import Tensor
 
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 
+#: Weight of a shift along an optical axis beside one across it, in what cameras share: it shows little, and
+#: as much as another focal length.
+_ALONG = 0.01
+
 
 def without_common(
     motions: Float[Tensor, "*b V 6"], axes: Float[Tensor, "*b V 3"]
 ) -> Float[Tensor, "*b V 6"]:
     """Motions without their mean, and without what they share along the optical axes.
 
+    The mean of the shifts is the one that photographs show least of once it is taken out: least squares of
+    what is across the optical axes.
+
     Args:
         motions: rotation vectors of points, and shifts, in the world's axes.
         axes: optical axes of the cameras.
     """
-    turn, shift = (motions - motions.mean(-2, keepdim=True)).split(3, -1)
+    turn, shift = motions.split(3, -1)
+    turn = turn - turn.mean(-2, keepdim=True)
+    across = torch.eye(3).to(axes) - (1 - _ALONG) * axes[..., :, None] * axes[..., None, :]
+    mean = torch.linalg.solve(across.sum(-3), (across @ shift[..., None]).sum(-3))
+    shift = shift - mean.mT
     along = (shift * axes).sum(-1, keepdim=True).mean(-2, keepdim=True)
     return torch.cat((turn, shift - along * axes), -1)
 

@@ -146,6 +146,37 @@ def test_each_imperfection_changes_its_part_of_the_inputs_alone(root, names, cha
         assert one.masks.flatten(2).any(-1).all()
 
 
+def test_a_wrong_mask_shows_the_background(root):
+    """Before a background pixels that a mask adds are brighter than black; where the mask is right nothing is new."""
+    outlines = {"mask_offset": 1.5, "mask_ragged": 1.0}
+    clean, black, cloudy = (
+        module(root, augmentation=a).training_batch(1) for a in ({}, outlines, outlines | {"background": 1.0})
+    )
+    assert torch.equal(black.masks, cloudy.masks)
+    added = cloudy.masks & (clean.alpha == 0)
+    assert added.any()
+    assert ((cloudy.images - black.images).amax(2)[added] > 0.05).float().mean() > 0.9
+    sure = cloudy.masks & (clean.alpha == 1)
+    assert torch.equal(cloudy.images.movedim(2, -1)[sure], clean.images.movedim(2, -1)[sure])
+    assert not cloudy.images.movedim(2, -1)[~cloudy.masks].any()
+    assert torch.equal(cloudy.alpha, cloudy.masks.float())
+
+
+def test_refined_masks_are_those_of_a_capture(root):
+    """refined=1 finds mattes in the photographs, by as many pixels as outlines may be off."""
+    wrong = {"mask_offset": 1.5, "mask_ragged": 1.0, "background": 1.0}
+    clean, given, found = (
+        module(root, augmentation=a).training_batch(1) for a in ({}, wrong, wrong | {"refined": 1.0})
+    )
+    errors = [(batch.alpha - clean.alpha).abs().mean() for batch in (given, found)]
+    assert errors[1] < errors[0]
+    assert torch.equal(found.masks, found.alpha > 0.5)
+    assert ((found.alpha > 0) & (found.alpha < 1)).any()
+    assert found.images.max() <= 1
+    assert (found.images <= found.alpha[:, :, None] + 1 / 255).all()
+    assert equal(found.targets, clean.targets)
+
+
 def test_imperfections_do_not_depend_on_batch_mates(root):
     """Two elements together are as each alone."""
     batch = module(root).training_batch(0)
@@ -185,6 +216,7 @@ def test_shipped_variation_is_built():
         ({"sizes": [[3, 4, 5]]}, "augmentation.sizes: expected a side or"),
         ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
         ({"chance": 1.5}, "augmentation.chance: expected at most 1; found 1.5"),
+        ({"background": 2}, "augmentation.background: expected at most 1; found 2"),
         ({"calibration": -1}, "augmentation.calibration: expected at least 0; found -1"),
         ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole"),
     ],

@@ -20,6 +20,19 @@ def test_what_cameras_share_is_taken_out_and_the_rest_stays():
     torch.testing.assert_close(apart[..., :3], turns)
 
 
+def test_what_cameras_share_is_what_photographs_show():
+    """Left and right camera move along their axes, which shows little: the others stay where they are."""
+    axes = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    motions = torch.zeros(4, 6)
+    motions[:, 3] = torch.tensor([0.1, 0.0, -0.1, 0.0])
+    # As motions of points: front and back camera see them go apart, and no mean of them is a rig's.
+    torch.testing.assert_close(without_common(motions, axes), motions)
+    along = motions.clone()
+    along[1, 3] = 1.0
+    across = without_common(along, axes)[[0, 2], 3] - motions[[0, 2], 3]
+    assert across.abs().max() < 0.01
+
+
 def test_small_motions_turn_and_shift_points():
     """A turn by a hundredth moves a point by that share of its distance from the axis; shifts have a unit."""
     rotation, shift = rigid(torch.tensor([0.0, 0.0, 0.01, 0.0, 0.0, 0.5]), length=2.0)

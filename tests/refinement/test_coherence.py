@@ -1,0 +1,138 @@
+"""Cameras from silhouettes alone: no model, no colours."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.geometry.frame import HEIGHT, Frame
+from ghgs_lit.geometry.motion import after_motions, rigid, without_common
+from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.refinement import coherence
+from ghgs_lit.refinement.coherence import coherent_cameras
+from ghgs_lit.types import Batch
+from tests.helpers.scenes import CENTER, ellipsoid, off, ring
+
+#: A body with two arms and a leg that stand out: middles beside the subject's, and radii.
+PARTS = [
+    ((0.0, 0.0, 0.0), (0.25, 0.8, 0.2)),
+    ((0.4, 0.3, 0.05), (0.3, 0.07, 0.08)),
+    ((-0.1, 0.2, 0.35), (0.08, 0.08, 0.3)),
+    ((-0.25, -0.5, -0.1), (0.1, 0.35, 0.1)),
+]
+
+
+def _parts():
+    return [(CENTER + torch.tensor(middle), torch.tensor(radii)) for middle, radii in PARTS]
+
+
+def figure(batch=1, views=4, size=126):
+    """Mattes and depths of the figure, in the subject's frame."""
+    cameras = ring(batch, views, size, size)
+    finer = [ellipsoid(cameras.resized(4 * size, 4 * size), *part)[0] for part in _parts()]
+    alpha = torch.nn.functional.avg_pool2d(torch.stack(finer).any(0).float(), 4)
+    found = [ellipsoid(cameras, *part) for part in _parts()]
+    masks = torch.stack([mask for mask, _ in found]).any(0)
+    depths = torch.stack([torch.where(mask, depth, torch.inf) for mask, depth in found]).amin(0)
+    batch = Batch(masks[:, :, None].expand(-1, -1, 3, -1, -1).float(), masks, cameras, alpha=alpha)
+    batch = dataclasses.replace(batch, depths=torch.where(masks, depths, 0))
+    frame = Frame.of(batch)
+    depths = batch.depths / frame.metre.float()[:, None, None, None]
+    return dataclasses.replace(frame.enter(batch), depths=depths)
+
+
+def pixels_off(cameras, truth):
+    """How far surface points are from where they should be seen, root mean square over all views."""
+    points = unproject_maps(truth.depths, truth.cameras)[truth.masks][::5]
+    seen = [
+        project(points.expand(*each.extrinsics.shape[:2], -1, 3), *(m[:, :, None] for m in matrices))[0]
+        for each in (cameras, truth.cameras)
+        for matrices in [(each.intrinsics, each.extrinsics)]
+    ]
+    return float((seen[0] - seen[1]).square().sum(-1).mean().sqrt())
+
+
+@pytest.mark.parametrize(("views", "pixels", "seed"), [(3, 6.0, 1), (4, 6.0, 0), (4, 6.0, 2), (5, 6.0, 3)])
+def test_silhouettes_correct_cameras(views, pixels, seed):
+    """Errors of pixels become errors of a fraction; lenses stay, rotations are rotations."""
+    truth = figure(views=views)
+    wrong = off(truth, pixels, (seed,))
+    found = coherent_cameras(wrong)
+    assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
+    assert torch.equal(found.intrinsics, wrong.cameras.intrinsics)
+    rotation = found.extrinsics[0, :, :3, :3].double()
+    torch.testing.assert_close(
+        rotation @ rotation.mT, torch.eye(3).double().expand(views, 3, 3), rtol=0, atol=1e-5
+    )
+
+
+def test_exact_cameras_stay():
+    """To the bit: silhouettes that explain one another say nothing."""
+    truth = figure()
+    assert torch.equal(coherent_cameras(truth).extrinsics, truth.cameras.extrinsics)
+
+
+def test_elements_are_corrected_as_if_alone():
+    truth = figure(batch=2)
+    wrong = off(truth, 2.0, (0, 5))
+    together = coherent_cameras(wrong).extrinsics
+    for b in range(2):
+        parts = (wrong.images[[b]], wrong.masks[[b]], wrong.cameras[[b]])
+        alone = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
+        torch.testing.assert_close(alone.extrinsics[0], together[b], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("mask", [torch.zeros(126, 126), torch.ones(126, 126)])
+def test_a_silhouette_without_an_outline_says_nothing_wrong(mask):
+    """An empty one explains no ray and a full one every ray: cameras stay finite."""
+    truth = figure()
+    alpha = truth.alpha.clone()
+    alpha[0, 1] = mask
+    found = coherent_cameras(dataclasses.replace(truth, alpha=alpha))
+    assert found.extrinsics.isfinite().all()
+    if mask.all():
+        assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
+
+
+def test_a_subject_may_go_on_beyond_a_photograph():
+    """A photograph that cuts the legs off contradicts nothing, as nobody knows what is below it."""
+    truth = figure()
+    cameras = dataclasses.replace(truth.cameras, height=90)
+    images, masks, alpha = (part[..., :90, :] for part in (truth.images, truth.masks, truth.alpha))
+    cut = Batch(images, masks, cameras, alpha=alpha)
+    assert cut.masks[..., -1, :].any()
+    assert torch.equal(coherent_cameras(cut).extrinsics, truth.cameras.extrinsics)
+
+
+def test_gradients_are_those_of_finite_differences():
+    """Of distances by small motions of points, in a map that is smooth (a cone's slopes are constant)."""
+    truth = figure()
+    lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
+    u, v = torch.meshgrid(torch.arange(4 * 126.0), torch.arange(4 * 126.0), indexing="xy")
+    ramps = torch.stack([a * u + b * v for a, b in ((0.1, 0.0), (0.0, 0.1), (0.05, 0.1), (0.1, -0.02))])
+    outlines = coherence._Outlines(ramps[:, None], None, None, None, (126, 126))
+    points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
+    other = torch.arange(40) % 4
+    rows = coherence._gradients(outlines, lens, pose, points, other)
+
+    def distances(motion):
+        rotation, shift = rigid(motion, HEIGHT / 2)
+        return outlines.at(other, project(points @ rotation.mT + shift, lens[other], pose[other])[0])
+
+    for axis in range(6):
+        step = 0.01 * torch.eye(6)[axis]
+        found = (distances(step) - distances(-step)) / 0.02
+        torch.testing.assert_close(rows[:, axis], found, rtol=0.02, atol=0.05)
+
+
+def test_a_step_follows_the_motion_that_took_cameras_away():
+    """One camera moves by six pixels, sideways, but for what all share: most of it comes back."""
+    truth = figure()
+    pose = truth.cameras.extrinsics[0]
+    motion = torch.zeros(4, 6)
+    motion[2, 3:] = 6 * pose[2, 2, 3] / truth.cameras.intrinsics[0, 2, 0, 0] / (HEIGHT / 2) * pose[2, 0, :3]
+    motion = without_common(motion, pose[:, 2, :3])
+    moved = after_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
+    wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
+    found = coherent_cameras(wrong)
+    assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
