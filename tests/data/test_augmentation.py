@@ -147,7 +147,7 @@ def test_each_imperfection_changes_its_part_of_the_inputs_alone(root, names, cha
 
 
 def test_a_wrong_mask_shows_the_background(root):
-    """Before a background pixels that a mask adds are brighter than black; where the mask is right nothing is new."""
+    """Pixels that a mask adds show what is behind them; where the mask is right nothing is new."""
     outlines = {"mask_offset": 1.5, "mask_ragged": 1.0}
     clean, black, cloudy = (
         module(root, augmentation=a).training_batch(1) for a in ({}, outlines, outlines | {"background": 1.0})
