@@ -136,3 +136,35 @@ def test_a_step_follows_the_motion_that_took_cameras_away():
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
     found = coherent_cameras(wrong)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
+
+
+def test_a_ray_is_looked_up_in_the_other_silhouettes():
+    """The depth is the least one in the others, at a point of the ray that no other point of it beats."""
+    truth = figure()
+    outlines = coherence._Outlines.of(truth.alpha[0])
+    lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
+    view, pixels = outlines.view[::23], outlines.pixels[::23]
+    points, other, depth = coherence._best_points(outlines, lens, pose, view, pixels)
+    assert (other != view).all()
+    index = torch.arange(4).expand(len(view), 4)
+    seen = project(points[:, None].expand(-1, 4, 3), lens[index], pose[index])[0]
+    torch.testing.assert_close(seen[torch.arange(len(view)), view], pixels, rtol=0, atol=1e-3)
+    depths = torch.where(index == view[:, None], torch.inf, outlines.at(index, seen))
+    torch.testing.assert_close(depths.amin(1), depth)
+    # With exact cameras all of them meet the others, up to the sampling of depths.
+    assert depth.min() > -0.5
+
+
+def test_phases_weigh_rays_by_what_they_make_small():
+    """First, only rays that miss count; then, only those about as deep as in their own silhouette."""
+    first, second = coherence._PHASES
+    depth = torch.tensor([3.0, -0.5, -4.0])
+    distances = first.distances(depth, torch.ones(3))
+    torch.testing.assert_close(distances, torch.tensor([0.0, -0.5, -4.0]))
+    torch.testing.assert_close(first.weights(distances), torch.tensor([0.0, 1.0, 0.25]))
+    distances = second.distances(torch.tensor([2.0, 1.7, 5.0]), torch.full((3,), 2.0))
+    torch.testing.assert_close(distances, torch.tensor([0.0, -0.3, 3.0]))
+    weights = second.weights(distances)
+    assert weights[0] == 1
+    assert 0.2 < weights[1] < 0.3
+    assert weights[2] < 1e-3
