@@ -30,8 +30,9 @@ def without_common(
     turn, shift = motions.split(3, -1)
     turn = turn - turn.mean(-2, keepdim=True)
     across = torch.eye(3).to(axes) - (1 - _ALONG) * axes[..., :, None] * axes[..., None, :]
-    mean = torch.linalg.solve(across.sum(-3), (across @ shift[..., None]).sum(-3))
-    shift = shift - mean.mT
+    # Products written out: matmul would run in half precision under autocast.
+    mean = torch.linalg.solve(across.sum(-3), (across * shift[..., None, :]).sum((-3, -1)))
+    shift = shift - mean[..., None, :]
     along = (shift * axes).sum(-1, keepdim=True).mean(-2, keepdim=True)
     return torch.cat((turn, shift - along * axes), -1)
 

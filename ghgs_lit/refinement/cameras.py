@@ -132,8 +132,9 @@ class CameraRefinement:
                 optimizer.step()
             schedule.step()
         is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
-        motion = without_common(raw.detach(), axes)
-        extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
+        with torch.autocast(axes.device.type, enabled=False):
+            motion = without_common(raw.detach(), axes)
+            extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
         extrinsics = torch.where(is_better[:, None, None, None], extrinsics, cameras.extrinsics)
         return dataclasses.replace(cameras, extrinsics=extrinsics), is_better
 

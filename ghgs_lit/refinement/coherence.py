@@ -117,7 +117,8 @@ def coherent_cameras(batch: Batch) -> Cameras:
     parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)
     # A small problem of many short steps, and distances to outlines are found on a CPU.
     elements = zip(*(part.float().cpu() for part in parts), strict=True)
-    extrinsics = torch.stack([_coherent(*element) for element in elements]).to(cameras.extrinsics)
+    with torch.autocast("cpu", enabled=False):
+        extrinsics = torch.stack([_coherent(*element) for element in elements]).to(cameras.extrinsics)
     return dataclasses.replace(cameras, extrinsics=extrinsics)
 
 
@@ -146,6 +147,7 @@ def _step(
     distances = phase.distances(depth, own)
     # One pixel for each unit of the motions, about.
     pixel = HEIGHT / 2 * (lens[:, 0, 0] / pose[:, 2, 3]).mean()
+    rays = max(len(distances), 1)
     rows = _gradients(outlines, lens, pose, points, other) / pixel
     jacobian = rows.new_zeros(len(rows), count, 6)
     index = torch.arange(len(rows))
@@ -153,11 +155,11 @@ def _step(
     jacobian[index, view] -= rows
     jacobian = jacobian.flatten(1)
     weighted = phase.weights(distances)[:, None] * jacobian
-    normal = weighted.mT @ jacobian + _STAY * len(rows) * torch.eye(6 * count).to(rows)
+    normal = weighted.mT @ jacobian + _STAY * rays * torch.eye(6 * count).to(rows)
     steps = -torch.linalg.solve(normal, weighted.mT @ distances).reshape(count, 6) / pixel
     steps = without_common(steps, pose[:, 2, :3])
     moved = after_motions(pose, steps, pose.new_zeros(3), HEIGHT / 2)
-    return moved, distances.abs().sum() / max(len(rows), 1)
+    return moved, distances.abs().sum() / rays
 
 
 def _best_points(

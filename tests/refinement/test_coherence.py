@@ -82,6 +82,20 @@ def test_elements_are_corrected_as_if_alone():
         torch.testing.assert_close(alone.extrinsics[0], together[b], rtol=0, atol=1e-6)
 
 
+def test_half_precision_of_others_changes_nothing():
+    """Geometry is in float32 under any autocast."""
+    wrong = off(figure(), 6.0, (0,))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = coherent_cameras(wrong)
+    assert torch.equal(found.extrinsics, coherent_cameras(wrong).extrinsics)
+
+
+def test_no_silhouette_at_all_moves_nothing():
+    truth = figure()
+    nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha)
+    assert torch.equal(coherent_cameras(nothing).extrinsics, truth.cameras.extrinsics)
+
+
 @pytest.mark.parametrize("mask", [torch.zeros(126, 126), torch.ones(126, 126)])
 def test_a_silhouette_without_an_outline_says_nothing_wrong(mask):
     """An empty one explains no ray and a full one every ray: cameras stay finite."""
