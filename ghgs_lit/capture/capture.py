@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.data.resampling import area_image
 from ghgs_lit.errors import require
+from ghgs_lit.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.

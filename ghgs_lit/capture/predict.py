@@ -63,7 +63,7 @@ def predict(
         refine_cameras: rounds, at most, that correct the cameras until the photographs agree
             (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
         refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then found in the
-            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
+            photographs (:func:`ghgs_lit.matting.refined_matte`). 0: masks are right.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
