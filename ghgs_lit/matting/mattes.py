@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 from safetensors.torch import load_file
-from scipy.ndimage import distance_transform_edt
 
+from ghgs_lit.geometry.outlines import signed_distance
 from ghgs_lit.matting.network import MattingNetwork
 
 #: The tensors of the network that comes with the package, in half precision.
@@ -38,7 +38,8 @@ def refined_matte(
     colors, given = (torch.from_numpy(part[window] / np.float32(255)) for part in (image, matte))
     with torch.inference_mode():
         found, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
-    is_open = _to_other_side(matte[window] > 127) <= pixels
+    # Pixels whose nearest one on the other side of the outline is so near.
+    is_open = np.abs(signed_distance(matte[window] > 127)) + 0.5 <= pixels
     result = np.zeros_like(image), np.zeros_like(matte)
     kept = given.numpy(), (given[..., None] * colors).numpy()
     alpha = np.where(is_open, found[0].numpy(), kept[0])
@@ -59,13 +60,3 @@ def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]
     """The part of an image around its mask; all of it where the mask is empty."""
     lines = (np.nonzero(inside.any(axis))[0] for axis in (1, 0))
     return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)
-
-
-def _to_other_side(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Distance in pixels to the nearest pixel on the other side of the outline; infinite without one.
-
-    The image's border is no outline.
-    """
-    if inside.all() or not inside.any():
-        return np.full(inside.shape, np.inf)
-    return np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))

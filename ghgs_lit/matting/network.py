@@ -11,8 +11,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
+
+from ghgs_lit.geometry.outlines import signed_distance
 
 #: Channels at the full size of the image and at each half of it.
 _WIDTHS = (16, 32, 48, 64)
@@ -92,10 +93,7 @@ def _features(
 
 def _insideness(mask: np.ndarray) -> np.ndarray:
     """Distance from the outline over :data:`FARTHEST`, from -1 outside to 1 inside; float32."""
-    if mask.all() or not mask.any():
-        return np.where(mask, np.float32(1), np.float32(-1))
-    distance = np.where(mask, distance_transform_edt(mask) - 0.5, 0.5 - distance_transform_edt(~mask))
-    return (distance / FARTHEST).clip(-1, 1).astype(np.float32)
+    return (signed_distance(mask) / FARTHEST).clip(-1, 1).astype(np.float32)
 
 
 def _near(sums: Float[Tensor, "B 4 m n"], side: int, size: torch.Size) -> Float[Tensor, "B 3 h w"]:

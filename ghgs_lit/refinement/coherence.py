@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.motion import after_motions, without_common
+from ghgs_lit.geometry.outlines import signed_distance
 from ghgs_lit.geometry.projection import pixel_centers, project, unproject
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.types import Batch, Cameras
@@ -77,7 +77,10 @@ class _Outlines:
     def of(cls, mattes: Float[Tensor, "V H W"]) -> "_Outlines":
         size = (mattes.shape[1], mattes.shape[2])
         larger = F.interpolate(mattes[:, None], scale_factor=_FINER, mode="bilinear", align_corners=False)
-        maps = torch.stack([_signed_distance(one[0] > 0.5) for one in larger])[:, None] / _FINER
+        maps = (
+            torch.stack([torch.from_numpy(signed_distance(one[0].numpy() > 0.5)) for one in larger])[:, None]
+            / _FINER
+        )
         maps = maps.clamp(-_FAR, _FAR).to(mattes)
         view = torch.arange(len(mattes))[:, None, None].expand(-1, *size)
         pixels = pixel_centers(*size, mattes).expand(*view.shape, 2)
@@ -201,12 +204,3 @@ def _gradients(
     in_camera = torch.cat((slopes / depth[:, None], ahead[:, None]), -1)
     in_world = (pose[other, :3, :3].mT @ in_camera[..., None])[..., 0]
     return torch.cat((torch.linalg.cross(points, in_world), HEIGHT / 2 * in_world), -1)
-
-
-def _signed_distance(inside: Tensor) -> Tensor:
-    """Pixels to the outline, which runs between pixel centres; without an outline, all far."""
-    mask = inside.numpy()
-    if mask.all() or not mask.any():
-        return torch.full(mask.shape, _FAR * _FINER if mask.all() else -_FAR * _FINER)
-    within, beyond = distance_transform_edt(mask) - 0.5, 0.5 - distance_transform_edt(~mask)
-    return torch.from_numpy(within * mask + beyond * ~mask).float()

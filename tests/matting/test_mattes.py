@@ -8,7 +8,8 @@ from scipy.ndimage import gaussian_filter, zoom
 
 from ghgs_lit import Capture
 from ghgs_lit.capture import capture
-from ghgs_lit.matting import mattes, refined_matte
+from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.matting import refined_matte
 from tests.helpers.figures import Figure
 
 HEIGHT, WIDTH = 216, 180
@@ -37,7 +38,7 @@ def masks_of(alpha):
     mask = alpha > 127
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     bumps = gaussian_filter(np.random.default_rng(1).standard_normal(mask.shape), 3)
-    distance = mattes._to_other_side(mask) * np.where(mask, 1, -1)
+    distance = signed_distance(mask)
     return {
         "exact": mask,
         "grown": distance > -2,
@@ -71,7 +72,7 @@ def test_far_from_the_outline_the_mask_decides(scene):
     mask = (255 * ((alpha > 127) & (place >= 9))).astype(np.uint8)
     _, matte = refined_matte(photograph, mask, 4)
     assert (matte[place < 4] == 0).all()
-    far = mattes._to_other_side(mask > 0) > 6
+    far = np.abs(signed_distance(mask > 0)) > 5.5
     assert (matte[far] == mask[far]).all()
 
 
@@ -119,7 +120,7 @@ def test_crops_of_wrong_masks_hold_the_subject_alone(tmp_path):
     exact = Capture.read(tmp_path, figure.write(tmp_path))
     grown = tuple(
         dataclasses.replace(
-            one, matte=(255 * (mattes._to_other_side(one.mask) <= 4)).astype(np.uint8) | one.matte
+            one, matte=(255 * (np.abs(signed_distance(one.mask)) <= 3.5)).astype(np.uint8) | one.matte
         )
         for one in exact.photographs
     )
