@@ -199,10 +199,10 @@ def train(data: PhotographsDataModule, steps: int, out: Path, weights: Path) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=9500)
+    parser.add_argument("--steps", type=int, default=9500, help="in all")
     parser.add_argument("--people", type=int, nargs=2, default=(160, 80), help="standing and in other poses")
     parser.add_argument("--out", type=Path, default=Path("runs/matting"), help="checkpoints and logs")
-    parser.add_argument("--weights", type=Path, default=WEIGHTS)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS, help="replaced at the end")
     options = parser.parse_args()
     standing, active = options.people
     overrides = [f"data.people={{train: {standing}, val: 1}}", f"data.active={{train: {active}, val: 0}}"]

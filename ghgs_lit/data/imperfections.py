@@ -8,11 +8,12 @@ import math
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt, zoom
+from scipy.ndimage import zoom
 from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.motion import after_motions, motions_between, without_common
+from ghgs_lit.geometry.outlines import signed_distance
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.types import Cameras
@@ -75,12 +76,8 @@ def imperfect_mask(
             slice(max(0, lines.min() - margin), lines.max() + 1 + margin) for lines in (rows, columns)
         )
         part = mask[window]
-        # Pixels from the outline, which runs between pixel centres: above 0 inside.
-        outline = 0.5 - distance_transform_edt(~part)
-        if not part.all():
-            outline = np.where(part, distance_transform_edt(part) - 0.5, outline)
         noise = zoom(bumps, _BUMP, order=1)[: mask.shape[0], : mask.shape[1]][window]
-        result[window] = outline + (2 * grow - 1) * offset + height * ragged * noise > 0
+        result[window] = signed_distance(part) + (2 * grow - 1) * offset + height * ragged * noise > 0
     if missing < hole_chance:
         middle, radius = int(place * len(rows)), size * hole * (rows.max() - rows.min() + 1) / 2
         v, u = np.ogrid[: mask.shape[0], : mask.shape[1]]
