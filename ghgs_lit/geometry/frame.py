@@ -67,7 +67,8 @@ class Frame:
         extrinsics[..., :3, 3] = (
             inside.extrinsics[..., :3, 3].double() * self.metre[:, None, None] - to_origin
         )
-        return dataclasses.replace(world, extrinsics=extrinsics.to(world.extrinsics))
+        intrinsics = inside.intrinsics.to(world.intrinsics)
+        return dataclasses.replace(world, intrinsics=intrinsics, extrinsics=extrinsics.to(world.extrinsics))
 
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
         """A prediction in the frame as one in the world.

@@ -1,11 +1,11 @@
-"""Extrinsics of a capture, corrected until the photographs agree with one another.
+"""Cameras of a capture, corrected until the photographs agree with one another.
 
 A calibration that is off by a pixel or two costs a model several dB: views contradict one another. First
-cameras move until silhouettes explain one another (:mod:`ghgs_lit.refinement.coherence`); where a prediction
-does not agree that this is better, as with wrong masks, they stay. Then predictions say more: what the other
-views say of a view is drawn with that view's camera and compared with its photograph, and the camera moves
-until they fit. A view's own Gaussians take no part, as they reproduce its photograph wherever its camera is.
-Bundle adjustment with a rendering loss is that of BARF (Lin et al., ICCV 2021).
+cameras move and zoom until silhouettes explain one another (:mod:`ghgs_lit.refinement.coherence`); where a
+prediction does not agree that this is better, as with wrong masks, they stay. Then predictions say more: what
+the other views say of a view is drawn with that view's camera and compared with its photograph, and the
+camera moves until they fit. A view's own Gaussians take no part, as they reproduce its photograph wherever
+its camera is. Bundle adjustment with a rendering loss is that of BARF (Lin et al., ICCV 2021).
 
 Photographs do not tell where the whole rig is, so cameras only move beside one another
 (:mod:`ghgs_lit.geometry.motion`).
@@ -70,13 +70,12 @@ class CameraRefinement:
         self.rounds, self.predict, self.renderer = rounds, predict, renderer
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with corrected extrinsics; targets stay as they are.
+        """The batch with corrected cameras; targets stay as they are.
 
         Args:
             batch: photographs, masks and cameras, of two views or more.
         """
         frame = Frame.of(batch)
-        given = batch.cameras.extrinsics
         inside, moved = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
             with torch.no_grad():
@@ -86,10 +85,9 @@ class CameraRefinement:
             if not bool(is_better.any()):
                 break
             inside, moved = dataclasses.replace(inside, cameras=cameras), moved | is_better
-        found = frame.leave_cameras(inside.cameras, batch.cameras).extrinsics
         # To the frame and back is not exact.
-        extrinsics = torch.where(moved[:, None, None, None], found, given)
-        return dataclasses.replace(batch, cameras=dataclasses.replace(batch.cameras, extrinsics=extrinsics))
+        found = _chosen(moved, frame.leave_cameras(inside.cameras, batch.cameras), batch.cameras)
+        return dataclasses.replace(batch, cameras=found)
 
     @torch.no_grad()
     def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"]]:
@@ -101,10 +99,7 @@ class CameraRefinement:
         proposal = dataclasses.replace(batch, cameras=cameras)
         before, after = map(self._disagreement, (batch, proposal))
         is_better = moved & (after < (1 - _FIRST) * before)
-        extrinsics = torch.where(is_better[:, None, None, None], cameras.extrinsics, batch.cameras.extrinsics)
-        return dataclasses.replace(
-            batch, cameras=dataclasses.replace(cameras, extrinsics=extrinsics)
-        ), is_better
+        return dataclasses.replace(batch, cameras=_chosen(is_better, cameras, batch.cameras)), is_better
 
     def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
         """What the rounds make small, with the cameras as they are."""
@@ -135,8 +130,18 @@ class CameraRefinement:
         with torch.autocast(axes.device.type, enabled=False):
             motion = without_common(raw.detach(), axes)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
-        extrinsics = torch.where(is_better[:, None, None, None], extrinsics, cameras.extrinsics)
-        return dataclasses.replace(cameras, extrinsics=extrinsics), is_better
+        found = dataclasses.replace(cameras, extrinsics=extrinsics)
+        return _chosen(is_better, found, cameras), is_better
+
+
+def _chosen(which: Bool[Tensor, " B"], first: Cameras, second: Cameras) -> Cameras:
+    """The first cameras of some elements, the second of the others."""
+    which = which[:, None, None, None]
+    return dataclasses.replace(
+        first,
+        intrinsics=torch.where(which, first.intrinsics, second.intrinsics),
+        extrinsics=torch.where(which, first.extrinsics, second.extrinsics),
+    )
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:

@@ -1,4 +1,4 @@
-"""Extrinsics of a capture, moved until its silhouettes explain one another.
+"""Cameras of a capture, moved and zoomed until its silhouettes explain one another.
 
 Where cameras are right the ray of every pixel of a silhouette has a point that all other silhouettes show
 (silhouette coherence: Boyer, ACCV 2006; Hernandez, Schmitt and Cipolla, PAMI 2007). Where they are off, rays
@@ -32,8 +32,9 @@ _FROM, _TO = 0.25, 8.0
 _REACH = 0.75
 #: Mean distance in pixels of rays near outlines that is none: silhouettes explain one another.
 _COHERENT = 5e-4
-#: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays.
-_STAY = 1e-3
+#: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
+#: of the logarithms of focal lengths over it: lenses are known better than where cameras stand.
+_STAY, _KNOWN = 1e-3, 5.0
 
 
 @dataclass(frozen=True)
@@ -121,48 +122,53 @@ def coherent_cameras(batch: Batch) -> Cameras:
     # A small problem of many short steps, and distances to outlines are found on a CPU.
     elements = zip(*(part.float().cpu() for part in parts), strict=True)
     with torch.autocast("cpu", enabled=False):
-        extrinsics = torch.stack([_coherent(*element) for element in elements]).to(cameras.extrinsics)
-    return dataclasses.replace(cameras, extrinsics=extrinsics)
+        lenses, poses = map(torch.stack, zip(*(_coherent(*element) for element in elements), strict=True))
+    return dataclasses.replace(
+        cameras, intrinsics=lenses.to(cameras.intrinsics), extrinsics=poses.to(cameras.extrinsics)
+    )
 
 
 def _coherent(
     mattes: Float[Tensor, "V H W"], lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
-) -> Float[Tensor, "V 4 4"]:
-    """Extrinsics of one element after all steps."""
-    outlines, given = _Outlines.of(mattes), pose
+) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
+    """Intrinsics and extrinsics of one element after all steps."""
+    outlines, given = _Outlines.of(mattes), (lens, pose)
     for phase in _PHASES:
         for _ in range(phase.steps):
-            moved, distance = _step(outlines, lens, pose, phase)
-            if pose is given and distance < _COHERENT:
+            *found, distance = _step(outlines, lens, pose, phase)
+            if pose is given[1] and distance < _COHERENT:
                 return given
-            pose = moved
-    return pose
+            lens, pose = found
+    return lens, pose
 
 
 def _step(
     outlines: _Outlines, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"], phase: _Phase
-) -> tuple[Float[Tensor, "V 4 4"], Float[Tensor, ""]]:
-    """Extrinsics after one step of Gauss-Newton, and the mean distance before it."""
+) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Float[Tensor, ""]]:
+    """Intrinsics and extrinsics after one step of Gauss-Newton, and the mean distance before it."""
     count = len(pose)
     near = outlines.own <= phase.to
     view, own = outlines.view[near], outlines.own[near]
     points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
     distances = phase.distances(depth, own)
-    # One pixel for each unit of the motions, about.
+    # One pixel for each unit of the unknowns, about.
     pixel = HEIGHT / 2 * (lens[:, 0, 0] / pose[:, 2, 3]).mean()
     rays = max(len(distances), 1)
-    rows = _gradients(outlines, lens, pose, points, other) / pixel
-    jacobian = rows.new_zeros(len(rows), count, 6)
-    index = torch.arange(len(rows))
-    jacobian[index, other] = rows
-    jacobian[index, view] -= rows
+    gradients = _gradients(outlines, lens, pose, points, other) / pixel
+    jacobian = gradients.new_zeros(len(gradients), count, 7)
+    index = torch.arange(len(gradients))
+    jacobian[index, other] = _rows(points, gradients, pose[other])
+    jacobian[index, view] -= _rows(points, gradients, pose[view])
     jacobian = jacobian.flatten(1)
     weighted = phase.weights(distances)[:, None] * jacobian
-    normal = weighted.mT @ jacobian + _STAY * rays * torch.eye(6 * count).to(rows)
-    steps = -torch.linalg.solve(normal, weighted.mT @ distances).reshape(count, 6) / pixel
-    steps = without_common(steps, pose[:, 2, :3])
-    moved = after_motions(pose, steps, pose.new_zeros(3), HEIGHT / 2)
-    return moved, distances.abs().sum() / rays
+    stay = _STAY * rays * torch.tensor([*[1.0] * 6, _KNOWN]).to(gradients).repeat(count)
+    normal = weighted.mT @ jacobian + stay.diag()
+    steps = -torch.linalg.solve(normal, weighted.mT @ distances).reshape(count, 7) / pixel
+    motions = without_common(steps[:, :6], pose[:, 2, :3])
+    moved = after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
+    zoomed = lens.clone()
+    zoomed[:, [0, 1], [0, 1]] *= (steps[:, 6:] - steps[:, 6:].mean(0)).exp()
+    return zoomed, moved, distances.abs().sum() / rays
 
 
 def _best_points(
@@ -195,12 +201,25 @@ def _gradients(
     pose: Float[Tensor, "V 4 4"],
     points: Float[Tensor, "R 3"],
     other: Int[Tensor, " R"],
-) -> Float[Tensor, "R 6"]:
-    """How distances grow with small motions of points: rotation vectors, and shifts in half heights."""
+) -> Float[Tensor, "R 3"]:
+    """How distances grow where points move, in the world's axes."""
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
-    inside = (pose[other, :3, :3] @ points[..., None])[..., 0] + pose[other, :3, 3]
+    inside = _inside(points, pose[other])
     ahead = -(slopes * inside[:, :2]).sum(-1) / depth**2
     in_camera = torch.cat((slopes / depth[:, None], ahead[:, None]), -1)
-    in_world = (pose[other, :3, :3].mT @ in_camera[..., None])[..., 0]
-    return torch.cat((torch.linalg.cross(points, in_world), HEIGHT / 2 * in_world), -1)
+    return (pose[other, :3, :3].mT @ in_camera[..., None])[..., 0]
+
+
+def _rows(
+    points: Float[Tensor, "R 3"], gradients: Float[Tensor, "R 3"], pose: Float[Tensor, "R 4 4"]
+) -> Float[Tensor, "R 7"]:
+    """How distances grow with small changes of what a camera sees: rotation vectors of points, shifts in half
+    heights, and the logarithm of the focal length, as which points move away from the optical axis."""
+    across = _inside(points, pose)[:, :2]
+    zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
+    return torch.cat((torch.linalg.cross(points, gradients), HEIGHT / 2 * gradients, zoom), -1)
+
+
+def _inside(points: Float[Tensor, "R 3"], pose: Float[Tensor, "R 4 4"]) -> Float[Tensor, "R 3"]:
+    return (pose[:, :3, :3] @ points[..., None])[..., 0] + pose[:, :3, 3]

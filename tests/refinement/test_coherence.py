@@ -54,12 +54,15 @@ def pixels_off(cameras, truth):
 
 @pytest.mark.parametrize(("views", "pixels", "seed"), [(3, 6.0, 1), (4, 6.0, 0), (4, 6.0, 2), (5, 6.0, 3)])
 def test_silhouettes_correct_cameras(views, pixels, seed):
-    """Errors of pixels become errors of a fraction; lenses stay, rotations are rotations."""
+    """Errors of pixels become errors of a fraction; lenses hardly change, rotations are rotations."""
     truth = figure(views=views)
     wrong = off(truth, pixels, (seed,))
     found = coherent_cameras(wrong)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
-    assert torch.equal(found.intrinsics, wrong.cameras.intrinsics)
+    zoom = (found.intrinsics / wrong.cameras.intrinsics)[0, :, [0, 1], [0, 1]]
+    torch.testing.assert_close(zoom[:, 0], zoom[:, 1])
+    torch.testing.assert_close(zoom, torch.ones_like(zoom), rtol=0, atol=0.04)
+    assert torch.equal(found.intrinsics[..., 2], wrong.cameras.intrinsics[..., 2])
     rotation = found.extrinsics[0, :, :3, :3].double()
     torch.testing.assert_close(
         rotation @ rotation.mT, torch.eye(3).double().expand(views, 3, 3), rtol=0, atol=1e-5
@@ -69,7 +72,9 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
 def test_exact_cameras_stay():
     """To the bit: silhouettes that explain one another say nothing."""
     truth = figure()
-    assert torch.equal(coherent_cameras(truth).extrinsics, truth.cameras.extrinsics)
+    found = coherent_cameras(truth)
+    assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
+    assert torch.equal(found.intrinsics, truth.cameras.intrinsics)
 
 
 def test_elements_are_corrected_as_if_alone():
@@ -127,14 +132,16 @@ def test_gradients_are_those_of_finite_differences():
     outlines = coherence._Outlines(ramps[:, None], None, None, None, (126, 126))
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
-    rows = coherence._gradients(outlines, lens, pose, points, other)
+    rows = coherence._rows(points, coherence._gradients(outlines, lens, pose, points, other), pose[other])
 
-    def distances(motion):
-        rotation, shift = rigid(motion, HEIGHT / 2)
-        return outlines.at(other, project(points @ rotation.mT + shift, lens[other], pose[other])[0])
+    def distances(step):
+        rotation, shift = rigid(step[:6], HEIGHT / 2)
+        zoomed = lens.clone()
+        zoomed[:, [0, 1], [0, 1]] *= step[6].exp()
+        return outlines.at(other, project(points @ rotation.mT + shift, zoomed[other], pose[other])[0])
 
-    for axis in range(6):
-        step = 0.01 * torch.eye(6)[axis]
+    for axis in range(7):
+        step = 0.01 * torch.eye(7)[axis]
         found = (distances(step) - distances(-step)) / 0.02
         torch.testing.assert_close(rows[:, axis], found, rtol=0.02, atol=0.05)
 
@@ -149,6 +156,22 @@ def test_a_step_follows_the_motion_that_took_cameras_away():
     moved = after_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
     found = coherent_cameras(wrong)
+    assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
+
+
+@pytest.mark.parametrize("zoomed", [1, 3])
+def test_a_wrong_focal_length_comes_back(zoomed):
+    """One lens is longer than the others: what photographs show of that is found, and is no motion."""
+    truth = figure()
+    zoom = torch.ones(4)
+    zoom[zoomed] = 1.06
+    zoom = zoom / zoom.log().mean().exp()  # what all share, they do not show
+    lens = truth.cameras.intrinsics.clone()
+    lens[..., [0, 1], [0, 1]] *= zoom[:, None]
+    wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lens))
+    found = coherent_cameras(wrong)
+    left = (found.intrinsics / truth.cameras.intrinsics)[0, :, 0, 0].log()
+    assert left.abs().max() < 0.7 * zoom.log().abs().max()
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
 
 
