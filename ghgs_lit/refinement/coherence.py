@@ -99,6 +99,27 @@ class _Outlines:
         ]
         return sample(self.maps, view, _FINER * torch.stack(within, -1))[..., 0]
 
+    def along(
+        self,
+        view: int,
+        lens: Float[Tensor, "3 3"],
+        pose: Float[Tensor, "4 4"],
+        start: Float[Tensor, "3"],
+        ahead: Float[Tensor, "R 3"],
+        depths: Float[Tensor, " D"],
+    ) -> Float[Tensor, "R D"]:
+        """Distances in one silhouette at ``start + depth * ahead``."""
+        # From -1 to 1 over the photograph; what is seen of a ray is a ratio of two lines.
+        height, width = self.size
+        onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
+        first, slope = onto @ (pose[:3, :3] @ start + pose[:3, 3]), ahead @ (onto @ pose[:3, :3]).mT
+        x, y, z = (first[axis] + slope[:, axis, None] * depths for axis in range(3))
+        z = torch.where(z > 0, z, 1)
+        places = torch.stack((x / z, y / z), -1)[None]
+        return F.grid_sample(self.maps[view : view + 1], places, padding_mode="border", align_corners=False)[
+            0, 0
+        ]
+
     def slopes(self, view: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
         steps = _REACH * torch.eye(2).to(pixels)
         return torch.stack(
@@ -178,21 +199,30 @@ def _best_points(
     view: Int[Tensor, " R"],
     pixels: Float[Tensor, "R 2"],
 ) -> tuple[Float[Tensor, "R 3"], Int[Tensor, " R"], Float[Tensor, " R"]]:
-    """Of each ray the point deepest in the other silhouettes, the one that it is least deep in, how deep."""
-    count = len(pose)
+    """Of each ray the point deepest in the other silhouettes, the one that it is least deep in, how deep.
+
+    Args:
+        view: the silhouette of each ray, in ascending order.
+    """
+    centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
-    depths = pose[view, 2, 3, None] + along
-    shape = depths.shape
-    points = unproject(pixels[:, None].expand(*shape, 2), depths, lens[view][:, None], pose[view][:, None])
-    least, other = points.new_full(shape, torch.inf), view[:, None].expand(shape)
-    for one in range(count):
-        seen, _ = project(points, lens[one], pose[one])
-        depth = outlines.at(torch.full(shape, one), seen)
-        depth = torch.where((view == one)[:, None], torch.inf, depth)
-        least, other = torch.minimum(least, depth), torch.where(depth < least, one, other)
-    depth, place = least.max(1)
-    index = torch.arange(len(view))
-    return points[index, place], other[index, place], depth
+    points, found, others = [], [], range(len(pose))
+    for own in others:
+        rays = pixels[view == own]
+        ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[own], pose[own]) - centers[own]
+        depths = pose[own, 2, 3] + along
+        least = rays.new_full((len(rays), _DEPTHS), torch.inf)
+        for one in others:
+            if one != own:
+                seen = outlines.along(one, lens[one], pose[one], centers[own], ahead, depths)
+                least = torch.minimum(least, seen)
+        points.append(centers[own] + depths[least.argmax(1)][:, None] * ahead)
+    points = torch.cat(points)
+    for one in others:
+        depth = outlines.at(torch.full_like(view, one), project(points, lens[one], pose[one])[0])
+        found.append(torch.where(view == one, torch.inf, depth))
+    depth, other = torch.stack(found).min(0)
+    return points, other, depth
 
 
 def _gradients(
