@@ -180,6 +180,7 @@ KINDS: dict[str, Kind] = {
     "data.rig.positions": integer(least=2),
     "data.rig.radius": POSITIVE,
     "data.rig.shift_y": number(),
+    "data.rig.variation.between_pitch": number(least=0, below=45),
     "data.rig.variation.camera_look_at": AMOUNT,
     "data.rig.variation.camera_pitch": number(least=0, below=45),
     "data.rig.variation.camera_roll": number(least=0, most=180),

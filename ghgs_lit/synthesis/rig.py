@@ -35,6 +35,8 @@ class Variation:
         camera_pitch, camera_roll: greatest deviation of single cameras, degrees.
         camera_look_at: greatest shift of single cameras, with the point that they look at, along each axis,
             metres.
+        between_pitch: greatest deviation of the views between ring cameras (2, 3 and 4), which only targets
+            take, degrees: subjects are also seen from higher and from lower than by any input.
     """
 
     radius: tuple[float, float] | None = None
@@ -43,6 +45,7 @@ class Variation:
     camera_pitch: float = 0.0
     camera_roll: float = 0.0
     camera_look_at: float = 0.0
+    between_pitch: float = 0.0
 
     def __post_init__(self) -> None:
         for name, low, high in (("radius", 0, np.inf), ("pitch", -89, 89), ("fill", 0, 1)):
@@ -52,7 +55,7 @@ class Variation:
                 expected = f"[least, greatest] between {low} and {high}"
                 require(ordered, f"data.rig.variation.{name}", expected, list(limits))
                 set_fields(self, **{name: tuple(limits)})
-        for name in ("camera_pitch", "camera_roll", "camera_look_at"):
+        for name in ("camera_pitch", "camera_roll", "camera_look_at", "between_pitch"):
             value = getattr(self, name)
             require(value >= 0, f"data.rig.variation.{name}", "at least 0", value)
 
@@ -167,7 +170,10 @@ class Rig:
         deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
         deviations[:, 1] = np.roll(deviations[:, 0], -1, 0)  # view 1 is the next ring camera
         pitch, roll, shift = deviations[..., 0], deviations[..., 1], deviations[..., 2:]
-        poses = Poses(v.camera_pitch * pitch, v.camera_roll * roll, v.camera_look_at * shift)
+        higher = rng.uniform(-1, 1, yaws.shape)  # drawn last: what came before depends on no newer draw
+        higher[:, :2] = 0
+        pitch = v.camera_pitch * pitch + v.between_pitch * higher
+        poses = Poses(pitch, v.camera_roll * roll, v.camera_look_at * shift)
         radius, ring_pitch = _within(v.radius, share[0], self.radius), _within(v.pitch, share[1], self.pitch)
         rig = replace(self, radius=radius, pitch=ring_pitch, variation=Variation())
         if v.fill is None:

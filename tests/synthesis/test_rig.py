@@ -76,6 +76,20 @@ def test_single_cameras_deviate_within_their_limits():
     torch.testing.assert_close(torch.linalg.det(turn), torch.ones_like(pitch), atol=1e-5, rtol=0)
 
 
+def test_only_views_between_ring_cameras_stand_higher_or_lower():
+    """Targets are seen from heights that no input has, by as many random numbers as before."""
+    person = VARIED.place(box_person(), subject_rng(0, "box"))
+    higher = replace(VARIED, variation=replace(VARIATION, between_pitch=20))
+    pitches = []
+    for rig in (VARIED, higher):
+        _, cameras, _ = drawn(rig, person)
+        pitches.append(torch.rad2deg(torch.asin(-cameras.extrinsics[..., 2, 1].double())))
+    change = pitches[1] - pitches[0]
+    assert change[:, :2].abs().max() < 1e-4
+    assert -20.1 < change[:, 2:].min() < -15
+    assert 15 < change[:, 2:].max() < 20.1
+
+
 def test_without_variation_nothing_changes():
     """The ring is the same to the bit, and what this version of the renderer has made keeps its name."""
     person = box_person()
