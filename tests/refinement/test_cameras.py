@@ -87,6 +87,22 @@ def test_views_agree_better(views, pixels, seed):
     assert max(pixels_moved(wrong, found)[0]) > 0.3
 
 
+def test_focal_lengths_are_corrected_where_silhouettes_tell_them():
+    """One element has a lens that is too long, the other none: only the first one's lenses change."""
+    truth = scene(batch=2)
+    lenses = truth.cameras.intrinsics.clone()
+    lenses[0, 1, [0, 1], [0, 1]] *= 1.08
+    wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lenses))
+    found = CameraRefinement(1, predictor(truth), RENDERER)(wrong).cameras.intrinsics
+    assert torch.equal(found[1], truth.cameras.intrinsics[1])
+
+    def beside_one_another(lens):
+        zoom = (lens / truth.cameras.intrinsics)[0, :, 0, 0].log()
+        return zoom - zoom.mean()
+
+    assert beside_one_another(found).abs().max() < 0.8 * beside_one_another(lenses).abs().max()
+
+
 def test_exact_cameras_stay():
     """A user who asks for it without need must not lose, not even digits far from the world's origin."""
     truth = scene()
