@@ -92,7 +92,7 @@ def _drawn(case: int, photographs: np.ndarray) -> tuple[dict[str, float], np.nda
 
 
 #: What the scene and the measurement here do not take from the configuration.
-_OWN = ("data", "views", "targets", "split", "subjects", "task", "threads", "timing")
+_FIXED = ("data", "views", "targets", "split", "subjects", "task", "threads", "timing")
 
 #: Draws a number of frames of a case: the seconds of the stages of each.
 Draw = Callable[[int, int], list[dict[str, float]]]
@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("options", nargs="*", help="overrides of `ghgs benchmark`, such as device=cuda")
     options = parser.parse_intermixed_args()
     for option in options.options:
-        if option.lstrip("+~").split("=")[0].split(".")[0] in _OWN:
+        if option.lstrip("+~").split("=")[0].split(".")[0] in _FIXED:
             parser.error(f"{option}: expected an option of the model; see --threads, --repeats and --views")
     if options.in_flight < 1:
         parser.error(f"--in-flight: expected 1 or more; found {options.in_flight}")

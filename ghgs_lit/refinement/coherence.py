@@ -18,7 +18,7 @@ from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.motion import after_motions, without_common
 from ghgs_lit.geometry.outlines import signed_distance
-from ghgs_lit.geometry.projection import pixel_centers, project, unproject
+from ghgs_lit.geometry.projection import pixel_centers, project, unproject, world_to_camera
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.types import Batch, Cameras
 
@@ -206,22 +206,23 @@ def _best_points(
     """
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
-    points, found, others = [], [], range(len(pose))
-    for own in others:
+    views, points = range(len(pose)), []
+    for own in views:
         rays = pixels[view == own]
         ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[own], pose[own]) - centers[own]
         depths = pose[own, 2, 3] + along
         least = rays.new_full((len(rays), _DEPTHS), torch.inf)
-        for one in others:
+        for one in views:
             if one != own:
                 seen = outlines.along(one, lens[one], pose[one], centers[own], ahead, depths)
                 least = torch.minimum(least, seen)
         points.append(centers[own] + depths[least.argmax(1)][:, None] * ahead)
     points = torch.cat(points)
-    for one in others:
+    shown = []
+    for one in views:
         depth = outlines.at(torch.full_like(view, one), project(points, lens[one], pose[one])[0])
-        found.append(torch.where(view == one, torch.inf, depth))
-    depth, other = torch.stack(found).min(0)
+        shown.append(torch.where(view == one, torch.inf, depth))
+    depth, other = torch.stack(shown).min(0)
     return points, other, depth
 
 
@@ -235,7 +236,7 @@ def _gradients(
     """How distances grow where points move, in the world's axes."""
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
-    inside = _inside(points, pose[other])
+    inside = world_to_camera(points, pose[other])
     ahead = -(slopes * inside[:, :2]).sum(-1) / depth**2
     in_camera = torch.cat((slopes / depth[:, None], ahead[:, None]), -1)
     return (pose[other, :3, :3].mT @ in_camera[..., None])[..., 0]
@@ -246,10 +247,6 @@ def _rows(
 ) -> Float[Tensor, "R 7"]:
     """How distances grow with small changes of what a camera sees: rotation vectors of points, shifts in half
     heights, and the logarithm of the focal length, as which points move away from the optical axis."""
-    across = _inside(points, pose)[:, :2]
+    across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
     return torch.cat((torch.linalg.cross(points, gradients), HEIGHT / 2 * gradients, zoom), -1)
-
-
-def _inside(points: Float[Tensor, "R 3"], pose: Float[Tensor, "R 4 4"]) -> Float[Tensor, "R 3"]:
-    return (pose[:, :3, :3] @ points[..., None])[..., 0] + pose[:, :3, 3]

@@ -77,7 +77,7 @@ def test_single_cameras_deviate_within_their_limits():
 
 
 def test_only_views_between_ring_cameras_stand_higher_or_lower():
-    """Targets are seen from heights that no input has, by as many random numbers as before."""
+    """Targets are seen from heights that no input has; nothing else of the rig changes."""
     person = VARIED.place(box_person(), subject_rng(0, "box"))
     higher = replace(VARIED, variation=replace(VARIATION, between_pitch=20))
     pitches = []
