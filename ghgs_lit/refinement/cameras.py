@@ -39,8 +39,11 @@ _SAME = 0.05
 _STAY = 4.0
 #: Part of the disagreement that the first round and any later one must take away for its cameras to be kept.
 #: With exact cameras it is up to 0.01, 0.02 from above; with cameras that are off by a pixel 0.02 to 0.2.
-#: The first also holds for cameras whose silhouettes explain one another.
+#: The first also holds for cameras that silhouettes propose.
 _FIRST, _LATER = 0.02, 0.01
+#: Cameras whose rays pass beside silhouettes by less than this many pixels are exact, or off by half a pixel:
+#: they must agree better by another part to be moved.
+_EXACT, _DOUBTED = 1.5e-4, 0.05
 
 
 @dataclass(frozen=True)
@@ -76,11 +79,11 @@ class CameraRefinement:
             batch: photographs, masks and cameras, of two views or more.
         """
         frame = Frame.of(batch)
-        inside, moved = self._coherent(frame.enter(batch))
+        inside, moved, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
             with torch.no_grad():
                 prediction = self.predict(inside)
-            worth = torch.where(moved, _LATER, _FIRST)
+            worth = torch.where(moved, _LATER, first)
             cameras, is_better = self._corrected(prediction, inside, worth)
             if not bool(is_better.any()):
                 break
@@ -90,16 +93,18 @@ class CameraRefinement:
         return dataclasses.replace(batch, cameras=found)
 
     @torch.no_grad()
-    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"]]:
-        """Elements whose silhouettes explain one another, and which of them agree better for it."""
-        cameras = coherent_cameras(batch)
+    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Float[Tensor, " B"]]:
+        """Elements with coherent silhouettes, which agree better for it, and what a first round must gain."""
+        cameras, distance = coherent_cameras(batch)
+        first = torch.where(distance < _EXACT, _DOUBTED, _FIRST)
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
-            return batch, moved
+            return batch, moved, first
         proposal = dataclasses.replace(batch, cameras=cameras)
         before, after = map(self._disagreement, (batch, proposal))
         is_better = moved & (after < (1 - _FIRST) * before)
-        return dataclasses.replace(batch, cameras=_chosen(is_better, cameras, batch.cameras)), is_better
+        cameras = _chosen(is_better, cameras, batch.cameras)
+        return dataclasses.replace(batch, cameras=cameras), is_better, first
 
     def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
         """What the rounds make small, with the cameras as they are."""

@@ -132,6 +132,22 @@ def test_elements_are_corrected_as_if_alone(is_exact):
         )
 
 
+def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch):
+    """Photographs of the first element explain one another; in the other the cameras are off by pixels."""
+    truth = scene(batch=2)
+    poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 4.0, (0, 5)).cameras.extrinsics[1]))
+    batch = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
+    asked = []
+
+    def corrected(self, prediction, batch, worth):
+        asked.append(worth)
+        return batch.cameras, torch.zeros(2, dtype=torch.bool)
+
+    monkeypatch.setattr(CameraRefinement, "_corrected", corrected)
+    CameraRefinement(1, predictor(truth), RENDERER)(batch)
+    assert asked[0][0] > 2 * asked[0][1] > 0
+
+
 def test_rounds_end_where_nothing_gets_better():
     """Cameras that agree are predicted once, others until they do."""
     truth = scene(size=42)

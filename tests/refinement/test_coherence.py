@@ -57,7 +57,7 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
     """Errors of pixels become errors of a fraction; lenses hardly change, rotations are rotations."""
     truth = figure(views=views)
     wrong = off(truth, pixels, (seed,))
-    found = coherent_cameras(wrong)
+    found, _ = coherent_cameras(wrong)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
     zoom = (found.intrinsics / wrong.cameras.intrinsics)[0, :, [0, 1], [0, 1]]
     torch.testing.assert_close(zoom[:, 0], zoom[:, 1])
@@ -72,18 +72,28 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
 def test_exact_cameras_stay():
     """To the bit: silhouettes that explain one another say nothing."""
     truth = figure()
-    found = coherent_cameras(truth)
+    found, _ = coherent_cameras(truth)
     assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
     assert torch.equal(found.intrinsics, truth.cameras.intrinsics)
+
+
+def test_distances_tell_exact_cameras_from_others():
+    """Those of the given cameras, in pixels, for each element."""
+    truth = figure(batch=2)
+    poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 4.0, (0, 5)).cameras.extrinsics[1]))
+    cameras = dataclasses.replace(truth.cameras, extrinsics=poses)
+    _, distances = coherent_cameras(dataclasses.replace(truth, cameras=cameras))
+    assert 0 <= distances[0] < 1.5e-4
+    assert 3e-3 < distances[1] < 1
 
 
 def test_elements_are_corrected_as_if_alone():
     truth = figure(batch=2)
     wrong = off(truth, 2.0, (0, 5))
-    together = coherent_cameras(wrong).extrinsics
+    together = coherent_cameras(wrong)[0].extrinsics
     for b in range(2):
         parts = (wrong.images[[b]], wrong.masks[[b]], wrong.cameras[[b]])
-        alone = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
+        alone, _ = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
         torch.testing.assert_close(alone.extrinsics[0], together[b], rtol=0, atol=1e-6)
 
 
@@ -91,14 +101,14 @@ def test_half_precision_of_others_changes_nothing():
     """Geometry is in float32 under any autocast."""
     wrong = off(figure(), 6.0, (0,))
     with torch.autocast("cpu", torch.bfloat16):
-        found = coherent_cameras(wrong)
-    assert torch.equal(found.extrinsics, coherent_cameras(wrong).extrinsics)
+        found, _ = coherent_cameras(wrong)
+    assert torch.equal(found.extrinsics, coherent_cameras(wrong)[0].extrinsics)
 
 
 def test_no_silhouette_at_all_moves_nothing():
     truth = figure()
     nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha)
-    assert torch.equal(coherent_cameras(nothing).extrinsics, truth.cameras.extrinsics)
+    assert torch.equal(coherent_cameras(nothing)[0].extrinsics, truth.cameras.extrinsics)
 
 
 @pytest.mark.parametrize("mask", [torch.zeros(126, 126), torch.ones(126, 126)])
@@ -107,7 +117,7 @@ def test_a_silhouette_without_an_outline_says_nothing_wrong(mask):
     truth = figure()
     alpha = truth.alpha.clone()
     alpha[0, 1] = mask
-    found = coherent_cameras(dataclasses.replace(truth, alpha=alpha))
+    found, _ = coherent_cameras(dataclasses.replace(truth, alpha=alpha))
     assert found.extrinsics.isfinite().all()
     if mask.all():
         assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
@@ -120,7 +130,7 @@ def test_a_subject_may_go_on_beyond_a_photograph():
     images, masks, alpha = (part[..., :90, :] for part in (truth.images, truth.masks, truth.alpha))
     cut = Batch(images, masks, cameras, alpha=alpha)
     assert cut.masks[..., -1, :].any()
-    assert torch.equal(coherent_cameras(cut).extrinsics, truth.cameras.extrinsics)
+    assert torch.equal(coherent_cameras(cut)[0].extrinsics, truth.cameras.extrinsics)
 
 
 def test_gradients_are_those_of_finite_differences():
@@ -155,7 +165,7 @@ def test_a_step_follows_the_motion_that_took_cameras_away():
     motion = without_common(motion, pose[:, 2, :3])
     moved = after_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
-    found = coherent_cameras(wrong)
+    found, _ = coherent_cameras(wrong)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
 
 
@@ -169,7 +179,7 @@ def test_a_wrong_focal_length_comes_back(zoomed):
     lens = truth.cameras.intrinsics.clone()
     lens[..., [0, 1], [0, 1]] *= zoom[:, None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lens))
-    found = coherent_cameras(wrong)
+    found, _ = coherent_cameras(wrong)
     left = (found.intrinsics / truth.cameras.intrinsics)[0, :, 0, 0].log()
     assert left.abs().max() < 0.7 * zoom.log().abs().max()
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
