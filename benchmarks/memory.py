@@ -81,13 +81,12 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=140)
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--batch", type=int, default=1)
-    parser.add_argument("--only", choices=("prediction", "training"), help="measure one of the two")
     parser.add_argument("--json", action="store_true", help="one line for a program")
     options = parser.parse_args()
     if _AT_ONCE.items() - os.environ.items():
         sys.exit(subprocess.call([sys.executable, *sys.argv], env={**os.environ, **_AT_ONCE}))
     torch.set_num_threads(1)
-    for what in ("prediction", "training") if options.only is None else (options.only,):
+    for what in ("prediction", "training"):
         found = compare(options.overrides, options.size, options.views, options.batch, what == "training")
         if options.json:
             print(json.dumps({"what": what, **found}))

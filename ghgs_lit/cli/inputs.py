@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -12,7 +12,6 @@ from omegaconf import DictConfig, OmegaConf
 from ghgs_lit.config import build
 from ghgs_lit.config.ablation import ablation_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
-from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.model import GHGS, OPTIONS, STAGES
@@ -20,6 +19,9 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED
+
+if TYPE_CHECKING:  # it would import Lightning, which takes seconds
+    from ghgs_lit.data.datamodule import PhotographsDataModule
 
 #: Nodes of the configuration that describe the model; a checkpoint stores these.
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
@@ -42,7 +44,7 @@ FREE = (
 )
 
 
-def build_data(config: Mapping[str, Any]) -> PhotographsDataModule:
+def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
     """The configured data with its view and target protocols."""
     # Cameras are targets that every data set could have; a verb without targets reads none.
     targets = config.get("targets") or CAMERAS
@@ -63,7 +65,7 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
     return renderer
 
 
-def check_size(data: PhotographsDataModule, model: GHGS) -> None:
+def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     """Refuse photographs that ``model`` cannot take, before any of them is made or read.
 
     Raises:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -26,7 +26,6 @@ from ghgs_lit.cli.photographs import capture_folder, fixed_camera, require_consi
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
-from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.export import output_options, write_prediction
 from ghgs_lit.export.video import write_mp4
@@ -37,9 +36,12 @@ from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
+if TYPE_CHECKING:  # it would import Lightning, which takes seconds
+    from ghgs_lit.data.datamodule import PhotographsDataModule
+
 
 def subject_batch(
-    data: PhotographsDataModule, subject: str | int, split: str, targets: dict[str, Any] | None
+    data: "PhotographsDataModule", subject: str | int, split: str, targets: dict[str, Any] | None
 ) -> Batch:
     """The photographs of one subject.
 

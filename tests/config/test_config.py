@@ -8,18 +8,15 @@ import torch
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli.main import VERBS
-from ghgs_lit.config import build, compose, conf_dir
+from ghgs_lit.config import build, conf_dir
 from ghgs_lit.config.ablation import ablation_of, switches_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
+from tests.helpers.configs import composed
 
 CONF = conf_dir()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
 MEMBERS = [(group, path.stem) for group in GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
-
-
-def composed(verb: str, *overrides: str):
-    return compose(verb, overrides)
 
 
 def nodes_with_target(node, key=""):

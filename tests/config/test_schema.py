@@ -11,6 +11,7 @@ from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.schema import KINDS, check, is_node, kind_of
 from ghgs_lit.errors import InputError
+from tests.helpers.configs import composed
 
 GROUPS = sorted(path.name for path in conf_dir().iterdir() if path.is_dir() and path.name != "hydra")
 OPTIONS = [(g, path.stem) for g in GROUPS for path in sorted((conf_dir() / g).glob("*.yaml"))]
@@ -26,7 +27,7 @@ def nested(key, value):
 @functools.cache
 def leaves(verb, *overrides):
     """The values of a composed configuration by dotted key; what the user must give is left out."""
-    plain = OmegaConf.to_container(compose(verb, overrides), resolve=True)
+    plain = OmegaConf.to_container(composed(verb, *overrides), resolve=True)
     return {key: value for key, value in flatten(plain).items() if value != "???"}
 
 
