@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, run_block
+from ghgs_lit.encoder.block import Block, draw_normal_, run_block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables
 from ghgs_lit.errors import require
@@ -68,8 +68,8 @@ class Aggregator(nn.Module):
         self.special = 1 + registers
         self.head_width = width // heads
         self.patch_embed = patch_embed
-        self.camera_token = nn.Parameter(torch.empty(1, 2, 1, width).normal_(std=1e-6))
-        self.register_token = nn.Parameter(torch.empty(1, 2, registers, width).normal_(std=1e-6))
+        self.camera_token = nn.Parameter(draw_normal_(torch.empty(1, 2, 1, width), 1e-6))
+        self.register_token = nn.Parameter(draw_normal_(torch.empty(1, 2, registers, width), 1e-6))
 
         def blocks() -> nn.ModuleList:
             return nn.ModuleList(

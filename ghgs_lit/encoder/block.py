@@ -17,6 +17,11 @@ from ghgs_lit.kernels.parts import even_parts
 _HIDDEN = 1 << 23
 
 
+def draw_normal_(values: Tensor, std: float) -> Tensor:
+    """Draw ``values`` in place. The meta device has none, and PyTorch would import its compiler there."""
+    return values if values.is_meta else values.normal_(std=std)
+
+
 class LayerScale(nn.Module):
     """Adds a branch to the residual stream, scaled by a learned ``gamma`` for each channel."""
 

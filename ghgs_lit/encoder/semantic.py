@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, run_block
+from ghgs_lit.encoder.block import Block, draw_normal_, run_block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem
 from ghgs_lit.encoder.rope import rotary_tables
@@ -51,7 +51,7 @@ class SemanticBranch(nn.Module):
         require(width % (4 * heads) == 0, "encoder.semantic.width", expected, width)
         self.patch_size, self.parts, self.head_width = patch_size, parts, width // heads
         self.stem = ConvStem(4, width, patch_size, channels)
-        self.token = nn.Parameter(torch.empty(1, 1, width).normal_(std=0.02))
+        self.token = nn.Parameter(draw_normal_(torch.empty(1, 1, width), 0.02))
         self.blocks = nn.ModuleList(
             Block(width, heads, qk_norm=True, norm_eps=NORM_EPS, layer_scale=0.1) for _ in range(depth)
         )

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, run_block
+from ghgs_lit.encoder.block import Block, draw_normal_, run_block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import PatchEmbed
 from ghgs_lit.errors import require
@@ -60,7 +60,7 @@ class VisionTransformer(nn.Module):
 
     def reset_parameters(self) -> None:
         for token in (self.cls_token, self.register_tokens):
-            nn.init.normal_(token, std=1e-6)
+            draw_normal_(token.detach(), 1e-6)
         nn.init.trunc_normal_(self.pos_embed, std=0.02)
         for module in self.modules():
             if isinstance(module, nn.Linear):

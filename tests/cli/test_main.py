@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.cli import main as cli
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import compose, conf_dir
+from tests.helpers.processes import run_python
 
 
 def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
@@ -110,6 +111,14 @@ def test_a_reader_that_closes_the_pipe_gets_no_traceback():
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0) as process:
         process.stdout.close()
         assert (process.stderr.read(), process.wait()) == (b"", 141)
+
+
+def test_a_prediction_does_not_wait_for_what_training_needs():
+    """Lightning, torchmetrics and PyTorch's compiler take seconds to import."""
+    code = "import sys, ghgs_lit.cli.predict, ghgs_lit; ghgs_lit.GHGS.from_checkpoint(); print(*sys.modules)"
+    loaded = set(run_python(code).stdout.split())
+    assert {"torch", "ghgs_lit.refinement"} <= loaded
+    assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded
 
 
 def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
