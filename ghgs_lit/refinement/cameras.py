@@ -41,9 +41,9 @@ _STAY = 4.0
 #: With exact cameras it is up to 0.01, 0.02 from above; with cameras that are off by a pixel 0.02 to 0.2.
 #: The first also holds for cameras that silhouettes propose.
 _FIRST, _LATER = 0.02, 0.01
-#: Cameras whose rays pass beside silhouettes by less than this many pixels are exact, or off by half a pixel:
-#: they must agree better by another part to be moved.
-_EXACT, _DOUBTED = 1.5e-4, 0.05
+#: From so many cameras on, those whose rays pass beside silhouettes by less than so many pixels are exact, or
+#: off by half a pixel (fewer silhouettes tell less), and must agree better by another part to be moved.
+_TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,8 @@ class CameraRefinement:
     def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Float[Tensor, " B"]]:
         """Elements with coherent silhouettes, which agree better for it, and what a first round must gain."""
         cameras, distance = coherent_cameras(batch)
-        first = torch.where(distance < _EXACT, _DOUBTED, _FIRST)
+        are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
+        first = torch.where(are_right, _DOUBTED, _FIRST)
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
             return batch, moved, first
