@@ -7,6 +7,7 @@ steps make small. This needs no model and no surface that two photographs share.
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import torch
@@ -134,7 +135,7 @@ def coherent_cameras(batch: Batch) -> tuple[Cameras, Float[Tensor, " B"]]:
 
     Also returned is how far rays near outlines pass beside other silhouettes, in pixels on average, with the
     given cameras: 0 to 0.00014 with exact cameras and mattes, 0.0001 to 0.0004 with four cameras that are off
-    by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three.
+    by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three; infinite where no silhouette has an outline.
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
@@ -158,6 +159,8 @@ def _coherent(
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], float]:
     """Intrinsics and extrinsics of one element after all steps, and the mean distance with the given ones."""
     outlines, given, first = _Outlines.of(mattes), (lens, pose), None
+    if not len(outlines.own):
+        return *given, math.inf
     for phase in _PHASES:
         for _ in range(phase.steps):
             *found, distance = _step(outlines, lens, pose, phase)

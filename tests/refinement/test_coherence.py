@@ -105,10 +105,14 @@ def test_half_precision_of_others_changes_nothing():
     assert torch.equal(found.extrinsics, coherent_cameras(wrong)[0].extrinsics)
 
 
-def test_no_silhouette_at_all_moves_nothing():
+@pytest.mark.parametrize("matte", [0, 1])
+def test_no_outline_at_all_moves_nothing_and_says_nothing(matte):
+    """Photographs without masks must not pass for silhouettes that agree."""
     truth = figure()
-    nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha)
-    assert torch.equal(coherent_cameras(nothing)[0].extrinsics, truth.cameras.extrinsics)
+    nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha + matte)
+    found, distances = coherent_cameras(nothing)
+    assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
+    assert distances.isposinf().all()
 
 
 @pytest.mark.parametrize("mask", [torch.zeros(126, 126), torch.ones(126, 126)])
