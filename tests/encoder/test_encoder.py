@@ -206,6 +206,23 @@ def test_weights_can_be_assigned_to_a_model_without_storage():
     assert torch.equal(empty(images, masks).latent[1], encoder(images, masks).latent[1])
 
 
+@pytest.mark.parametrize(
+    "vit", [SMALL["vit"], {"kind": "dinov2", "depth": 1, "heads": 2}], ids=["stem", "dinov2"]
+)
+def test_special_tokens_are_drawn_near_zero(vit):
+    """As published, and the semantic branch's token as wide as the weights of its blocks."""
+    semantic = {"width": 32, "depth": 1, "heads": 2, "channels": 8, "parts": 5}
+    torch.manual_seed(0)
+    encoder = VGGTEncoder(**{**SMALL, "vit": vit, "semantic": semantic})
+    tokens = {
+        name: p for name, p in encoder.named_parameters() if "token" in name and "mask_token" not in name
+    }
+    assert len(tokens) == (5 if vit["kind"] == "dinov2" else 3)
+    for name, token in tokens.items():
+        std = 0.02 if "semantic" in name else 1e-6
+        assert 0.5 * std < token.std() < 1.5 * std, name
+
+
 def test_normalisation_is_no_part_of_a_checkpoint():
     """Published weights have no such tensors."""
     assert all(key.startswith("aggregator.") for key in _encoder().state_dict())

@@ -90,11 +90,12 @@ def test_distances_tell_exact_cameras_from_others():
 def test_elements_are_corrected_as_if_alone():
     truth = figure(batch=2)
     wrong = off(truth, 2.0, (0, 5))
-    together = coherent_cameras(wrong)[0].extrinsics
+    together, _ = coherent_cameras(wrong)
     for b in range(2):
         parts = (wrong.images[[b]], wrong.masks[[b]], wrong.cameras[[b]])
         alone, _ = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
-        torch.testing.assert_close(alone.extrinsics[0], together[b], rtol=0, atol=1e-6)
+        torch.testing.assert_close(alone.extrinsics[0], together.extrinsics[b], rtol=0, atol=1e-6)
+        torch.testing.assert_close(alone.intrinsics[0], together.intrinsics[b], rtol=0, atol=1e-4)
 
 
 def test_half_precision_of_others_changes_nothing():
