@@ -19,8 +19,6 @@ from typing import Any
 import torch
 
 from ghgs_lit import GHGS
-from ghgs_lit.capture.capture import Capture, Photograph
-from ghgs_lit.capture.predict import trained_size
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
 from ghgs_lit.cli.methods import baselines_of
 from ghgs_lit.config import build, compose, resolve
@@ -32,7 +30,9 @@ from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.refinement import CameraRefinement
+from ghgs_lit.predict.capture.capture import Capture, Photograph
+from ghgs_lit.predict.capture.predict import trained_size
+from ghgs_lit.predict.refinement import CameraRefinement
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint
 

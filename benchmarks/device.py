@@ -20,9 +20,9 @@ from torch import nn
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from ghgs_lit.benchmark.scene import ellipsoid_batch
-from ghgs_lit.benchmark.stages import OTHER, TOTAL, top_level, watched
 from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
 from ghgs_lit.losses import Losses
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import Optimization
@@ -33,7 +33,7 @@ Counts = dict[str, tuple[int, int, int]]
 
 
 class CountingProbe:
-    """Calls and waits of each stage (a probe of ``ghgs_lit.benchmark.stages``)."""
+    """Calls and waits of each stage (a probe of ``ghgs_lit.diagnostics.benchmark.stages``)."""
 
     def __init__(self, log: Log):
         self.log = log

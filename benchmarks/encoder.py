@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 
 from ghgs_lit import encoder, recalibration
-from ghgs_lit.benchmark.weights import random_model
 from ghgs_lit.config import compose
+from ghgs_lit.diagnostics.benchmark.weights import random_model
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS, STAGES

@@ -17,12 +17,12 @@ from rich.progress import Progress
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from literal import write_out
 
-from ghgs_lit.benchmark.machine import in_words, machine_facts
-from ghgs_lit.benchmark.measure import Job, inspect, time_jobs
-from ghgs_lit.benchmark.presets import Case, Source, cases_of, presets_of, readers_of_skip
-from ghgs_lit.benchmark.stages import TOTAL, top_level
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
+from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
+from ghgs_lit.diagnostics.benchmark.measure import Job, inspect, time_jobs
+from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of, presets_of, readers_of_skip
+from ghgs_lit.diagnostics.benchmark.stages import TOTAL, top_level
 from ghgs_lit.types import Batch
 
 

@@ -14,12 +14,12 @@ import sys
 
 import torch
 
-from ghgs_lit.benchmark.memory import PeakProbe
-from ghgs_lit.benchmark.scene import ellipsoid_batch
-from ghgs_lit.benchmark.stages import TOTAL
-from ghgs_lit.benchmark.weights import random_model
 from ghgs_lit.config import build, compose, resolve
-from ghgs_lit.doctor.estimate import Scene, estimate_prediction, estimate_training
+from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
+from ghgs_lit.diagnostics.benchmark.stages import TOTAL
+from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.doctor.estimate import Scene, estimate_prediction, estimate_training
 from ghgs_lit.model import GHGS
 
 #: Blocks above this size go back to the system when they are freed.

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from ghgs_lit.benchmark.memory import memory_bytes, reset_peak, return_free_memory
+from ghgs_lit.diagnostics.benchmark.memory import memory_bytes, reset_peak, return_free_memory
 
 
 @dataclass

@@ -4,9 +4,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ghgs_lit.capture.capture import Capture
-    from ghgs_lit.capture.predict import predict
     from ghgs_lit.model import GHGS
+    from ghgs_lit.predict.capture.capture import Capture
+    from ghgs_lit.predict.capture.predict import predict
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Cameras, Gaussians
 
@@ -14,9 +14,9 @@ _MODULES = {
     "GHGS": "ghgs_lit.model",
     "Batch": "ghgs_lit.types",
     "Cameras": "ghgs_lit.types",
-    "Capture": "ghgs_lit.capture.capture",
+    "Capture": "ghgs_lit.predict.capture.capture",
     "Gaussians": "ghgs_lit.types",
-    "predict": "ghgs_lit.capture.predict",
+    "predict": "ghgs_lit.predict.capture.predict",
     "render": "ghgs_lit.rendering",
 }
 __all__ = ["GHGS", "Batch", "Cameras", "Capture", "Gaussians", "predict", "render"]

@@ -3,7 +3,7 @@
     python scripts/bake_matting.py --out runs/matting
 
 People are rendered on first use (240 for the network in the package). An interrupted run goes on where its
-last checkpoint was. Writes ``ghgs_lit/matting/weights.safetensors`` at the end, in half precision.
+last checkpoint was. Writes ``ghgs_lit/data/matting/weights.safetensors`` at the end, in half precision.
 """
 
 import argparse
@@ -24,9 +24,9 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds, imperfect_mask
+from ghgs_lit.data.matting.mattes import WEIGHTS
+from ghgs_lit.data.matting.network import MattingNetwork
 from ghgs_lit.files import write_atomically
-from ghgs_lit.matting.mattes import WEIGHTS
-from ghgs_lit.matting.network import MattingNetwork
 
 _CROP = 160
 #: Height or width of the subject in pixels; how much photographs are enlarged for it at most.

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ghgs_lit.benchmark.flops import FlopsProbe
+from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.skipping import encoder_products

@@ -12,20 +12,28 @@ import torch
 from omegaconf import DictConfig
 from rich.progress import Progress
 
-from ghgs_lit.benchmark import report, scaling
-from ghgs_lit.benchmark.board import write_board
-from ghgs_lit.benchmark.machine import in_words, machine_facts
-from ghgs_lit.benchmark.measure import record_cases, threads
-from ghgs_lit.benchmark.page import to_page
-from ghgs_lit.benchmark.peers import tables_of as tables_of_peers
-from ghgs_lit.benchmark.plot import draw_presets, draw_scaling, save_png
-from ghgs_lit.benchmark.presets import KNOBS, YARDSTICK, Case, Source, cases_of, presets_of, readers_of_skip
 from ghgs_lit.cli.benchmark_peers import peers
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.config.settings import from_config
+from ghgs_lit.diagnostics.benchmark import report, scaling
+from ghgs_lit.diagnostics.benchmark.board import write_board
+from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
+from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
+from ghgs_lit.diagnostics.benchmark.page import to_page
+from ghgs_lit.diagnostics.benchmark.peers import tables_of as tables_of_peers
+from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling, save_png
+from ghgs_lit.diagnostics.benchmark.presets import (
+    KNOBS,
+    YARDSTICK,
+    Case,
+    Source,
+    cases_of,
+    presets_of,
+    readers_of_skip,
+)
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.files import write_text_atomically

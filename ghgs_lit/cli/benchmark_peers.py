@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.benchmark.peers import measure_peers, peer_rows
 from ghgs_lit.cli.inputs import build_data, check_size, model_of
 from ghgs_lit.cli.methods import baselines_of, trained_method
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
+from ghgs_lit.diagnostics.benchmark.peers import measure_peers, peer_rows
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.journal import Journal

@@ -12,13 +12,20 @@ from rich.filesize import decimal
 from rich.markup import escape
 from rich.table import Table
 
-from ghgs_lit.benchmark.stages import RENDER, TOTAL
 from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
-from ghgs_lit.doctor.estimate import BACKWARD, LOSS, Pass, Scene, estimate_prediction, estimate_training
-from ghgs_lit.doctor.machine import machine_lines, memory_of_host, missing_extras
-from ghgs_lit.doctor.needs import needs
+from ghgs_lit.diagnostics.benchmark.stages import RENDER, TOTAL
+from ghgs_lit.diagnostics.doctor.estimate import (
+    BACKWARD,
+    LOSS,
+    Pass,
+    Scene,
+    estimate_prediction,
+    estimate_training,
+)
+from ghgs_lit.diagnostics.doctor.machine import machine_lines, memory_of_host, missing_extras
+from ghgs_lit.diagnostics.doctor.needs import needs
 from ghgs_lit.model import STAGES
 
 #: Of the products, by ``trainer.precision``.

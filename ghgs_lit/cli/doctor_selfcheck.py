@@ -5,8 +5,8 @@ from omegaconf import DictConfig
 from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.config import resolve
-from ghgs_lit.doctor.machine import machine_lines
-from ghgs_lit.doctor.selfcheck import FAILED, selfcheck, table
+from ghgs_lit.diagnostics.doctor.machine import machine_lines
+from ghgs_lit.diagnostics.doctor.selfcheck import FAILED, selfcheck, table
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_text_atomically
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import torch
 
-from ghgs_lit.capture.capture import Capture
-from ghgs_lit.capture.doctor import Diagnosis
-from ghgs_lit.capture.folder import CaptureFolder
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.predict.capture.capture import Capture
+from ghgs_lit.predict.capture.doctor import Diagnosis
+from ghgs_lit.predict.capture.folder import CaptureFolder
 from ghgs_lit.types import Cameras
 
 #: Longer side of the pictures of a video of instants, in pixels.

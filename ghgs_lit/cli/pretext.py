@@ -13,10 +13,10 @@ from ghgs_lit.cli.train import build_trainer, fit, quiet, resume_step, run_job
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder.semantic import SemanticBranch
 from ghgs_lit.errors import require
-from ghgs_lit.pretext.module import Pretext, PretextModule
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import loggers
 from ghgs_lit.training.interruption import StopAtStep
+from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 
 def run(cfg: DictConfig) -> float | str | None:

@@ -8,9 +8,9 @@ from rich.table import Table
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.diagnostics.stress import report
+from ghgs_lit.diagnostics.stress.run import processes, run_tasks, tasks_of
 from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.stress import report
-from ghgs_lit.stress.run import processes, run_tasks, tasks_of
 from ghgs_lit.training.replay import replay
 
 

@@ -8,10 +8,10 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.console import Console
 
-from ghgs_lit import tables as t
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.terminal import print_uncut
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ghgs_lit.config.settings import image_size, set_fields
 from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.errors import require
-from ghgs_lit.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
 
 # Streams of random numbers beside those of ghgs_lit.data.sampling.
@@ -40,7 +40,7 @@ class Augmentation:
         background: share of the samples with such masks that were taken before :func:`backgrounds`, which a
             mask that is too large shows; behind the others it is black.
         refined: share of the samples before a background whose masks were refined
-            (:func:`ghgs_lit.matting.refined_matte`), as a capture's are with ``refine_masks``.
+            (:func:`ghgs_lit.data.matting.refined_matte`), as a capture's are with ``refine_masks``.
         calibration: in pixels, as for :func:`miscalibrated`. Targets keep their true cameras, depth maps the
             z-depths in the true cameras: the loss on depth asks for the distance of the surface, not for one
             that makes up for the error of a camera.

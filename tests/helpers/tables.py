@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from ghgs_lit import tables as t
+from ghgs_lit.evaluation import tables as t
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import write_results
 

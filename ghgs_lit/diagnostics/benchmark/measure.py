@@ -1,0 +1,218 @@
+"""The measurement: what a case computes and predicts, and how long each stage takes."""
+
+import statistics
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from ghgs_lit.diagnostics.benchmark.error import differences
+from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
+from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
+from ghgs_lit.diagnostics.benchmark.presets import Case
+from ghgs_lit.diagnostics.benchmark.stages import SecondsProbe, forward
+from ghgs_lit.evaluation.measure import Estimate, measure
+from ghgs_lit.metrics import ImageMetrics
+from ghgs_lit.predict.export.ply import write_ply
+from ghgs_lit.runs.results import Row
+from ghgs_lit.types import Batch, Prediction, Rendering
+
+#: Called after each forward pass with the name of what ran.
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds of a stage: median and quartiles of the rounds."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, seconds: Sequence[float]) -> "Times":
+        if len(seconds) == 1:
+            return cls(seconds[0], seconds[0], seconds[0])
+        low, _, high = statistics.quantiles(seconds, n=4, method="inclusive")
+        return cls(statistics.median(seconds), low, high)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is timed as one: a case on batches, by a number of threads (None: those there are)."""
+
+    case: Case
+    batches: Sequence[Batch]
+    threads: int | None = None
+
+
+@dataclass
+class Work:
+    """What a forward pass of a batch needs: FLOPs (None: not counted) and peak bytes by stage, and numbers
+    of tokens, points, Gaussians and bytes of the PLY."""
+
+    flops: dict[str, float] | None
+    peaks: dict[str, int]
+    counts: dict[str, float]
+
+    @classmethod
+    def of(cls, works: Sequence["Work"]) -> "Work":
+        """Of several batches: the mean, and the largest peak."""
+
+        def mean(dicts: Sequence[dict[str, float]]) -> dict[str, float]:
+            return {name: statistics.fmean(found[name] for found in dicts) for name in dicts[0]}
+
+        flops = None if works[0].flops is None else mean([work.flops for work in works])
+        peaks = {name: max(work.peaks[name] for work in works) for name in works[0].peaks}
+        return cls(flops, peaks, mean([work.counts for work in works]))
+
+
+@dataclass
+class Record:
+    """All that is known about a case; ``differences`` are the largest of all batches."""
+
+    case: Case
+    times: dict[str, Times]
+    work: Work
+    differences: dict[str, float] = field(default_factory=dict)
+    metrics: list[Row] = field(default_factory=list)
+
+
+def order(turn: int, count: int) -> list[int]:
+    """The order of ``count`` jobs in a round: each round begins one job later, so that every job has every
+    neighbour and drift of the machine hits all alike."""
+    return [(turn + number) % count for number in range(count)]
+
+
+def time_jobs(
+    jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device, progress: Progress
+) -> list[dict[str, Times]]:
+    """Time jobs in interleaved rounds.
+
+    Args:
+        jobs: what is timed.
+        warmup: rounds that do not count.
+        repeats: rounds that count, at least 1.
+        device: where the models are.
+        progress: called after each job.
+
+    Returns:
+        For each job the seconds of each stage, means over its batches.
+    """
+    seconds: list[dict[str, list[float]]] = [{} for _ in jobs]
+    for turn in range(-warmup, repeats):
+        for number in order(turn, len(jobs)):
+            job = jobs[number]
+            found: dict[str, float] = {}
+            with threads(job.threads):
+                for batch in job.batches:
+                    probe = SecondsProbe(device)
+                    forward(job.case.model, job.case.renderer, batch, probe)
+                    for stage, value in probe.seconds().items():
+                        found[stage] = found.get(stage, 0.0) + value / len(job.batches)
+            if turn >= 0:
+                for stage, value in found.items():
+                    seconds[number].setdefault(stage, []).append(value)
+            progress(job.case.label)
+    return [{stage: Times.of(values) for stage, values in own.items()} for own in seconds]
+
+
+@contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """PyTorch with ``count`` threads; None changes nothing."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def inspect(
+    case: Case, batch: Batch, device: torch.device, count_flops: bool
+) -> tuple[Work, Prediction, Rendering]:
+    """Predict a batch once for its FLOPs, where they are counted, and once for its memory."""
+    flops = None
+    if count_flops:
+        with FlopsProbe() as counted:
+            forward(case.model, case.renderer, batch, counted)
+        flops = counted.flops
+    memory = PeakProbe(device)
+    prediction, rendering = forward(case.model, case.renderer, batch, memory)
+    return Work(flops, memory.peaks, _counts(prediction)), prediction, rendering
+
+
+def _counts(prediction: Prediction) -> dict[str, float]:
+    gaussians = prediction.gaussians
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{element}.ply" for element in range(len(gaussians.splits))]
+        for element, path in enumerate(paths):
+            write_ply(gaussians[element], path)
+        size = sum(path.stat().st_size for path in paths)
+    return {
+        "tokens": prediction.points.tokens.shape[0],
+        "points": int(prediction.points.valid.sum()),
+        "gaussians": len(gaussians),
+        "ply_bytes": size,
+    }
+
+
+def record_cases(
+    cases: Sequence[Case],
+    batches: Sequence[Batch],
+    metrics: ImageMetrics,
+    device: torch.device,
+    warmup: int,
+    repeats: int,
+    count_flops: bool,
+    progress: Progress,
+) -> list[Record]:
+    """Measure work and error of cases on batches, then their times.
+
+    Args:
+        cases: of each source the yardstick first.
+        batches: on the device, with targets.
+        metrics: of the renders.
+        device: where the models are.
+        warmup, repeats: as for :func:`time_jobs`.
+        count_flops: whether FLOPs are counted, which takes one more forward pass.
+        progress: called after each forward pass but those for the FLOPs.
+    """
+    records = [Record(case, {}, Work(None, {}, {})) for case in cases]
+    works: list[list[Work]] = [[] for _ in cases]
+    for batch in batches:
+        for record, own in zip(records, works, strict=True):
+            work, *found = inspect(record.case, batch, device, count_flops)
+            if record.case.is_yardstick:
+                yardstick = found
+            own.append(work)
+            for name, value in differences(found, yardstick, batch.masks).items():
+                worst = min if name == "psnr_to_none" else max
+                record.differences[name] = worst(record.differences.get(name, value), value)
+            record.metrics += _metrics(record.case, batch, *found, metrics, device)
+            progress(record.case.label)
+    for record, own in zip(records, works, strict=True):
+        record.work = Work.of(own)
+    jobs = [Job(case, batches) for case in cases]
+    for record, times in zip(records, time_jobs(jobs, warmup, repeats, device, progress), strict=True):
+        record.times = times
+    return records
+
+
+def _metrics(
+    case: Case,
+    batch: Batch,
+    prediction: Prediction,
+    rendering: Rendering,
+    metrics: ImageMetrics,
+    device: torch.device,
+) -> list[Row]:
+    """The error against the truth, by the measurement of ``ghgs evaluate``; its time does not count."""
+    estimate = Estimate(
+        rendering.image, prediction.depth, prediction.depth_valid, decisions=prediction.decisions
+    )
+    rows = measure(lambda _: estimate, case.label, [batch], metrics, device)
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]

@@ -1,0 +1,81 @@
+"""Peak memory of stages: of the process on a CPU (Linux's own counters), of all tensors on CUDA."""
+
+import ctypes
+import os
+from pathlib import Path
+
+import torch
+
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def memory_bytes(field: str) -> int:
+    """``VmRSS`` (memory now) or ``VmHWM`` (peak since the last reset) of this process."""
+    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(field + ":"))
+    return int(line.split()[1]) * 1024
+
+
+def reset_peak() -> None:
+    """Reset ``VmHWM`` to the memory that is held now."""
+    _CLEAR.write_text("5")
+
+
+def return_free_memory() -> None:
+    """Give free memory that the C library keeps back to the system, where it can: it must not count."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+class PeakProbe:
+    """A probe (:mod:`ghgs_lit.diagnostics.benchmark.stages`) that finds the peak memory of each stage.
+
+    ``peaks`` are bytes in addition to what was held when the first stage began: weights and photographs do
+    not count. Stages may lie inside one another. On systems without Linux's counters there are no peaks.
+    """
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self.peaks: dict[str, int] = {}
+        self._open: list[str] = []
+        self._base = 0
+
+    def begin(self, stage: str) -> None:
+        if not self._available:
+            return
+        if self._open:
+            self._note()
+        else:
+            self._base = self._held()
+        self._reset()
+        self._open.append(stage)
+
+    def end(self, stage: str) -> None:
+        if self._available:
+            self._note()
+            self._open.pop()
+            self._reset()
+
+    @property
+    def _available(self) -> bool:
+        return self.device.type == "cuda" or os.access(_CLEAR, os.W_OK)
+
+    def _note(self) -> None:
+        """The peak since the last reset counts for all stages that are open."""
+        is_cuda = self.device.type == "cuda"
+        peak = torch.cuda.max_memory_allocated(self.device) if is_cuda else memory_bytes("VmHWM")
+        for stage in self._open:
+            self.peaks[stage] = max(self.peaks.get(stage, 0), peak - self._base)
+
+    def _held(self) -> int:
+        if self.device.type == "cuda":
+            return torch.cuda.memory_allocated(self.device)
+        return_free_memory()
+        return memory_bytes("VmRSS")
+
+    def _reset(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            return_free_memory()  # what an earlier stage freed is not this one's
+            reset_peak()

@@ -1,0 +1,220 @@
+"""What is compared: one model in every preset of ``conf/skip`` and with every value of the knobs."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from ghgs_lit.config import build
+from ghgs_lit.config.groups import read_option
+from ghgs_lit.config.keys import flatten, is_below
+from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.errors import require
+from ghgs_lit.evaluation.measure import Renderer
+from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.weights.checkpoint import read_checkpoint, require_fit
+
+#: The preset that all others are compared with.
+YARDSTICK = "none"
+#: Nodes of a configuration that a model is built from, beside ``skip``.
+MODEL_NODES = (*STAGES, "rounds", "model")
+#: What knobs can change.
+KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
+#: Rounds take normals from differences of depths and look photographs up where Gaussians are: one rounding of
+#: the photographs changes single attributes by 1e-3 of the largest one (trained weights, 1 to 3 rounds).
+ROUNDS_AMPLIFY = 1000
+
+
+@dataclass(frozen=True)
+class Source:
+    """Weights and the configuration that fits them.
+
+    Args:
+        name: ``model``, or ``vs`` for the second of two.
+        config: with :data:`MODEL_NODES`.
+        checkpoint: path of the weights; None: random ones.
+    """
+
+    name: str
+    config: Mapping[str, Any]
+    checkpoint: str | None
+
+    @classmethod
+    def of_checkpoint(cls, name: str, path: str) -> "Source":
+        """The model of a checkpoint.
+
+        Raises:
+            FileNotFoundError, InputError: as for :func:`read_checkpoint`.
+        """
+        return cls(name, read_checkpoint(path)["config"], path)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model that is measured.
+
+    Args:
+        source: name of its weights.
+        preset: name of the preset.
+        knobs: values that were changed, by key.
+        model: in evaluation mode, on its device.
+        renderer: of its Gaussians.
+        budget_db: PSNR that the preset may lose against the yardstick; None: nothing is promised.
+        max_rel_diff: difference of every attribute from the yardstick's that the preset may make, times
+            :data:`ROUNDS_AMPLIFY` where there are rounds; None: nothing is promised.
+        is_trained: whether its weights are a checkpoint's.
+    """
+
+    source: str
+    preset: str
+    knobs: Mapping[str, Any]
+    model: GHGS
+    renderer: Renderer
+    budget_db: float | None
+    max_rel_diff: float | None
+    is_trained: bool
+
+    @property
+    def label(self) -> str:
+        """A name that no other case has."""
+        changes = [f"{key}={value}" for key, value in self.knobs.items()]
+        return " ".join(["vs:"] * (self.source == "vs") + [self.preset, *changes])
+
+    @property
+    def is_yardstick(self) -> bool:
+        return self.preset == YARDSTICK and not self.knobs
+
+
+def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """The values of presets by name.
+
+    Args:
+        names: files of ``conf/skip``.
+        configured: the node ``skip`` of the run, whose values its own preset has, overrides included.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    return {
+        name: dict(configured) if name == configured["name"] else read_option("skip", name, "presets")
+        for name in names
+    }
+
+
+def readers_of_skip(cfg: DictConfig) -> dict[str, str]:
+    """Keys of the stages that follow the preset, with their interpolations of ``skip``.
+
+    A checkpoint has the values that they had in training; with these another preset can be set.
+    """
+    raw = OmegaConf.to_container(OmegaConf.masked_copy(cfg, list(MODEL_NODES)), resolve=False)
+    return {
+        key: value for key, value in flatten(raw).items() if isinstance(value, str) and "${skip." in value
+    }
+
+
+def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Every choice of one value for each knob.
+
+    Raises:
+        InputError: a knob that does not exist, or has no list of values.
+    """
+    for key, values in knobs.items():
+        require(is_below(key, KNOBS), f"knobs.{key}", f"a key of {', '.join(KNOBS)}", key)
+        is_list = isinstance(values, Sequence) and not isinstance(values, str)
+        require(is_list and bool(values), f"knobs.{key}", "a list with a value", values)
+    return [dict(zip(knobs, values, strict=True)) for values in itertools.product(*knobs.values())]
+
+
+def case_config(
+    source: Source,
+    skip: Mapping[str, Any],
+    readers: Mapping[str, str],
+    knobs: Mapping[str, Any],
+    shared: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The configuration of a case as plain data.
+
+    Args:
+        source: gives the model's nodes.
+        skip: the values of the preset.
+        readers: of :func:`readers_of_skip`.
+        knobs: values by key.
+        shared: nodes that all cases have (``renderer``, ``precision``).
+
+    Raises:
+        InputError: a knob that the configuration does not have.
+    """
+    own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
+    known = flatten(own)
+    node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
+    for key, text in readers.items():
+        if key in known:
+            OmegaConf.update(node, key, text)
+    for key, value in knobs.items():
+        if OmegaConf.select(node, key, default=None) is None:
+            require(key in flatten(OmegaConf.to_container(node)), f"knobs.{key}", "an existing key", key)
+        OmegaConf.update(node, key, value)
+    return OmegaConf.to_container(node, resolve=True)
+
+
+def cases_of(
+    source: Source,
+    presets: Mapping[str, Mapping[str, Any]],
+    readers: Mapping[str, str],
+    knobs: Mapping[str, Sequence[Any]],
+    shared: Mapping[str, Any],
+    device: torch.device,
+    seed: int = 0,
+) -> list[Case]:
+    """The cases of one source; they share one copy of the weights.
+
+    Args:
+        source, readers, shared: as for :func:`case_config`.
+        presets: of :func:`presets_of`; the yardstick comes first, without knobs, where it is among them.
+        knobs: values of each knob, by key; every preset is measured with every combination.
+        device: of the models.
+        seed: of random weights.
+
+    Raises:
+        InputError: a preset or knob that the model refuses, or to which the weights do not fit.
+    """
+    choices = [(name, change) for name in presets for change in combinations(knobs)]
+    if YARDSTICK in presets:
+        choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]
+    state: dict[str, Tensor] = {}
+    cases = []
+    for name, change in choices:
+        skip = presets[name]
+        config = case_config(source, skip, readers, change, shared)
+        model = _model(source, config, state, seed, device).to(device).eval()
+        state = state or model.state_dict()
+        model.precision = config["precision"]
+        # A preset's promise is about the preset alone.
+        budget_db, max_rel_diff = (None if change else skip.get(key) for key in ("budget_db", "max_rel_diff"))
+        renderer = build(config["renderer"], "renderer")
+        if max_rel_diff is not None and model.rounds is not None:
+            max_rel_diff *= ROUNDS_AMPLIFY
+        is_trained = source.checkpoint is not None
+        cases.append(Case(source.name, name, change, model, renderer, budget_db, max_rel_diff, is_trained))
+    return cases
+
+
+def _model(
+    source: Source, config: dict[str, Any], state: dict[str, Tensor], seed: int, device: torch.device
+) -> GHGS:
+    """A model with the tensors of ``state``; the first one, where there are none yet, gets its own."""
+    if not state and source.checkpoint is None:
+        return random_model(config, seed)
+    model = GHGS.from_config(config, empty=STAGES)
+    if not state:
+        model.load(source.checkpoint, device=device)
+        return model
+    require_fit(model, state, "knobs")
+    model.load_state_dict(state, assign=True)
+    if source.checkpoint is not None:
+        model.check_preset(read_checkpoint(source.checkpoint), source.checkpoint)
+    return model

@@ -1,0 +1,89 @@
+"""Facts of this machine, and what is missing for which optional feature."""
+
+import importlib.metadata
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from rich.filesize import decimal
+
+from ghgs_lit.diagnostics.benchmark.machine import machine_facts
+from ghgs_lit.rendering import gsplat_backend
+
+DISTRIBUTION = "ghgs-lit"
+#: Extras that no feature of a user needs.
+_WITHOUT_FEATURE = ("dev",)
+
+Line = tuple[str, str]
+
+
+def machine_lines(device: torch.device) -> list[Line]:
+    """What there is, as pairs of a name and its value.
+
+    Args:
+        device: the device that work would run on.
+    """
+    facts = machine_facts(device)
+    versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
+    total, available = memory_of_host()
+    return [
+        ("versions", ", ".join(f"{name} {_version(name) or 'none'}" for name in versions)),
+        ("platform", facts["platform"]),
+        ("processor", f"{facts['processor']}, vectors {facts['vectors']}"),
+        ("threads", f"{facts['threads']} of {facts['cores']} cores"),
+        ("memory", f"{decimal(available)} free of {decimal(total)}" if total else "not known here"),
+        *_gpus(),
+        ("renderer", _gsplat_state()),
+        ("compiled kernels", os.environ.get("NUMBA_CACHE_DIR") or "beside the package's sources"),
+    ]
+
+
+def memory_of_host() -> tuple[int, int]:
+    """All and the free memory in bytes; (0, 0) where the system does not say (only Linux does here)."""
+    path = Path("/proc/meminfo")
+    if not path.exists():
+        return 0, 0
+    found = dict(re.findall(r"^(\w+):\s+(\d+) kB", path.read_text(), re.MULTILINE))
+    return int(found.get("MemTotal", 0)) * 1024, int(found.get("MemAvailable", 0)) * 1024
+
+
+def missing_extras() -> Iterator[Line]:
+    """Each extra of the package that is not there as a whole, and the command that installs it."""
+    wanted: dict[str, list[str]] = {}
+    for requirement in importlib.metadata.requires(DISTRIBUTION) or []:
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
+        if extra and extra[1] not in _WITHOUT_FEATURE:
+            wanted.setdefault(extra[1], []).append(re.match(r"[\w.-]+", requirement)[0])
+    for extra, names in wanted.items():
+        absent = [name for name in names if _version(name) is None]
+        if absent:
+            yield extra, f"{', '.join(absent)} missing: pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _gpus() -> list[Line]:
+    if not torch.cuda.is_available():
+        return [("GPU", f"none that PyTorch can use (built for CUDA {torch.version.cuda})")]
+    found = []
+    for number in range(torch.cuda.device_count()):
+        free, total = torch.cuda.mem_get_info(number)
+        about = torch.cuda.get_device_properties(number)
+        text = f"{about.name}, {decimal(free)} free of {decimal(total)}, CUDA {torch.version.cuda}"
+        found.append((f"GPU {number}", text))
+    return found
+
+
+def _gsplat_state() -> str:
+    try:
+        gsplat_backend.load()
+    except gsplat_backend.BackendUnavailable as error:
+        return f"cpu ({error})"
+    return "gsplat"

@@ -1,0 +1,329 @@
+"""Bounds, projection, unprojection, token points, padding, photo-consistency, undistortion."""
+
+import torch
+from torch import Generator, Tensor
+
+from ghgs_lit.bounds import SubjectBox, VisualHull
+from ghgs_lit.bounds.rays import depths_in_box, ray_directions
+from ghgs_lit.diagnostics.stress import inputs
+from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.padding import pad_to_patches
+from ghgs_lit.geometry.photo_consistency import photo_consistency
+from ghgs_lit.geometry.projection import project, unproject, world_to_camera
+from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
+from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.undistortion import undistorting_grid
+from ghgs_lit.geometry.unprojection import subject_tokens
+from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps
+
+_SIZE = 12
+
+
+def _rig(family: str, g: Generator, views: int = 1, size: int = _SIZE) -> Values:
+    middle = inputs.place(family, g)
+    lenses, poses = inputs.cameras(family, g, views, size, middle)
+    return {"lenses": lenses, "poses": poses, "middle": middle}
+
+
+def cameras_of(values: Values, size: int = _SIZE) -> Cameras:
+    return Cameras(*inputs.matrices(values["lenses"], values["poses"]), size, size)
+
+
+def _project_inputs(family: str, g: Generator) -> Values:
+    rig = _rig(family, g)
+    return {**rig, "points": inputs.points(family, g, 16, rig["middle"], rig["poses"])}
+
+
+def _project(v: Values) -> Values:
+    """Camera coordinates of all points, pixels of those that lie clearly before the camera."""
+    intrinsics, extrinsics = inputs.matrices(v["lenses"], v["poses"])
+    pixels, z = project(v["points"], intrinsics, extrinsics)
+    camera = world_to_camera(v["points"], extrinsics)
+    return {"camera": camera, "pixels": torch.where(z[..., None] > 0, pixels, 0.0)}
+
+
+def _unproject_inputs(family: str, g: Generator) -> Values:
+    rig = _rig(family, g)
+    return {**rig, "pixels": inputs.uniform(g, 0, _SIZE, 16, 2), "depth": inputs.depths(family, g, 16)}
+
+
+def _unproject(v: Values) -> Values:
+    return {"points": unproject(v["pixels"], v["depth"], *inputs.matrices(v["lenses"], v["poses"]))}
+
+
+def _unproject_slowly(v: Values) -> Values:
+    """By the inverses of the matrices of the whole camera."""
+    homogeneous = torch.cat((v["pixels"], torch.ones_like(v["pixels"][..., :1])), -1)
+    intrinsics, _ = inputs.matrices(v["lenses"], v["poses"])
+    camera = torch.einsum("nvij,npj->npi", torch.linalg.inv(intrinsics), homogeneous)
+    centered = camera * v["depth"][..., None] - v["poses"][..., 3]
+    return {"points": torch.einsum("nvji,npj->npi", v["poses"][..., :3], centered)}
+
+
+def _rays_inputs(family: str, g: Generator) -> Values:
+    rig = _rig(family, g, size=4)
+    half = 0.7 * inputs.UNITS.get(family, 1.0)
+    half = half + inputs.uniform(g, 0, 0.1 * half, 3)
+    cameras = Cameras(*inputs.matrices(rig["lenses"], rig["poses"]), 4, 4)
+    inner, outer = (_hits(cameras, rig["middle"], half * share) for share in (0.9, 1.1))
+    return {**rig, "half": half, "clear": inner == outer}
+
+
+def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
+    """Which rays hit a box."""
+    directions, centers = ray_directions(cameras), cameras.centers[:, None, None]
+    faces = [(middle + sign * half - centers) / directions for sign in (-1, 1)]
+    return torch.minimum(*faces).amax(-1) < torch.maximum(*faces).amin(-1)
+
+
+def _rays(v: Values) -> Values:
+    """Rays, and where those meet the box that neither graze nor barely miss it: that is a decision."""
+    cameras = cameras_of(v, 4)
+    with torch.autocast("cpu", enabled=False):  # as in the stage
+        bounds = depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
+        near, far = (torch.where(v["clear"], x, 0.0) for x in (bounds.near, bounds.far))
+        return {"directions": ray_directions(cameras), "near": near, "far": far}
+
+
+def scene(family: str, g: Generator, views: int, size: int, target: bool = False) -> Values:
+    """Photographs, masks and true depths of a sphere of 0.5 units."""
+    rig = _rig(family, g, views + target, size)
+    unit = inputs.UNITS.get(family, 1.0)
+    intrinsics, extrinsics = inputs.matrices(rig["lenses"], rig["poses"])
+    rows, columns = torch.meshgrid(*[torch.arange(size, dtype=torch.float64) + 0.5] * 2, indexing="ij")
+    pixels = torch.stack((columns, rows, torch.ones_like(rows)), -1)
+    rays = torch.einsum("vij,hwj->vhwi", torch.linalg.inv(intrinsics), pixels)
+    center = extrinsics[:, :3, :3] @ rig["middle"] + extrinsics[:, :3, 3]
+    a, b = rays.square().sum(-1), (rays * center[:, None, None]).sum(-1)
+    radius = 0.5 * unit
+    root = b * b - a * (center.square().sum(-1) - radius**2)[:, None, None]
+    depth = (b - root.clamp(min=0).sqrt()) / a
+    masks = inputs.spoiled(family, g, (root > 0)[:views])
+    images = inputs.images(family, g, views + target, 3, size, size)
+    images = images * (root > 0)[:, None]
+    found = {
+        "images": images[:views],
+        "masks": masks,
+        "lenses": rig["lenses"][:views],
+        "poses": rig["poses"][:views],
+        "truth": torch.where(root > 0, depth, 0.0)[:views],
+        "middle": rig["middle"],
+    }
+    if target:
+        same = family == "identical"
+        found |= {
+            "target": images[:1] if same else images[views:],
+            "target_lenses": rig["lenses"][views:],
+            "target_poses": rig["poses"][views:],
+        }
+    return found
+
+
+def batch_of(v: Values) -> Batch:
+    return Batch(v["images"], v["masks"], cameras_of(v, v["images"].shape[-1]))
+
+
+def _seen(family: str, g: Generator) -> Values:
+    """A scene whose subject is in every frame."""
+    return scene(family, g, 4, 24)
+
+
+def _bounds(stage: SubjectBox, v: Values) -> Values:
+    """Bounds of the subject's pixels as the model asks for them, in the subject's frame, whose limits are in
+    metres; and how far the true surface lies outside them."""
+    batch, masks = batch_of(v), v["masks"]
+    frame = Frame.of(batch)
+    found, metre = stage(frame.enter(batch)), frame.metre.to(v["truth"])[:, None, None, None]
+    found = DepthBounds(found.near * metre, found.far * metre)
+    outside = torch.relu(found.near - v["truth"]) + torch.relu(v["truth"] - found.far)
+    seen = masks & (v["truth"] > 0)
+    return {
+        "near": torch.where(masks, found.near, 0.0),
+        "far": torch.where(masks, found.far, 0.0),
+        "outside": torch.where(seen, outside, 0.0),
+    }
+
+
+def _bounds_slowly(v: Values) -> Values:
+    """In the double precision of its inputs; the true surface must lie inside."""
+    found = _bounds(VisualHull(dilation=0.02), v)
+    return {**found, "outside": torch.zeros_like(found["outside"])}
+
+
+def _cells(v: Values) -> Tensor:
+    """Bounds are decisions on a grid of cells: one cell of 1/20 of the subject's depth may differ."""
+    return torch.full((len(v["images"]),), 0.05 / (100 * torch.finfo(torch.float32).eps))
+
+
+def _frame_inputs(family: str, g: Generator) -> Values:
+    found = scene(family, g, 3, _SIZE)
+    return {**found, "points": inputs.normal(g, 16, 3)}
+
+
+def _frame(v: Values) -> Values:
+    """Cameras in the subject's frame, and points of the frame in the world."""
+    batch = batch_of(v)
+    frame = Frame.of(batch)
+    element = torch.arange(len(v["points"]))[:, None]
+    world = frame._to_world(v["points"], element, v["points"].dtype)
+    return {"extrinsics": frame.enter(batch).cameras.extrinsics, "world": world}
+
+
+def _sample_inputs(family: str, g: Generator) -> Values:
+    found = _project_inputs(family, g)
+    return {**found, "maps": inputs.images(family, g, 3, _SIZE, _SIZE)}
+
+
+def _places(v: Values) -> Tensor:
+    """Pixels of points, far outside where they are behind the camera."""
+    pixels, z = project(v["points"], *inputs.matrices(v["lenses"], v["poses"]))
+    return torch.where(z[..., None] > 0, pixels, 1e9)
+
+
+def _sample(v: Values) -> Values:
+    image = torch.arange(len(v["maps"]))[:, None].expand(v["points"].shape[:2])
+    return {"values": sample(v["maps"], image, _places(v))}
+
+
+def _sample_slowly(v: Values) -> Values:
+    """Every pixel times its share of the place."""
+    places = _places(v).clamp(-2, _SIZE + 2)
+    centers = torch.arange(_SIZE) + 0.5
+    across, down = (torch.relu(1 - (places[..., axis, None] - centers).abs()) for axis in (0, 1))
+    return {"values": torch.einsum("nph,npw,nchw->npc", down, across, v["maps"])}
+
+
+def _photo_inputs(family: str, g: Generator) -> Values:
+    found = scene(family, g, 3, 12)
+    depth = found["truth"]
+    return {**found, "near": depth - 0.2, "far": depth + 0.2}
+
+
+def _photo(v: Values) -> Values:
+    """What is left to full agreement: a share of 1, however small the agreement is."""
+    return {"disagreement": 1 - photo_consistency(batch_of(v), DepthBounds(v["near"], v["far"]), 3)}
+
+
+def _tokens_inputs(family: str, g: Generator) -> Values:
+    masks = inputs.spoiled(family, g, inputs.disc(_SIZE).expand(2, -1, -1))
+    depth = inputs.depths(family, g, 2, _SIZE, _SIZE)
+    return {"depth": depth, "far": depth + 0.3, "masks": masks}
+
+
+def _tokens(v: Values) -> Values:
+    maps = DepthMaps(v["depth"], v["masks"], torch.ones_like(v["depth"]))
+    pixels, depth, valid = subject_tokens(maps, 4)
+    bounds = relative_bounds(DepthBounds(v["depth"], v["far"]), v["masks"])
+    return {
+        "pixels": torch.where(valid[..., None], pixels, 0.0),
+        "depth": torch.where(valid, depth, 0.0),
+        "relative": relative_depth(v["depth"], v["masks"]),
+        "bounds": bounds,
+    }
+
+
+def _padding_inputs(family: str, g: Generator) -> Values:
+    return scene(family, g, 2, 18)
+
+
+def _padding(v: Values) -> Values:
+    """Maps that were padded and cut, and a point's pixel in the padded camera, moved back."""
+    padding = pad_to_patches(v["masks"], 4)
+    padded = padding.pad_batch(batch_of(v))
+    cameras, images = padded.cameras, padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
+    moved, _ = project(v["middle"][:, None].expand(-1, 2, -1), cameras.intrinsics, cameras.extrinsics)
+    corner = torch.tensor([padding.left, padding.top])
+    return {"images": images, "masks": padding.cut(padded.masks).to(images), "pixel": moved + corner}
+
+
+def _padding_slowly(v: Values) -> Values:
+    pixel, _ = project(v["middle"][:, None].expand(-1, 2, -1), *inputs.matrices(v["lenses"], v["poses"]))
+    return {"images": v["images"], "masks": v["masks"].to(v["images"]), "pixel": pixel}
+
+
+def _lens_inputs(family: str, g: Generator) -> Values:
+    distortion = inputs.uniform(g, -0.1, 0.1, 5)
+    return {"lens": _rig(family, g, size=16)["lenses"][0], "distortion": distortion}
+
+
+def _lens(v: Values) -> Values:
+    fx, fy, cx, cy = v["lens"].unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    matrices = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+    pairs = zip(matrices.numpy(), v["distortion"].numpy(), strict=True)
+    return {"grid": torch.cat([undistorting_grid(k, d, 16, 16) for k, d in pairs])}
+
+
+def _lens_slowly(v: Values) -> Values:
+    """OpenCV's model written out at the same knots."""
+    knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
+    rows, columns = torch.meshgrid(knots, knots, indexing="ij")
+    fx, fy, cx, cy = (value[:, None, None] for value in v["lens"].unbind(-1))
+    k1, k2, p1, p2, k3 = (v["distortion"][:, i, None, None] for i in range(5))
+    x, y = (columns - cx) / fx, (rows - cy) / fy
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    w = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    grid = 2 * torch.stack((u * fx + cx, w * fy + cy), 1) / 16 - 1
+    dense = torch.nn.functional.interpolate(grid, (16, 16), mode="bilinear", align_corners=True)
+    return {"grid": dense.permute(0, 2, 3, 1)}
+
+
+_OUTSIDE_FRAME = {"wide": "the subject is smaller than a pixel", "degenerate": "nothing is in the frame"}
+_HOLDS = "a sum of a few products a coordinate; each rounds once, and the inputs' rounding is in kappa"
+
+STAGES = (
+    Stage(
+        "projection", ("cameras", "points"), _project_inputs, _project, 20, _HOLDS,
+        gradients=("points", "lenses", "poses"), steady=("middle",),
+        silent="a point behind the camera has no pixel",
+    ),
+    Stage(
+        "unprojection", ("cameras", "depths"), _unproject_inputs, _unproject, 20, _HOLDS, _unproject_slowly,
+        gradients=("pixels", "depth", "lenses", "poses"), steady=("middle",),
+        silent="an infinite focal length is a ray along the axis; the model refuses it",
+    ),
+    Stage(
+        "rays and box", ("cameras",), _rays_inputs, _rays, 50,
+        "as projection, and a division by a component of the direction", silent="NaN loses every comparison",
+    ),
+    Stage(
+        "bounds and hull", ("cameras", "masks"), _seen, lambda v: _bounds(VisualHull(dilation=0.02), v), 100,
+        "decisions on a grid: one cell may differ (kappa), the true surface must be inside", _bounds_slowly,
+        steady=("truth", "middle", "images"), seeds=32, kappa=_cells, excluded=_OUTSIDE_FRAME,
+        silent="cameras that are not finite are refused before this stage",
+    ),
+    Stage(
+        "subject frame", ("cameras", "masks"), _frame_inputs, _frame, 20,
+        "all of it in float64, rounded once", gradients=("points",), steady=("truth", "middle", "images"),
+        excluded=_OUTSIDE_FRAME, silent="cameras that are not finite are refused before this stage",
+    ),
+    Stage(
+        "samples of maps", ("cameras", "points", "images"), _sample_inputs, _sample, 20,
+        "a mean of four pixels; their shares lose the digits of a pixel's place (kappa)", _sample_slowly,
+        steady=("middle",), seeds=64,
+        excluded={n: "its callers clean their maps" for n in ("nan", "inf")},
+    ),
+    Stage(
+        "photo-consistency", ("cameras", "images", "masks"), _photo_inputs, _photo, 100,
+        "exp of a colour difference over 0.1, of bilinear samples at a projected place",
+        steady=("truth", "middle"), seeds=64, silent="agreement of what cannot be compared is 0",
+    ),
+    Stage(
+        "token points", ("depths", "masks"), _tokens_inputs, _tokens, 50,
+        "means of 16 and of 144 values", gradients=("depth", "far"),
+        silent="relative depths are read inside the mask only",
+    ),
+    Stage(
+        "padding", ("cameras", "images", "masks"), _padding_inputs, _padding, 10,
+        "copies, and a principal point that moves by whole pixels", _padding_slowly,
+        gradients=("images",), steady=("truth", "poses"),
+    ),
+    Stage(
+        "undistortion", ("cameras",), _lens_inputs, _lens, 50,
+        "a polynomial of degree 7 and its division by the focal length", _lens_slowly,
+        dtypes=("float32", "bfloat16", "float16"), no_dtype="photographs are undistorted in float32",
+    ),
+)  # fmt: skip

@@ -1,0 +1,147 @@
+"""Dense heads, activations of depth and of the Gaussians' attributes, quaternions and covariances."""
+
+import copy
+
+import torch
+from torch import Generator
+
+from ghgs_lit.diagnostics.stress import inputs
+from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.depth import BOUNDED, bounded_depth
+from ghgs_lit.heads.dpt import DPTHead
+from ghgs_lit.heads.gaussian import FootprintAttributes
+from ghgs_lit.types import Tokens
+
+
+def _depth_inputs(family: str, g: Generator) -> Values:
+    near = inputs.depths("equal_depths" if family == "equal_depths" else "ordinary", g, 24)
+    unit_ = inputs.UNITS.get(family, 1.0)
+    return {
+        "raw": inputs.raw(family, g, 24),
+        "near": near * unit_,
+        "far": near * unit_ + inputs.uniform(g, 0.02, 1, 24) * unit_,
+        "confidence": inputs.raw(family, g, 24),
+    }
+
+
+def _depth(v: Values) -> Values:
+    found = {name: bounded_depth(v["raw"], v["near"], v["far"], name) for name in BOUNDED}
+    return {**found, "confidence": CONFIDENCES["expp1"](v["confidence"])}
+
+
+def _attribute_inputs(family: str, g: Generator) -> Values:
+    return {
+        "offset": inputs.raw(family, g, 16, 3),
+        "scale": inputs.raw(family, g, 16, 3),
+        "rotation": inputs.raw(family, g, 16, 4),
+        "opacity": inputs.raw(family, g, 16),
+        "footprint": inputs.depths(family, g, 16) / 500,
+    }
+
+
+_ATTRIBUTES = FootprintAttributes()
+
+
+def _attributes(v: Values) -> Values:
+    names = ("offset", "scale", "rotation", "opacity", "footprint")
+    found = _ATTRIBUTES(*(v[name].flatten(0, 1) for name in names))
+    shape = v["opacity"].shape
+    return {
+        name: value.unflatten(0, shape)
+        for name, value in zip(("offsets", "scales", "quaternions", "opacities"), found, strict=True)
+    }
+
+
+def _unit_inputs(family: str, g: Generator) -> Values:
+    return {"vectors": inputs.quaternions(family, g, 16)}
+
+
+def _covariance_inputs(family: str, g: Generator) -> Values:
+    return {"quaternions": inputs.quaternions(family, g, 16), "scales": inputs.scales(family, g, 16)}
+
+
+def _covariance(v: Values) -> Values:
+    rotation = quaternion_to_matrix(v["quaternions"])
+    root = rotation * v["scales"][..., None, :]
+    return {"rotation": rotation, "covariance": (root[..., :, None, :] * root[..., None, :, :]).sum(-1)}
+
+
+def _covariance_slowly(v: Values) -> Values:
+    """By products of the quaternion with the axes: q e conj(q)."""
+    q = v["quaternions"]
+    length = q.norm(dim=-1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=q.dtype)
+    q = torch.where(length > 0, q / torch.where(length > 0, length, 1.0), identity)
+    real, imaginary = q[..., None, :1], q[..., None, 1:].expand(*q.shape[:-1], 3, 3)
+    axes = torch.eye(3, dtype=q.dtype).expand_as(imaginary)
+    twice = 2 * torch.linalg.cross(imaginary, axes)
+    rotation = (axes + real * twice + torch.linalg.cross(imaginary, twice)).mT
+    squares = torch.diag_embed(v["scales"].square())
+    return {"rotation": rotation, "covariance": rotation @ squares @ rotation.mT}
+
+
+_GRID = (2, 3)
+
+
+def _dpt_inputs(family: str, g: Generator) -> Values:
+    count = _GRID[0] * _GRID[1]
+    return {f"layer{i}": inputs.features(family, g, count, 32) for i in range(4)}
+
+
+def _head() -> DPTHead:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(5)
+        return DPTHead(32, 8, (4, 8, 8, 8), 3).requires_grad_(False)
+
+
+_HEADS = {torch.float32: _head()}
+_HEADS[torch.float64] = copy.deepcopy(_HEADS[torch.float32]).double()
+
+
+def _dpt(v: Values) -> Values:
+    n, (h, w) = len(v["layer0"]), _GRID
+    image, row, column = (
+        axis.flatten()
+        for axis in torch.meshgrid(torch.arange(n), torch.arange(h), torch.arange(w), indexing="ij")
+    )
+    layers = tuple(v[f"layer{i}"].flatten(0, 1) for i in range(4))
+    tokens = Tokens(layers, layers[0], image, row, column, (n, 1, h, w), 4)
+    return {"maps": _HEADS[layers[0].dtype](tokens)}
+
+
+_BOUNDED = "a value between bounds is finite whatever the raw value"
+
+STAGES = (
+    Stage(
+        "depth activation", ("raw values", "cameras", "depths"), _depth_inputs, _depth, 50,
+        "a sigmoid and two divisions", gradients=("raw", "near", "far"), silent=_BOUNDED,
+        excluded={
+            **{name: "depths are the result" for name in
+               ("zero_depth", "negative_depth", "near_zero_depth", "huge_depth")},
+            **{name: "takes bounds, not cameras" for name in
+               ("shifted", "wide", "long", "skewed", "mirrored", "degenerate")},
+        },
+    ),
+    Stage(
+        "attributes", ("raw values", "depths"), _attribute_inputs, _attributes, 50,
+        "an exponential of a sigmoid whose exponent is at most 3.3",
+        gradients=("offset", "scale", "rotation", "opacity", "footprint"), silent=_BOUNDED,
+        excluded={"negative_depth": "footprints are of points before the camera"},
+    ),
+    Stage(
+        "unit vectors", ("quaternions",), _unit_inputs, lambda v: {"unit": unit(v["vectors"])}, 20,
+        "one square root and one division", gradients=("vectors",),
+    ),
+    Stage(
+        "quaternion and covariance", ("quaternions", "scales"), _covariance_inputs, _covariance, 50,
+        "products of four factors, sums of three", _covariance_slowly, gradients=("quaternions", "scales"),
+    ),
+    Stage(
+        "dense head", ("features",), _dpt_inputs, _dpt, 100,
+        "twenty convolutions in a row, each a sum of up to 72 products; tokens are normalised first",
+        gradients=tuple(f"layer{i}" for i in range(4)), seeds=64, network=True,
+    ),
+)  # fmt: skip

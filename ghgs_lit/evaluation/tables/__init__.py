@@ -1,0 +1,26 @@
+"""The paper's tables from directories of runs."""
+
+from ghgs_lit.evaluation.tables.assemble import TableOptions, build_tables
+from ghgs_lit.evaluation.tables.csv_format import to_csv
+from ghgs_lit.evaluation.tables.latex import PREAMBLE, to_latex
+from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Table, layout_named
+from ghgs_lit.evaluation.tables.markdown import to_markdown, to_terminal
+from ghgs_lit.evaluation.tables.others import read_others
+from ghgs_lit.evaluation.tables.records import read_sweep
+from ghgs_lit.evaluation.tables.significance import PairedTest
+
+__all__ = [
+    "LAYOUTS",
+    "PREAMBLE",
+    "PairedTest",
+    "Table",
+    "TableOptions",
+    "build_tables",
+    "layout_named",
+    "read_others",
+    "read_sweep",
+    "to_csv",
+    "to_latex",
+    "to_markdown",
+    "to_terminal",
+]

@@ -1,0 +1,203 @@
+"""Layouts of tables (the paper's four, and the ablation at every number of views) and their parts."""
+
+from dataclasses import dataclass, field
+
+from ghgs_lit.errors import choice
+from ghgs_lit.evaluation.tables.records import Planned, Record, Variant
+from ghgs_lit.evaluation.tables.significance import Comparison
+
+DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
+DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
+LOWER_IS_BETTER = ("lpips", "flip", "depth_error_mm", "prediction_seconds", "seconds", "peak_gb")
+NEITHER_IS_BETTER = ("gaussians", "steps")
+TITLES = {
+    "depth_error_mm": "Depth error (mm)",
+    "gaussians": "Gaussians",
+    "prediction_seconds": "Prediction (s)",
+    "steps": "Training steps",
+    "seconds": "Training (s)",
+    "peak_gb": "Training memory (GB)",
+}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Rows (``ablation``: all four combinations, or ``methods``) and groups of columns.
+
+    Args:
+        name: the layout's name.
+        rows: ``ablation`` or ``methods``.
+        columns: ``views`` or ``data``, one group for each.
+        views: numbers of input views.
+        heading: above each group of columns: its ``views``, its ``data`` or ``none``.
+        reported: the paper's table whose figures are shown beside the measured ones.
+    """
+
+    name: str
+    rows: str
+    columns: str
+    views: tuple[int, ...]
+    heading: str
+    reported: str | None = None
+
+
+LAYOUTS = {
+    "ablation": Layout("ablation", "ablation", "views", (3, 4, 5), "views"),
+    "table1": Layout("table1", "methods", "data", (4,), "data", "table1"),
+    "table2": Layout("table2", "methods", "views", (3, 4, 5), "views", "table2"),
+    "table3": Layout("table3", "methods", "views", (4,), "none", "table3"),
+    "table4": Layout("table4", "ablation", "views", (4,), "data", "table4"),
+}
+
+
+def layout_named(name: str) -> Layout:
+    """One of ``LAYOUTS``; another name is an InputError."""
+    choice("layout", name, tuple(LAYOUTS))
+    return LAYOUTS[name]
+
+
+def _stem(metric: str) -> str:
+    """The metric without its region: ``psnr`` of ``psnr_box``."""
+    return metric if metric in DECIMALS else metric.split("_")[0]
+
+
+def decimals(metric: str) -> int:
+    """Digits after the decimal point, as in the paper."""
+    return DECIMALS.get(_stem(metric), 4)
+
+
+def arrow(metric: str) -> str:
+    """Whether higher (↑) or lower (↓) is better; empty where neither is."""
+    stem = _stem(metric)
+    return "" if stem in NEITHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else "↑"
+
+
+def title(metric: str) -> str:
+    """``psnr_box`` as ``PSNR box``."""
+    stem, _, region = metric.partition("_")
+    return TITLES.get(metric) or f"{stem.upper()} {region}".strip()
+
+
+@dataclass(frozen=True)
+class Group:
+    """Columns below one heading: the metrics on ``data`` (None: the table's) with ``views`` input views."""
+
+    title: str
+    views: int
+    data: str | None = None
+
+
+Column = tuple[Group, str]
+
+
+@dataclass
+class Cell:
+    """One number of a table.
+
+    Attributes:
+        seeds: mean over subjects for each seed.
+        missing_seeds: seeds that other runs of the sweep have.
+        by_seed: values of each subject, one for each seed.
+        count: number of subjects, where it is known.
+        runs: hashes or paths of the runs.
+        best: whether it is the best of its column, as printed.
+        test: the comparison with the reference row.
+        marked: whether it differs from the reference row beyond chance.
+    """
+
+    seeds: dict[int, float] = field(default_factory=dict)
+    missing_seeds: tuple[int, ...] = ()
+    by_seed: dict[str, list[float]] = field(default_factory=dict)
+    count: int | None = None
+    runs: list[str] = field(default_factory=list)
+    best: bool = False
+    test: Comparison | None = None
+    marked: bool = False
+
+    @property
+    def mean(self) -> float:
+        """Mean over seeds."""
+        return sum(self.seeds.values()) / len(self.seeds)
+
+    @property
+    def subjects(self) -> dict[str, float]:
+        """Mean of each subject over the seeds."""
+        return {name: sum(values) / len(values) for name, values in self.by_seed.items()}
+
+
+@dataclass
+class Line:
+    """A row of a table: a variant, its texts in the first columns, its cells, and the text of others."""
+
+    variant: Variant
+    stub: tuple[str, ...]
+    cells: dict[Column, Cell] = field(default_factory=dict)
+    absent: str = "missing"
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it is a trained model of ours."""
+        return self.variant.kind == "model"
+
+    @property
+    def is_reported(self) -> bool:
+        """Whether its figures are those that the paper prints."""
+        return self.variant.kind == "reported"
+
+    @property
+    def competes(self) -> bool:
+        """Whether it can be best and is tested: no baseline, some of which know the truth."""
+        return self.variant.kind in ("model", "other")
+
+
+@dataclass
+class Table:
+    """One table: everything that a writer of a format needs.
+
+    Args:
+        layout: its layout.
+        records: what was measured.
+        planned: the training runs of the sweep, finished or not, that belong to it.
+        stub: headings of the first columns.
+        groups, metrics: the columns.
+        lines: the rows.
+        caption, notes: the texts around it.
+        reported_on: data of the reported figures, where it has any.
+    """
+
+    layout: Layout
+    records: list[Record]
+    planned: list[Planned]
+    stub: tuple[str, ...]
+    groups: list[Group]
+    metrics: list[str]
+    lines: list[Line]
+    caption: str = ""
+    notes: list[str] = field(default_factory=list)
+    reported_on: str | None = None
+
+    @property
+    def columns(self) -> list[Column]:
+        """Every metric in every group."""
+        return [(group, metric) for group in self.groups for metric in self.metrics]
+
+    @property
+    def ours(self) -> list[Line]:
+        """The rows of our models."""
+        return [line for line in self.lines if line.is_ours]
+
+    @property
+    def measured(self) -> list[Cell]:
+        """The cells that were measured, not reported."""
+        return [cell for line in self.lines if not line.is_reported for cell in line.cells.values()]
+
+    @property
+    def blocks(self) -> list[list[Line]]:
+        """Reported rows, then measured rows; a block without rows is left out."""
+        parts = [[line for line in self.lines if line.is_reported == reported] for reported in (True, False)]
+        return [part for part in parts if part]
+
+    def block_title(self, block: list[Line]) -> str:
+        """What stands above a block where a table has reported rows."""
+        reported = f"as reported on {self.reported_on}, not measured here"
+        return reported if block[0].is_reported else "measured here"

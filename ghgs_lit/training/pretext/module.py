@@ -1,0 +1,87 @@
+"""The LightningModule of the pretext stage."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torchmetrics import MeanMetric
+
+from ghgs_lit.encoder.packing import KeptPatches
+from ghgs_lit.encoder.semantic import SemanticBranch, features_of
+from ghgs_lit.errors import require
+from ghgs_lit.training.base import BudgetedModule
+from ghgs_lit.training.guard import DivergedError
+from ghgs_lit.training.optimization import Optimization
+from ghgs_lit.training.pretext.labels import part_shares
+from ghgs_lit.training.pretext.measure import neighbor_shows_part
+from ghgs_lit.training.pretext.parts import PARTS
+from ghgs_lit.types import Batch
+
+
+class Pretext(nn.Module):
+    """A branch under the name that it has in a model.
+
+    Raises:
+        InputError: it does not have a channel for each of :data:`PARTS`.
+    """
+
+    def __init__(self, branch: SemanticBranch):
+        super().__init__()
+        require(branch.parts == len(PARTS), "encoder.semantic.parts", str(len(PARTS)), branch.parts)
+        self.encoder = nn.ModuleDict({"semantic": branch})
+
+    def forward(self, batch: Batch) -> tuple[Float[Tensor, "N P"], Float[Tensor, "N P"], KeptPatches]:
+        """Logarithms of predicted shares, true shares, and the patches that have any of these."""
+        branch = self.encoder["semantic"]
+        kept = KeptPatches(branch.subject(batch.masks), batch.images.device)
+        shares = part_shares(batch, branch.patch_size)[kept.index]
+        return branch.log_shares(batch.images, batch.masks, kept), shares, kept
+
+
+def cross_entropy(log_shares: Float[Tensor, "N P"], shares: Float[Tensor, "N P"]) -> Tensor:
+    """Mean over the patches with a part; 0 without such a patch."""
+    return -(shares * log_shares).sum() / shares.any(1).sum().clamp_min(1)
+
+
+class PretextModule(BudgetedModule):
+    """Trains a semantic branch to tell parts of the body; arguments as of :class:`BudgetedModule`."""
+
+    def __init__(self, model: Pretext, optimization: Optimization, config: Mapping[str, Any]):
+        super().__init__(model, optimization, config)
+        self.part_accuracy = MeanMetric()
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        loss = cross_entropy(*self.model(batch)[:2])
+        self.clock.mark("loss")
+        size = len(batch.images)
+        self.log("loss/parts", loss.detach(), prog_bar=True, batch_size=size)
+        rate = self.optimizers().param_groups[0]["lr"]
+        self.log_dict({"train/learning_rate": rate, "train/budget": self.used_budget}, batch_size=size)
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        log_shares, shares, kept = self.model(batch)
+        features, part = features_of(log_shares), shares.argmax(1)
+        element = kept.image // batch.images.shape[1]
+        for b in range(len(batch.images)):
+            rows = shares.any(1) & (element == b)
+            shown = neighbor_shows_part(features[rows], part[rows], kept.image[rows])
+            if len(shown):
+                self.part_accuracy.update(shown.float())
+        size = len(batch.images)
+        self.log("val/part_accuracy", self.part_accuracy, prog_bar=True, on_epoch=True, batch_size=size)
+        self.log("val/parts", cross_entropy(log_shares, shares), on_epoch=True, batch_size=size)
+
+    def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
+        """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
+
+        Raises:
+            DivergedError: the norm is not finite.
+        """
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
+        if not norm.isfinite():
+            raise DivergedError(
+                f"step {self.global_step}: expected a finite gradient; found a norm of {norm}"
+            )
+        self.log("train/gradient_norm", norm)

@@ -1,0 +1,154 @@
+"""Mattes found in photographs whose masks are wrong."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, zoom
+
+from ghgs_lit import Capture
+from ghgs_lit.data.matting import refined_matte
+from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.predict.capture import capture
+from tests.helpers.figures import Figure
+
+HEIGHT, WIDTH = 216, 180
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A textured ellipse before a cloudy background: the photograph, its colours on black, its matte."""
+    rng = np.random.default_rng(3)
+    v, u = np.mgrid[: 4 * HEIGHT, : 4 * WIDTH] / 4
+    inside = ((u - 93) / 51) ** 2 + ((v - 105) / 81) ** 2 < 1
+    alpha = inside.reshape(HEIGHT, 4, WIDTH, 4).mean((1, 3))
+    subject, behind = (
+        0.5 * zoom(rng.uniform(size=(cells, cells, 3)), (HEIGHT / cells, WIDTH / cells, 1), order=1) + offset
+        for cells, offset in ((12, [0.3, 0.0, 0.1]), (6, [0.1, 0.4, 0.5]))
+    )
+    premultiplied = subject * alpha[..., None]
+    photograph = premultiplied + behind * (1 - alpha[..., None])
+    return tuple(
+        (255 * part.clip(0, 1)).round().astype(np.uint8) for part in (photograph, premultiplied, alpha)
+    )
+
+
+def masks_of(alpha):
+    """Wrong masks by name: off by up to 2.5 pixels, one with a hole 6 pixels wide."""
+    mask = alpha > 127
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    bumps = gaussian_filter(np.random.default_rng(1).standard_normal(mask.shape), 3)
+    distance = signed_distance(mask)
+    return {
+        "exact": mask,
+        "grown": distance > -2,
+        "shrunk": distance > 2,
+        "ragged": distance + 2.5 * bumps / np.abs(bumps).max() > 0,
+        "holed": mask & ((v - 90) ** 2 + (u - 90) ** 2 >= 9),
+    }
+
+
+def error(matte, alpha):
+    return np.abs(matte.astype(float) - alpha).sum() / alpha.sum()
+
+
+@pytest.mark.parametrize("name", ["exact", "grown", "shrunk", "ragged", "holed"])
+def test_the_photograph_mends_the_mask(scene, name):
+    """What is left is a small part of the mask's error, and no background is left in the colours."""
+    photograph, premultiplied, alpha = scene
+    mask = (255 * masks_of(alpha)[name]).astype(np.uint8)
+    subject, matte = refined_matte(photograph, mask, 4)
+    assert error(matte, alpha) < 0.4 * error(mask, alpha)
+    given = photograph * (mask[..., None] / 255)
+    assert error(subject, premultiplied) < 0.65 * error(given, premultiplied)
+    assert (subject[matte == 0] == 0).all()
+
+
+def test_far_from_the_outline_the_mask_decides(scene):
+    """A hole wider than twice the pixels stays open in its middle; nothing appears far away."""
+    photograph, _, alpha = scene
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    place = np.hypot(v - 105, u - 93)
+    mask = (255 * ((alpha > 127) & (place >= 9))).astype(np.uint8)
+    _, matte = refined_matte(photograph, mask, 4)
+    assert (matte[place < 4] == 0).all()
+    far = np.abs(signed_distance(mask > 0)) > 5.5
+    assert (matte[far] == mask[far]).all()
+
+
+def test_a_subject_that_the_border_cuts_stays_whole_there(scene):
+    """The border of the image is no outline."""
+    photograph, _, alpha = (part[:150, :120] for part in scene)
+    _, matte = refined_matte(photograph, np.where(alpha > 127, 255, 0).astype(np.uint8), 4)
+    assert (matte[-1][alpha[-1] == 255] > 240).all()
+    assert error(matte, alpha) < 0.02
+
+
+@pytest.mark.parametrize("value", [0, 255])
+@pytest.mark.parametrize("size", [(2, 2), (2, 7), (9, 9)])
+def test_masks_without_an_outline_stay(value, size):
+    image = np.random.default_rng(0).integers(0, 255, (*size, 3)).astype(np.uint8)
+    mask = np.full(size, value, np.uint8)
+    subject, matte = refined_matte(image, mask, 4)
+    assert (matte == mask).all()
+    assert np.abs(subject.astype(int) - image * (value // 255)).max() <= 3
+
+
+@pytest.mark.parametrize("height", [128, 512])
+def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, height):
+    """Or at that of the photograph where it is smaller; limits are in pixels of the crops."""
+    calls = []
+
+    def record(image, matte, pixels):
+        calls.append((image.shape[:2], matte.shape, pixels))
+        return image, matte
+
+    monkeypatch.setattr(capture, "refined_matte", record)
+    figure = Figure(height=height, width=height * 3 // 4)
+    taken = Capture.read(tmp_path, figure.write(tmp_path))
+    cut = [int(1 / capture._SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
+    taken.batch((112, 84), 4)
+    for (size, same, pixels), rows in zip(calls, cut, strict=True):
+        assert size == same
+        assert size[0] == pytest.approx(min(rows, 2 * 112), abs=2)
+        assert pixels == 4 * size[0] / 112
+
+
+def test_crops_of_wrong_masks_hold_the_subject_alone(tmp_path):
+    """Of photographs larger than the crops; cameras are those of the given masks."""
+    figure = Figure(height=256, width=192)
+    exact = Capture.read(tmp_path, figure.write(tmp_path))
+    grown = tuple(
+        dataclasses.replace(
+            one, matte=(255 * (np.abs(signed_distance(one.mask)) <= 3.5)).astype(np.uint8) | one.matte
+        )
+        for one in exact.photographs
+    )
+    wrong = dataclasses.replace(exact, photographs=grown)
+    right, given, refined = exact.batch((112, 84)), wrong.batch((112, 84)), wrong.batch((112, 84), 4)
+    assert (refined.images[0].movedim(1, -1)[refined.alpha[0] == 0] == 0).all()
+    assert (refined.cameras.intrinsics == given.cameras.intrinsics).all()
+    assert refined.alpha.sum() < given.alpha.sum() - 0.6 * (given.alpha.sum() - right.alpha.sum())
+    assert ((refined.alpha >= 0.5) == refined.masks).all()
+
+
+def test_a_matte_that_loses_the_subject_is_refused(monkeypatch, tmp_path):
+    """The mask stays as it is, and the warning names the photograph."""
+    figure = Figure()
+    taken = Capture.read(tmp_path, figure.write(tmp_path))
+    monkeypatch.setattr(capture, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
+    with pytest.warns(UserWarning, match="refine_masks: expected colours of cam") as warned:
+        found = taken.batch((56, 42), 4)
+    assert len(warned) == len(taken.photographs)
+    assert "cam0 that tell the subject" in str(warned[0].message)
+    given = taken.batch((56, 42))
+    assert (found.alpha - given.alpha).abs().mean() < 0.01
+    assert (found.images - given.images).abs().mean() < 0.01
+
+
+def test_colors_that_say_nothing_leave_the_subject():
+    """A subject that looks like its background keeps nearly all of its mask."""
+    mask = np.zeros((96, 64), np.uint8)
+    mask[16:80, 28:36] = 255
+    _, matte = refined_matte(np.full((96, 64, 3), 120, np.uint8), mask, 4)
+    assert error(matte, mask) < 0.2

@@ -1,0 +1,218 @@
+"""The parts of a benchmark: order, exponents, errors, FLOPs, memory, the Pareto front, scenes."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from ghgs_lit import encoder, recalibration
+from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES, differences, partners, relative_difference
+from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
+from ghgs_lit.diagnostics.benchmark.measure import Job, Times, order, time_jobs
+from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
+from ghgs_lit.diagnostics.benchmark.plot import pareto
+from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
+from ghgs_lit.diagnostics.benchmark.scaling import exponent, fits_of
+from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
+from ghgs_lit.diagnostics.benchmark.stages import (
+    NAMES,
+    OTHER,
+    ROUNDS,
+    TOTAL,
+    SecondsProbe,
+    forward,
+    top_level,
+    watched,
+)
+from ghgs_lit.errors import InputError
+from ghgs_lit.rendering import Renderer
+from tests.helpers.models import close, make_model
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return ellipsoid_batch(share=0.2, views=3, size=42, batch=1)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_model().eval()
+
+
+def case(model, name):
+    return Case("model", name, {}, model, Renderer(), None, None, False)
+
+
+def test_rounds_begin_with_another_job_each():
+    """A machine that becomes slower must not make the preset that is always last look slow."""
+    rounds = [order(turn, 3) for turn in range(3)]
+    assert rounds == [[0, 1, 2], [1, 2, 0], [2, 0, 1]]
+    assert sorted(order(-1, 3)) == [0, 1, 2]
+
+
+def test_jobs_are_interleaved_and_warm_up_rounds_do_not_count(model, scene):
+    """Every round runs all jobs once; the numbers are those of the rounds after the warm-up."""
+    seen = []
+    jobs = [Job(case(model, "a"), [scene, scene]), Job(case(model, "b"), [scene], threads=1)]
+    times = time_jobs(jobs, warmup=1, repeats=2, device=CPU, progress=seen.append)
+    assert seen == ["b", "a", "a", "b", "b", "a"]
+    assert list(times[0]) == [name for name in NAMES if name != ROUNDS]
+    assert times[0][TOTAL].low <= times[0][TOTAL].median <= times[0][TOTAL].high
+
+
+def test_stages_and_the_rest_add_up_to_the_total(model, scene):
+    """Time that no stage has must be seen, not be lost."""
+    probe = SecondsProbe(CPU)
+    forward(model, Renderer(), scene, probe)
+    seconds = probe.seconds()
+    assert list(seconds) == [name for name in NAMES if name != ROUNDS]
+    assert sum(seconds[name] for name in top_level(seconds)) + seconds[OTHER] == pytest.approx(seconds[TOTAL])
+    assert 0 < seconds["encoder.patch_tokens"] < seconds["encoder"] < seconds[TOTAL]
+    assert seconds[OTHER] >= 0
+
+
+def test_a_probe_leaves_the_model_and_its_prediction_as_they_were(model, scene):
+    """A model that was measured must not stay slower, or become another one."""
+    bounds, before = model.bounds, model(scene)
+    found, _ = forward(model, Renderer(), scene, SecondsProbe(CPU))
+    close(found.gaussians, before.gaussians, 0)
+    with watched(model, SecondsProbe(CPU)):
+        assert model.bounds is not bounds
+        assert model.bounds.samples == bounds.samples
+    assert model.bounds is bounds
+    assert not any(m._forward_hooks or m._forward_pre_hooks for m in model.modules())
+
+
+def test_quartiles_of_one_round_are_its_value():
+    """One round, as for models of a minute, has no spread."""
+    assert Times.of([2.0]) == Times(2.0, 2.0, 2.0)
+    assert Times.of([1.0, 2.0, 3.0, 4.0, 5.0]) == Times(3.0, 2.0, 4.0)
+
+
+def test_exponents_of_known_costs():
+    """The fit finds the power of a cost that is one, and none where there is none."""
+    values = [2, 3, 4, 8]
+    assert exponent(values, [0.3 * v**1.7 for v in values]) == pytest.approx(1.7)
+    assert exponent(values, [5.0] * 4) == pytest.approx(0)
+    assert exponent([4], [1.0]) is None
+    assert exponent(values, [1.0, None, 2.0, 3.0]) is None
+    assert exponent(values, [0.0, 1.0, 2.0, 3.0]) is None
+    row = {"preset": "none", "stage": "total"}
+    rows = [{**row, "axis": "size", "value": v, "seconds": v**2, "flops": v**3} for v in values]
+    rows += [{**row, "axis": "threads", "value": v, "seconds": v**-0.5, "flops": 7.0} for v in (1, 2)]
+    size, threads = fits_of(rows)
+    assert (size["exponent"], size["expected"]) == (pytest.approx(2), pytest.approx(3))
+    assert (threads["exponent"], threads["expected"]) == (pytest.approx(-0.5), -1)
+
+
+def test_the_front_has_what_nothing_else_beats():
+    """A preset that is slower and worse than another one is not on the front."""
+    assert pareto([(3, 0.0), (1, 0.5), (2, 0.5), (2, 0.2), (4, 0.0)]) == [1, 3, 0]
+    assert pareto([(1, 1.0), (1, 1.0)]) == [0]
+
+
+def test_relative_differences_are_always_defined():
+    """An empty or broken result must not pass a budget as nan, and no difference needs no division."""
+    one = torch.ones(2)
+    assert relative_difference(one * 3, one * 2) == 0.5
+    assert relative_difference(one[:0], one[:0]) == 0
+    assert relative_difference(one * 0, one * 0) == 0
+    assert relative_difference(one, one * 0) == math.inf
+    assert relative_difference(one * math.nan, one) == math.inf
+
+
+def test_gaussians_are_compared_by_their_pixel(model, scene):
+    """A preset that drops some Gaussians, or orders them otherwise, is compared on those that it has."""
+    expected = forward(model, Renderer(), scene, SecondsProbe(CPU))
+    gaussians = expected[0].gaussians
+    kept = torch.arange(len(gaussians)).flip(0)[: len(gaussians) // 2]
+    found = dataclasses.replace(expected[0], gaussians=gaussians.select(kept, (len(kept),)))
+    a, b = partners(found.gaussians, gaussians)
+    assert torch.equal(kept[a], b)
+    changes = differences((found, expected[1]), expected, scene.masks)
+    assert all(changes[name] == 0 for name in (*ATTRIBUTES, "render", "depth", "max_rel_diff"))
+    assert changes["unmatched"] == pytest.approx(0.5, abs=1 / len(gaussians))
+    assert changes["psnr_to_none"] == pytest.approx(100)
+    nothing = gaussians.select(kept[:0], (0,))
+    assert [len(index) for index in partners(nothing, gaussians)] == [0, 0]
+    assert [len(index) for index in partners(gaussians, nothing)] == [0, 0]
+
+
+def test_flops_of_products_attention_and_compiled_kernels():
+    """Work must not vanish from the count because a compiled kernel does it."""
+    q = torch.rand(1, 2, 32, 16)
+    with torch.no_grad(), FlopsProbe() as probe:
+        for stage, run in {
+            "product": lambda: F.linear(torch.rand(5, 7), torch.rand(3, 7)),
+            "pytorch": lambda: F.scaled_dot_product_attention(q, q, q),
+        }.items():
+            probe.begin(stage)
+            run()
+            probe.end(stage)
+    assert probe.flops == {"product": 2 * 5 * 7 * 3, "pytorch": 4 * 2 * 32 * 32 * 16}
+
+
+def test_flops_count_the_calls_of_the_compiled_kernels(monkeypatch):
+    """The kernels are called through their module, by which the count sees them; afterwards it does not."""
+    for module, name in (
+        (encoder.cpu, "attend"),
+        (recalibration.cpu, "attend"),
+        (recalibration.cpu, "cosines"),
+    ):
+        monkeypatch.setattr(module, name, lambda *_: None)
+    rows, index = torch.rand(6, 32), torch.zeros(6, 4, dtype=torch.long)
+    with FlopsProbe() as probe:
+        probe.begin("kernels")
+        encoder.cpu.attend(*[torch.rand(1, 2, 8, 16)] * 3)
+        recalibration.cpu.attend(rows, rows, rows, 2, index, index == 0, index, index)
+        recalibration.cpu.cosines(rows, index)
+        probe.end("kernels")
+    recalibration.cpu.cosines(rows, index)
+    assert probe.flops == {"kernels": 4 * 2 * 8 * 8 * 16 + 4 * 6 * 4 * 32 + 2 * 6 * 4 * 32}
+
+
+def test_memory_of_a_stage_counts_for_the_stages_around_it_alone():
+    """A peak inside one stage must not be charged to the next."""
+    probe = PeakProbe(CPU)
+    probe.begin("outer")
+    if not probe._open:
+        pytest.skip("this system has no resettable peak")
+    probe.begin("large")
+    held = torch.ones(1 << 24)  # 64 MiB
+    del held
+    probe.end("large")
+    probe.begin("small")
+    probe.end("small")
+    probe.end("outer")
+    assert probe.peaks["large"] > 60 << 20
+    assert probe.peaks["outer"] >= probe.peaks["large"]
+    assert probe.peaks["small"] < 30 << 20
+
+
+@pytest.mark.parametrize("share", [0.05, 0.15, 0.6])
+def test_the_subject_covers_the_asked_part_of_the_frame(share):
+    """The study varies the share; the mask must have it, in every view."""
+    for size in ((280, 280), (420, 280), (210, 280)):
+        assert ellipse(share, size).float().mean().item() == pytest.approx(share, rel=0.02)
+    batch = ellipsoid_batch(share, 3, 56, 2)
+    assert batch.masks.float().mean((-2, -1)).sub(share).abs().max() < 0.02
+    assert batch.images.shape == (2, 3, 3, 56, 56)
+    with pytest.raises(InputError, match="share"):
+        ellipse(0.75, (56, 56))
+
+
+def test_knobs_are_combined_and_checked():
+    """Every combination is measured; a key that no case has is named."""
+    both = combinations({"recalibration.k": [4, 8], "precision": ["float32"]})
+    assert both == [
+        {"recalibration.k": 4, "precision": "float32"},
+        {"recalibration.k": 8, "precision": "float32"},
+    ]
+    assert combinations({}) == [{}]
+    for knobs in ({"trainer.max_steps": [1]}, {"recalibration.k": 4}, {"recalibration.k": []}):
+        with pytest.raises(InputError, match=r"knobs\."):
+            combinations(knobs)

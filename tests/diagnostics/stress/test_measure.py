@@ -1,0 +1,92 @@
+"""The stress test itself: its matrix is complete, and it catches what it must catch."""
+
+import dataclasses
+import runpy
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+
+from ghgs_lit.diagnostics.stress.families import FAMILIES, INGREDIENTS, PLANTED
+from ghgs_lit.diagnostics.stress.measure import measure
+from ghgs_lit.diagnostics.stress.run import Task, run_tasks, tasks_of
+from ghgs_lit.diagnostics.stress.stages import STAGES
+
+
+def failures(name, family, run, dtype="float32"):
+    """Failures of a stage whose function is replaced by ``run``."""
+    stage = STAGES[name]
+    reference = stage.reference or stage.run
+    broken = dataclasses.replace(stage, run=run, reference=reference)
+    return sum(cell.failures for cell in measure(broken, family, range(3), [dtype]))
+
+
+def test_the_full_run_is_large_and_no_stage_dominates():
+    """A hundred thousand cases, at least twenty seeds in each cell, no stage more than a fifth."""
+    cases = Counter()
+    for task in tasks_of():
+        assert task.seeds >= 20
+        cases[task.stage] += task.seeds * len(STAGES[task.stage].dtypes)
+    assert sum(cases.values()) >= 100_000
+    assert max(cases.values()) <= sum(cases.values()) / 5
+    assert {family.ingredient for family in FAMILIES.values()} <= {None, *INGREDIENTS}
+
+
+def _plain_direction(v):
+    squared = v["vectors"].square().sum(-1, keepdim=True)
+    return {"unit": v["vectors"] * squared.rsqrt()}
+
+
+def _masked_result(v):
+    direction = v["vectors"] / v["vectors"].norm(dim=-1, keepdim=True)
+    return {"unit": torch.where(v["vectors"].abs().sum(-1, keepdim=True) > 0, direction, 0.0)}
+
+
+def _half_precision_distances(v):
+    found = STAGES["cosine"].run(v)
+    return {"cosines": found["cosines"].half().to(found["cosines"].dtype)}
+
+
+@pytest.mark.parametrize(
+    ("stage", "family", "defect"),
+    [
+        ("unit vectors", "huge_quaternion", _plain_direction),
+        ("unit vectors", "tiny_quaternion", _plain_direction),
+        ("unit vectors", "zero_quaternion", _masked_result),
+        ("cosine", "ordinary", _half_precision_distances),
+    ],
+)
+def test_a_planted_defect_is_caught(stage, family, defect):
+    """Squares that overflow, a mask on the result instead of the argument, a value in float16."""
+    assert failures(stage, family, STAGES[stage].run) == 0
+    assert failures(stage, family, defect) > 0
+
+
+@pytest.mark.parametrize("family", list(PLANTED))
+def test_a_value_that_vanishes_is_caught(family):
+    """A stage that hides NaN or infinity must say why."""
+    stage = STAGES["unit vectors"]
+    hide = dataclasses.replace(stage, run=lambda v: {"unit": stage.run(v)["unit"].nan_to_num()}, gradients=())
+    assert measure(hide, family, range(3), ["float32"])[0].failures == 3
+
+
+def test_a_run_goes_on_where_it_was_interrupted(tmp_path, capsys):
+    """Families that are done are read from the journal, a last line that was cut off is not."""
+    tasks = [Task("unit vectors", family, 2, ("float32",)) for family in ("ordinary", "zero_quaternion")]
+    journal = tmp_path / "cells.jsonl"
+    first = run_tasks(tasks[:1], journal, 0)
+    journal.write_text(journal.read_text() + '{"key": "cut')
+    journal.write_text(journal.read_text() + "\n")
+    both = run_tasks(tasks, journal, 0)
+    assert both[0] == first[0]
+    assert len(both) == 2
+    assert "1 of 2 families are done" in capsys.readouterr().out
+
+
+def test_the_lines_of_planted_defects_are_there():
+    """The benchmark changes one line each; a line that was rewritten needs a new defect."""
+    root = Path(__file__).parents[3]
+    for defect in runpy.run_path(str(root / "benchmarks" / "planted_defects.py"))["DEFECTS"]:
+        assert (root / "ghgs_lit" / defect.file).read_text().count(defect.before) == 1, defect
+        assert defect.stage in STAGES

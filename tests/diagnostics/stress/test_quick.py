@@ -1,0 +1,14 @@
+"""What ``ghgs stress quick=true`` runs: every stage on every family, with no failure."""
+
+import pytest
+
+from ghgs_lit.diagnostics.stress.run import tasks_of
+from ghgs_lit.diagnostics.stress.stages import STAGES
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_no_case_fails(stage):
+    rows = [row for task in tasks_of([stage], quick=True) for row in task.run()]
+    failed = [(r["family"], r["dtype"], r["error"], r["worst"]) for r in rows if r["failures"]]
+    assert rows
+    assert not failed

@@ -1,0 +1,213 @@
+"""The ablation table of invented runs: rows, columns, best, seeds, missing and refused runs."""
+
+import csv
+import io
+import json
+
+import pytest
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown
+from ghgs_lit.evaluation.tables.text import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS, deviation
+from ghgs_lit.runs.results import read_results, summarize, write_results
+from tests.helpers.tables import body, start_run, tables_of, write_run
+
+
+def test_rows_columns_best_and_missing(tmp_path):
+    """All combinations and numbers of views appear, missing ones too, and only a real best is bold."""
+    write_run(tmp_path / "0", "full", 20.0)
+    write_run(tmp_path / "1" / "deep", "no_semantic", 21.0, views=(4,))
+    write_run(tmp_path / "2", "no_unprojection", 19.0)
+    (table,) = tables_of(tmp_path)
+    rows, header = body(to_markdown(table))
+    assert header[2:5] == ["3-view PSNR ↑", "3-view SSIM ↑", "3-view FLIP ↓"]
+    assert header[5] == "4-view PSNR ↑"
+    assert list(rows) == [("✗", "✗"), ("✗", "✓"), ("✓", "✗"), ("✓", "✓")]
+    assert rows["✗", "✗"] == ["missing"] * 9
+    assert rows["✓", "✓"][0] == "**23.00**"
+    assert rows["✓", "✓"][3] == "24.00"
+    assert rows["✓", "✗"] == ["missing"] * 3 + ["**25.00**", "0.9000", "0.1000"] + ["missing"] * 3
+    assert rows["✗", "✓"][6] == "24.00"
+    # Equal numbers are not the best of anything.
+    assert rows["✓", "✓"][1] == "0.9000"
+
+
+def test_several_seeds_give_a_deviation(tmp_path):
+    """Seeds are averaged and their sample deviation is printed."""
+    for seed, psnr in ((1, 20.0), (2, 21.0), (3, 22.0)):
+        write_run(tmp_path / str(seed), "full", psnr, seed=seed)
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
+    assert rows["✓", "✓"][0] == "25.00 ± 1.00"
+    assert "3 seeds" in table.caption
+    assert deviation([1.0]) is None
+
+
+def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
+    """The best LPIPS is the lowest, and columns can be chosen."""
+    write_run(tmp_path / "0", "full", 20.0, lpips=0.05)
+    write_run(tmp_path / "1", "neither", 20.0, lpips=0.06)
+    (table,) = tables_of(tmp_path, views=(3,), metrics=("lpips", "flip"))
+    rows, header = body(to_markdown(table))
+    assert header[2:] == ["3-view LPIPS ↓", "3-view FLIP ↓"]
+    assert rows["✓", "✓"] == ["**0.0500**", "0.1000"]
+    assert rows["✗", "✗"] == ["0.0600", "0.1000"]
+
+
+def test_runs_that_are_planned_or_going_are_said(tmp_path):
+    """Incomplete sweeps say which runs and seeds are missing."""
+    for seed in (1, 2):
+        write_run(tmp_path / f"full{seed}", "full", 20.0 + seed, seed=seed)
+    write_run(tmp_path / "other", "neither", 20.0, seed=1)
+    start_run(tmp_path / "going", "neither", seed=2)
+    start_run(tmp_path / "planned", "full", seed=3)
+    # Half-written, and foreign: neither is a run.
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "config.yaml").write_text("ablation: {name: [")
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
+    assert rows["✓", "✓"][0] == "**25.50 ± 0.71 (2/3)**"
+    assert rows["✗", "✗"][0] == "24.00 (1/3)"
+    assert any("synthetic paper neither seed 2" in note for note in table.notes)
+    assert not any("seed 1" in note for note in table.notes)
+
+
+def test_a_row_is_told_by_what_was_trained(tmp_path):
+    """The configuration of `ghgs evaluate` says nothing about the model in its checkpoint."""
+    write_run(tmp_path / "evaluated", "no_semantic", 20.0, seed=7, verb="evaluate")
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
+    assert rows["✓", "✗"][0] == "24.00"
+    assert rows["✗", "✗"][0] == "missing"
+
+
+def test_lpips_is_shown_when_every_run_has_it(tmp_path):
+    """A column never mixes runs with and without LPIPS."""
+    write_run(tmp_path / "0", "full", 20.0, lpips=0.05, weights="vggt.safetensors")
+    (table,) = tables_of(tmp_path, views=(3,))
+    text = to_markdown(table)
+    assert "3-view LPIPS ↓" in text
+    assert "FLIP" not in text
+    assert NO_SEMANTICS not in text
+    write_run(tmp_path / "1", "neither", 20.0, weights="vggt.safetensors")
+    (table,) = tables_of(tmp_path, views=(3,))
+    assert "3-view FLIP ↓" in to_markdown(table)
+
+
+@pytest.mark.parametrize(("weights", "semantic"), [("pretext", True), (None, False)])
+def test_a_branch_that_has_learned_parts_needs_no_footnote(tmp_path, weights, semantic):
+    """A random branch (`allow_random_encoder`) carries no more than any other random features."""
+    encoder = {"semantic": {"width": 64}, "weights": weights}
+    write_run(tmp_path / "0", "full", 20.0, encoder=encoder)
+    (table,) = tables_of(tmp_path, views=(3,))
+    assert (NO_SEMANTICS not in to_markdown(table)) is semantic
+
+
+def test_notes_and_caption_say_what_the_numbers_are(tmp_path):
+    """Readers see data, protocol, code states and settings that differ."""
+    write_run(tmp_path / "0", "full", 20.0, git={"commit": "a" * 40, "changed": False})
+    (table,) = tables_of(tmp_path, illustration=True)
+    text = to_markdown(table)
+    for said in (FOOTNOTE, NO_SEMANTICS, ILLUSTRATION, "`synthetic`", "2 subjects", "`release`", "`correct`"):
+        assert said in text
+    assert "states of the code" not in text
+    write_run(
+        tmp_path / "1", "neither", 20.0, git={"commit": "b" * 40, "changed": True}, optimizer={"lr": 0.1}
+    )
+    (table,) = tables_of(tmp_path)
+    text = to_markdown(table)
+    assert ILLUSTRATION not in text
+    # What a reviewer would ask: is it the same code and the same training?
+    assert "2 states of the code: aaaaaaaaa, bbbbbbbbb with changes" in text
+    assert "differ also in `optimizer.lr` (absent, 0.1)" in text
+
+
+def test_targets_are_tables_of_their_own_and_can_be_picked(tmp_path):
+    """Numbers on different targets or metrics never share a table."""
+    write_run(tmp_path / "0", "full", 20.0)
+    write_run(tmp_path / "1", "full", 18.0, targets="midway")
+    write_run(tmp_path / "2", "full", 18.0, protocol="release")
+    settings = [tuple(t.records[0].setting.__dict__.values()) for t in tables_of(tmp_path)]
+    assert [s[2:] for s in settings] == [
+        ("release", "correct"),
+        ("midway", "correct"),
+        ("release", "release"),
+    ]
+    (table,) = tables_of(tmp_path, targets=("midway",))
+    assert "targets `midway`" in table.caption
+    with pytest.raises(InputError, match="others only"):
+        tables_of(tmp_path, targets=("random",))
+
+
+def test_two_runs_of_one_cell_are_refused_and_can_be_told_apart(tmp_path):
+    """No run is averaged with another by accident; the message says how to separate them."""
+    write_run(tmp_path / "0", "full", 20.0, optimizer={"lr": 0.1})
+    write_run(tmp_path / "1", "full", 21.0, optimizer={"lr": 0.2})
+    expected = r"ablation=full, 3 views, seed 1; found .*0/metrics\.json .*by=\[optimizer\.lr\]"
+    with pytest.raises(InputError, match=expected):
+        tables_of(tmp_path)
+    first, second = tables_of(tmp_path, by=["optimizer.lr"])
+    assert "`optimizer.lr=0.1`" in first.caption
+    assert "`optimizer.lr=0.2`" in second.caption
+
+
+def test_the_same_numbers_twice_are_one_run(tmp_path):
+    """A run that was copied or evaluated again is not a second seed."""
+    write_run(tmp_path / "0", "full", 20.0)
+    write_run(tmp_path / "1", "full", 20.0, verb="evaluate")
+    (table,) = tables_of(tmp_path)
+    assert all(list(cell.seeds) == [1] for line in table.lines for cell in line.cells.values())
+
+
+def test_csv_has_every_cell_in_full(tmp_path):
+    """The CSV has all digits, and a row for every missing cell."""
+    path = write_run(tmp_path / "0", "full", 20.0 + 1 / 3, views=(3,))
+    own = json.loads(path.read_text())["provenance"]["config_hash"]
+    rows = list(csv.DictReader(io.StringIO(to_csv(tables_of(tmp_path, views=(3, 4))))))
+    assert len(rows) == 4 * 2 * 3
+    (row,) = (r for r in rows if (r["ablation"], r["views"], r["metric"]) == ("full", "3", "psnr"))
+    assert float(row["mean"]) == pytest.approx(23 + 1 / 3, abs=1e-12)
+    assert (row["seeds"], row["subjects"], row["runs"], row["deviation"]) == ("1", "2", own, "")
+    assert sum(r["mean"] == "" for r in rows) == 24 - 3
+
+
+def test_results_that_are_none_are_refused(tmp_path):
+    """Missing, empty, damaged and newer results are errors with their path."""
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_sweep([tmp_path / "nowhere"])
+    with pytest.raises(InputError, match="none"):
+        read_sweep([tmp_path])
+    start_run(tmp_path / "going", "full")
+    with pytest.raises(InputError, match="1 runs without one"):
+        read_sweep([tmp_path])
+    path = tmp_path / "metrics.json"
+    path.write_text("{")
+    with pytest.raises(InputError, match=r"metrics\.json"):
+        read_sweep([tmp_path])
+    path.write_text(json.dumps({"format_version": 99}))
+    with pytest.raises(InputError, match="format_version 1 to 3; found 99"):
+        read_results(path)
+    with pytest.raises(InputError, match="at least one"):
+        write_results(tmp_path, [], {})
+
+
+def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
+    """nan and infinity never reach JSON or a mean, and each subject counts once."""
+    about = {"method": "model", "views": 3, "targets": "release", "target": "t", "inputs": ["a", "b"]}
+    rows = [
+        {**about, "subject": "a", "psnr": 20.0, "psnr_box": float("nan"), "depth_error_mm": None},
+        {**about, "subject": "a", "psnr": 30.0, "psnr_box": 10.0, "depth_error_mm": None},
+        {**about, "subject": "b", "psnr": 40.0, "psnr_box": float("inf"), "depth_error_mm": None},
+    ]
+    (means,) = summarize(rows[:2])
+    assert means["psnr_box"] == 10
+    assert means["depth_error_mm"] is None
+    # Each subject counts once, however many targets it has.
+    assert summarize(rows)[0]["psnr"] == pytest.approx((25 + 40) / 2)
+    content = read_results(write_results(tmp_path, rows, {"seed": 1}))
+    assert content["rows"][0]["psnr_box"] is None
+    assert content["rows"][2]["psnr_box"] is None
+    lines = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert lines[0].startswith("method,subject,views,targets,target,inputs,psnr,psnr_box,depth_error_mm")
+    assert lines[1].startswith("model,a,3,release,t,a b,20.0,,")
+    assert not list(tmp_path.glob(".*"))

@@ -1,0 +1,128 @@
+"""What the training took as columns, rows by what a model does, and results that were edited."""
+
+import json
+
+import pytest
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables import read_sweep, to_markdown
+from ghgs_lit.runs.provenance import config_hash
+from tests.helpers.tables import body, tables_of, write_run
+
+COLUMNS = ("psnr", "steps", "seconds", "peak_gb")
+
+
+def test_steps_seconds_and_memory_can_be_columns(tmp_path):
+    """A reader must see what each row cost; a run that does not say has no figure."""
+    write_run(tmp_path / "0", "full", 20.0, training={"steps": 300, "seconds": 61.4, "peak_bytes": 2.5e9})
+    write_run(tmp_path / "1", "neither", 19.0, training={"steps": 300, "seconds": 50.0})
+    (table,) = tables_of(tmp_path, views=(4,), metrics=COLUMNS)
+    rows, header = body(to_markdown(table))
+    assert header[3:] == ["4-view Training steps", "4-view Training (s) ↓", "4-view Training memory (GB) ↓"]
+    assert rows["✓", "✓"] == ["**24.00**", "300", "61", "2.5"]
+    assert rows["✗", "✗"] == ["23.00", "300", "**50**", "missing"]
+    assert "different numbers of steps" not in to_markdown(table)
+
+
+def test_rows_of_different_steps_are_said(tmp_path):
+    """Rows of equal time but different steps do not show the method alone."""
+    write_run(tmp_path / "0", "full", 20.0, training={"steps": 300, "seconds": 61.4})
+    write_run(tmp_path / "1", "neither", 19.0, training={"steps": 350})
+    write_run(tmp_path / "2", "neither", 19.0, seed=2, training={"steps": 360})
+    (table,) = tables_of(tmp_path, views=(4,))
+    said = "Rows were trained for different numbers of steps (✓ ✓ (a): 300; ✗ ✗: 350 to 360)."
+    assert said in table.notes
+
+
+def test_a_row_is_what_the_model_does(tmp_path):
+    """A label that says something else than the model must not choose the row."""
+    changed = {"neighborhood": "image_plane", "similarity": "log"}
+    path = write_run(tmp_path / "0", "full", 20.0, recalibration=changed)
+    content = json.loads(path.read_text())
+    content["format_version"] = 2  # its hash was of other keys
+    content["provenance"]["config"]["ablation"] = {"name": "full", "unprojection": True, "semantic": True}
+    path.write_text(json.dumps(content))
+    (table,) = tables_of(tmp_path, views=(4,))
+    rows, _ = body(to_markdown(table))
+    assert rows["✗", "✓"][0] == "24.00"
+    assert rows["✓", "✓"][0] == "missing"
+
+
+def test_results_of_before_keep_their_rows(tmp_path):
+    """Earlier results say their ablation in a node of its own."""
+    path = write_run(tmp_path / "0", "full", 20.0)
+    content = json.loads(path.read_text())
+    content["format_version"] = 2  # its hash was of other keys
+    config = content["provenance"]["config"]
+    del config["recalibration"]
+    config["ablation"] = {"name": "no_semantic", "unprojection": True, "semantic": False}
+    path.write_text(json.dumps(content))
+    (table,) = tables_of(tmp_path, views=(4,))
+    assert body(to_markdown(table))[0]["✓", "✗"][0] == "24.00"
+
+
+def test_a_checkpoint_that_was_changed_is_another_row(tmp_path):
+    """What the command line of `ghgs evaluate` changed in the model tells the row."""
+    path = write_run(tmp_path / "0", "full", 20.0, verb="evaluate")
+    content = json.loads(path.read_text())
+    content["provenance"]["model_config"] = {"recalibration": {"neighborhood": "xyz", "similarity": "none"}}
+    path.write_text(json.dumps(content))
+    (table,) = tables_of(tmp_path, views=(4,))
+    assert body(to_markdown(table))[0]["✓", "✗"][0] == "24.00"
+
+
+def edited(value, *keys):
+    """The change of one value; KeyError removes it."""
+
+    def edit(content):
+        for key in keys[:-1]:
+            content = content[key]
+        if value is KeyError:
+            del content[keys[-1]]
+        else:
+            content[keys[-1]] = value
+
+    return edit
+
+
+PROVENANCE, ROW = "provenance", ("rows", 0)
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (edited(KeyError, PROVENANCE), "provenance: expected a mapping; found 'NoneType'"),
+        (edited([1], PROVENANCE), "provenance: expected a mapping; found 'list'"),
+        (edited("x", PROVENANCE, "config"), "provenance: config: expected a mapping; found 'x'"),
+        (edited(KeyError, PROVENANCE, "config", "recalibration"), "recalibration: expected a mapping"),
+        (
+            edited("one", PROVENANCE, "config", "seed"),
+            "provenance: seed: expected a whole number; found 'one'",
+        ),
+        (edited(KeyError, PROVENANCE, "data"), "provenance: data.name: expected a text"),
+        (edited(3, PROVENANCE, "data", "split"), "provenance: data.split: expected a text; found 3"),
+        (edited(None, PROVENANCE, "protocol"), "provenance: protocol.metrics: expected a text"),
+        (edited("dirty", PROVENANCE, "git"), "provenance: git.commit: expected a text"),
+        (edited(3, PROVENANCE, "training"), "provenance: training: expected a mapping; found 3"),
+        (edited(KeyError, "rows"), "rows: expected a list; found 'NoneType'"),
+        (edited({}, "rows"), "rows: expected a list; found 'dict'"),
+        (edited("x", *ROW), r"rows\[0\]: method: expected a text; found 'NoneType'"),
+        (edited("high", *ROW, "psnr"), r"rows\[0\]: psnr: expected a number or null; found 'high'"),
+        (edited("four", *ROW, "views"), r"rows\[0\]: views: expected a whole number; found 'four'"),
+        (edited(KeyError, *ROW, "subject"), r"rows\[0\]: subject: expected a text; found 'NoneType'"),
+        (edited(3, "summary"), "summary: expected a list; found 3"),
+    ],
+)
+def test_edited_results_are_one_line(tmp_path, edit, said):
+    """A results file that was changed by hand is named with the key that is wrong."""
+    path = write_run(tmp_path / "0", "full", 20.0, training={"steps": 1}, git={"commit": "a" * 40})
+    content = json.loads(path.read_text())
+    edit(content)
+    source = content.get("provenance")
+    if isinstance(source, dict) and isinstance(source.get("config"), dict):
+        source["config_hash"] = config_hash(source["config"])  # refused by itself otherwise
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=said) as error:
+        read_sweep([tmp_path])
+    assert "metrics.json" in str(error.value)
+    assert "\n" not in str(error.value)
