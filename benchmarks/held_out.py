@@ -23,8 +23,8 @@ from ghgs_lit.evaluation.baselines import nearest_view, splatted
 from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.predict.capture.predict import trained_size
-from ghgs_lit.predict.refinement import CameraRefinement, Refinement
+from ghgs_lit.prediction.capture.predict import trained_size
+from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.types import Batch, Targets
 from ghgs_lit.visualization.pictures import save_png, to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint

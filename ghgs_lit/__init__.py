@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ghgs_lit.model import GHGS
-    from ghgs_lit.predict.capture.capture import Capture
-    from ghgs_lit.predict.capture.predict import predict
+    from ghgs_lit.prediction.capture.capture import Capture
+    from ghgs_lit.prediction.capture.predict import predict
     from ghgs_lit.rendering import render
     from ghgs_lit.types import Batch, Cameras, Gaussians
 
@@ -14,9 +14,9 @@ _MODULES = {
     "GHGS": "ghgs_lit.model",
     "Batch": "ghgs_lit.types",
     "Cameras": "ghgs_lit.types",
-    "Capture": "ghgs_lit.predict.capture.capture",
+    "Capture": "ghgs_lit.prediction.capture.capture",
     "Gaussians": "ghgs_lit.types",
-    "predict": "ghgs_lit.predict.capture.predict",
+    "predict": "ghgs_lit.prediction.capture.predict",
     "render": "ghgs_lit.rendering",
 }
 __all__ = ["GHGS", "Batch", "Cameras", "Capture", "Gaussians", "predict", "render"]

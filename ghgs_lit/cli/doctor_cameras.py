@@ -7,11 +7,11 @@ from rich.table import Table
 from ghgs_lit.cli.photographs import capture_folder
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import InputError
-from ghgs_lit.predict.capture.calibration import calibrate
-from ghgs_lit.predict.capture.doctor import Diagnosis, Ranked, diagnose, silhouettes_of
-from ghgs_lit.predict.capture.drawing import camera_sheet
-from ghgs_lit.predict.capture.folder import CaptureFolder
-from ghgs_lit.predict.capture.formats.json_and_toml import write_json
+from ghgs_lit.prediction.capture.calibration import calibrate
+from ghgs_lit.prediction.capture.doctor import Diagnosis, Ranked, diagnose, silhouettes_of
+from ghgs_lit.prediction.capture.drawing import camera_sheet
+from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from ghgs_lit.visualization.pictures import save_png
 
 #: How many meanings are listed.

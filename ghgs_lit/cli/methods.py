@@ -9,7 +9,7 @@ from ghgs_lit.cli.inputs import MODEL_NODES, build_renderer
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.predict.refinement import CameraRefinement, Refinement
+from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.predict.capture.capture import Capture
-from ghgs_lit.predict.capture.doctor import Diagnosis
-from ghgs_lit.predict.capture.folder import CaptureFolder
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.doctor import Diagnosis
+from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.types import Cameras
 
 #: Longer side of the pictures of a video of instants, in pixels.

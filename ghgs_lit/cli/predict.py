@@ -26,11 +26,11 @@ from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.predict.capture.doctor import diagnose
-from ghgs_lit.predict.capture.predict import predict, trained_size
-from ghgs_lit.predict.export import output_options, write_prediction
-from ghgs_lit.predict.export.video import write_mp4
-from ghgs_lit.predict.refinement import CameraRefinement, Refinement, pixels_moved
+from ghgs_lit.prediction.capture.doctor import diagnose
+from ghgs_lit.prediction.capture.predict import predict, trained_size
+from ghgs_lit.prediction.export import output_options, write_prediction
+from ghgs_lit.prediction.export.video import write_mp4
+from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, pixels_moved
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8

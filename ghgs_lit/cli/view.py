@@ -8,8 +8,8 @@ from omegaconf import DictConfig
 from ghgs_lit.cli import predict
 from ghgs_lit.cli.runtime import output_dir, save_config
 from ghgs_lit.errors import require
-from ghgs_lit.predict.viewer.content import read_content
-from ghgs_lit.predict.viewer.server import Viewer
+from ghgs_lit.prediction.viewer.content import read_content
+from ghgs_lit.prediction.viewer.server import Viewer
 
 
 def run(cfg: DictConfig) -> None:

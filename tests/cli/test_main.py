@@ -117,7 +117,7 @@ def test_a_prediction_does_not_wait_for_what_training_needs():
     """Lightning, torchmetrics and PyTorch's compiler take seconds to import."""
     code = "import sys, ghgs_lit.cli.predict, ghgs_lit; ghgs_lit.GHGS.from_checkpoint(); print(*sys.modules)"
     loaded = set(run_python(code).stdout.split())
-    assert {"torch", "ghgs_lit.predict.refinement"} <= loaded
+    assert {"torch", "ghgs_lit.prediction.refinement"} <= loaded
     assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded
 
 

@@ -21,7 +21,7 @@ from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, measure_
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.metrics import ImageMetrics, psnr
 from ghgs_lit.model import GHGS
-from ghgs_lit.predict.export.ply import read_ply
+from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.synthesis.datamodules import ScansDataModule

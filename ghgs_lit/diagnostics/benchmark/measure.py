@@ -16,7 +16,7 @@ from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.stages import SecondsProbe, forward
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
-from ghgs_lit.predict.export.ply import write_ply
+from ghgs_lit.prediction.export.ply import write_ply
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Prediction, Rendering
 

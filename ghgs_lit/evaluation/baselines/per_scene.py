@@ -7,7 +7,7 @@ from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
 from ghgs_lit.evaluation.baselines.splats import splats_at
 from ghgs_lit.evaluation.measure import Estimate, Renderer
-from ghgs_lit.predict.refinement import Change, Refinement
+from ghgs_lit.prediction.refinement import Change, Refinement
 from ghgs_lit.types import Batch, Gaussians
 
 #: How far a Gaussian may go and how fast, tuned on four people with 3 to 5 views for what other cameras see.

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, zoom
 from ghgs_lit import Capture
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.geometry.outlines import signed_distance
-from ghgs_lit.predict.capture import capture
+from ghgs_lit.prediction.capture import capture
 from tests.helpers.figures import Figure
 
 HEIGHT, WIDTH = 216, 180

@@ -1,6 +1,0 @@
-"""Files of cameras: one module a format, each a function from a path to a :class:`CameraFile`."""
-
-from ghgs_lit.predict.capture.formats.camera_file import CameraFile
-from ghgs_lit.predict.capture.formats.reading import FORMATS, read_cameras
-
-__all__ = ["FORMATS", "CameraFile", "read_cameras"]

@@ -1,6 +1,0 @@
-"""Seconds of optimisation through the rasterizer, from a prediction."""
-
-from ghgs_lit.predict.refinement.cameras import CameraRefinement, pixels_moved
-from ghgs_lit.predict.refinement.refinement import Change, Refinement, Report
-
-__all__ = ["CameraRefinement", "Change", "Refinement", "Report", "pixels_moved"]

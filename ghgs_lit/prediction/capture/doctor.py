@@ -1,0 +1,331 @@
+"""Finds out what is wrong with a calibration by trying what else its numbers could mean.
+
+Each :class:`Hypothesis` is another meaning; they are ranked by how well masks and cameras agree
+(:mod:`ghgs_lit.prediction.capture.consistency`).
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ghgs_lit.data.resampling import area_image, area_mask
+from ghgs_lit.data.silhouettes import Silhouette, extent, subject_place
+from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.capture.calibration import (
+    AXES,
+    EXTRINSICS,
+    INTRINSICS,
+    Convention,
+    StoredCamera,
+)
+from ghgs_lit.prediction.capture.consistency import agreements
+from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.capture.photographs import Pixels
+
+#: Least agreement of every view of a right calibration, and by how much a better meaning must win.
+AGREES, BETTER = 0.9, 0.05
+# Longer side of the photographs that are compared, in pixels.
+_SIDE = 320
+# Shares of a photograph between which a principal point is plausible.
+_MIDDLE = (0.3, 0.7)
+#: Largest extents that are taken for a person in metres.
+PERSON = (0.5, 2.5)
+# What photographs are resized by after a calibration.
+_RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
+_UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "kilometres": 1000.0}
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph at a small size, its camera as stored, and what the camera's numbers mean."""
+
+    name: str
+    camera: StoredCamera
+    pixels: Pixels
+    mask: np.ndarray
+    convention: Convention
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What a calibration could mean.
+
+    Attributes:
+        says: in words.
+        option: of the command line, which makes it so; empty: as it is, or nothing does.
+        views: with this meaning.
+        blames: the cameras that it says are wrong; empty: all, or none.
+    """
+
+    says: str
+    option: str
+    views: tuple[View, ...]
+    blames: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A hypothesis with the agreement of each of its views."""
+
+    hypothesis: Hypothesis
+    shares: dict[str, float]
+
+    @property
+    def score(self) -> float:
+        return min(self.shares.values())
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is right or wrong with a calibration.
+
+    Attributes:
+        consistent: whether masks and cameras agree as they are.
+        lines: what was found, for people.
+        option: of the command line, which mends it; empty where none does.
+        ranking: all meanings that were tried, the best first.
+        size: the subject's largest extent, in the user's unit, of the best meaning.
+        suspects: cameras that disagree with the others.
+    """
+
+    consistent: bool
+    lines: tuple[str, ...]
+    option: str
+    ranking: tuple[Ranked, ...]
+    size: float
+    suspects: tuple[str, ...] = ()
+
+
+def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
+    """Examine the cameras of one instant (None: the first).
+
+    Raises:
+        InputError: photographs or masks cannot be read.
+    """
+    views = small_views(folder, folder.instants[0] if instant is None else instant)
+    given = _rank(folder, Hypothesis("the calibration is right as it is", "", views))
+    twins = _twins(views)
+    if twins:
+        line = f"{' and '.join(twins)} have the same pose: one of them is a copy"
+        return Diagnosis(False, (line,), "", (given,), _size(folder, given), twins)
+    if given.score >= AGREES:
+        return _healthy(folder, given)
+    tried = [given, *(_rank(folder, h) for h in _for_all(views))]
+    best = max(tried, key=lambda r: r.score)
+    if best.score < AGREES:
+        # One camera among right ones: with the best meaning for all.
+        base = best if best.score > given.score + BETTER else given
+        tried += [_rank(folder, h) for h in _for_some(base.hypothesis)]
+        best = max(tried, key=lambda r: r.score)
+    tried.sort(key=lambda r: -r.score)
+    if best.score >= max(AGREES, given.score + BETTER):
+        return _explained(folder, given, best, tried)
+    return _unexplained(folder, given, tried)
+
+
+def small_views(folder: CaptureFolder, instant: str) -> tuple[View, ...]:
+    """The photographs of an instant at a size at which many meanings can be tried."""
+    found = []
+    for name, (camera, pixels, matte) in zip(folder.paths[instant], folder.decode(instant), strict=True):
+        height, width = pixels.size
+        scale = min(_SIDE / max(height, width), 1)
+        size = max(round(height * scale), 1), max(round(width * scale), 1)
+        # Without a stored size the intrinsics are for the whole photograph.
+        known = camera.size or pixels.stored_size
+        small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
+        mask = area_mask(np.ascontiguousarray(matte > 127), *size)
+        found.append(View(name, replace(camera, size=known), small, mask, folder.convention))
+    return tuple(found)
+
+
+def silhouettes_of(folder: CaptureFolder, views: Sequence[View]) -> list[Silhouette]:
+    """Masks with cameras, as a meaning has them.
+
+    Raises:
+        InputError: it has the photographs in another ratio of height and width.
+    """
+    white = np.uint8(255)
+    found = [folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in views]
+    return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in found]
+
+
+def _rank(folder: CaptureFolder, hypothesis: Hypothesis) -> Ranked:
+    names = [view.name for view in hypothesis.views]
+    try:
+        shares = agreements(silhouettes_of(folder, hypothesis.views))
+    except (InputError, np.linalg.LinAlgError):
+        shares = np.zeros(len(names))
+    return Ranked(hypothesis, dict(zip(names, shares.tolist(), strict=True)))
+
+
+def _for_all(views: tuple[View, ...]) -> Iterator[Hypothesis]:
+    """Other meanings of all cameras."""
+    given = views[0].convention
+    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, _likely_resize(views))):
+        inner = replace(given, intrinsics=intrinsics, resized=resized)
+        if not all(_plausible(replace(view, convention=inner)) for view in views):
+            continue
+        for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
+            convention = replace(inner, extrinsics=extrinsics, axes=axes)
+            if convention == given:
+                continue
+            changed = {
+                key: getattr(convention, key)
+                for key in ("extrinsics", "axes", "intrinsics", "resized")
+                if getattr(convention, key) != getattr(given, key)
+            }
+            yield Hypothesis(
+                f"all cameras: {', '.join(f'{key} {_plain(value)}' for key, value in changed.items())}",
+                " ".join(f"calibration.{key}={_plain(value)}" for key, value in changed.items()),
+                tuple(replace(view, convention=convention) for view in views),
+            )
+
+
+def _plain(value: str | float) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
+
+
+def _likely_resize(views: Sequence[View]) -> float:
+    """The usual factor that brings the principal points nearest to the middle."""
+    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
+    scale = 0.5 / max(float(np.median(points)), 0.01)
+    return min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
+
+
+def _plausible(view: View) -> bool:
+    """Whether the principal point lies near the middle."""
+    share = view.camera.intrinsics[:2, 2] * view.convention.resized
+    if view.convention.intrinsics == "pixels":
+        share = share / np.array(view.camera.size)[::-1]
+    return bool((share >= _MIDDLE[0]).all() and (share <= _MIDDLE[1]).all())
+
+
+def _for_some(base: Hypothesis) -> Iterator[Hypothesis]:
+    """Mistakes of one camera, and two cameras or masks that are exchanged."""
+    views = base.views
+    for i, view in enumerate(views):
+        for says, changed in _mistakes(view):
+            mended = (*views[:i], changed, *views[i + 1 :])
+            yield Hypothesis(f"{view.name} alone: {says}", "", mended, (view.name,))
+    for i, j in itertools.combinations(range(len(views)), 2):
+        one, other = views[i], views[j]
+        swapped = list(views)
+        swapped[i] = replace(one, camera=other.camera)
+        swapped[j] = replace(other, camera=one.camera)
+        names, blames = f"{one.name} and {other.name}", (one.name, other.name)
+        if one.mask.shape == other.mask.shape and _masks_are_swapped(one, other):
+            swapped[i], swapped[j] = replace(one, mask=other.mask), replace(other, mask=one.mask)
+            yield Hypothesis(f"the masks of {names} are exchanged", "", tuple(swapped), blames)
+            continue
+        option = f"'calibration.names={{{one.name}: {other.name}, {other.name}: {one.name}}}'"
+        yield Hypothesis(f"the cameras of {names} are exchanged", option, tuple(swapped), blames)
+
+
+def _mistakes(view: View) -> Iterator[tuple[str, View]]:
+    """What one camera alone may have wrong, and the view without it."""
+    given = view.convention
+    for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
+        convention = replace(given, extrinsics=extrinsics, axes=axes)
+        if convention != given:
+            yield f"its extrinsics are {extrinsics} with axes of {axes}", replace(view, convention=convention)
+    for factor, says in ((0.001, "1000 times too long"), (1000.0, "1000 times too short")):
+        pose = view.camera.pose.copy()
+        pose[:3, 3] *= factor
+        yield f"its translation is {says}", replace(view, camera=replace(view.camera, pose=pose))
+    middle = view.camera.intrinsics.copy()
+    sides = np.array(view.camera.size)[::-1] if given.intrinsics == "pixels" else 1.0
+    middle[:2, 2] = sides / 2 / given.resized
+    yield (
+        "its principal point should be near the middle",
+        replace(view, camera=replace(view.camera, intrinsics=middle)),
+    )
+    for factor in (0.5, 2.0):
+        scaled = view.camera.intrinsics.copy()
+        scaled[:2] *= factor
+        yield (
+            f"its intrinsics are for photographs {1 / factor:g} times as large",
+            replace(view, camera=replace(view.camera, intrinsics=scaled)),
+        )
+
+
+def _masks_are_swapped(one: View, other: View) -> bool:
+    """Whether the outlines of the masks follow edges of the other photograph rather than of their own."""
+    own = _contrast(one, one.mask) * _contrast(other, other.mask)
+    return _contrast(one, other.mask) * _contrast(other, one.mask) > own
+
+
+def _contrast(view: View, mask: np.ndarray) -> float:
+    """Mean gradient of the photograph on the outline of a mask, of which it has most on its own."""
+    grey = view.pixels.image.astype(np.float64).mean(-1)
+    gradient = np.hypot(*np.gradient(grey))
+    outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
+    return float(gradient[outline].mean()) if outline.any() else 0.0
+
+
+def _twins(views: Sequence[View]) -> tuple[str, ...]:
+    """The first two cameras with the same pose."""
+    for one, other in itertools.combinations(views, 2):
+        if np.allclose(one.camera.pose, other.camera.pose, rtol=1e-6, atol=1e-9):
+            return one.name, other.name
+    return ()
+
+
+def _size(folder: CaptureFolder, ranked: Ranked) -> float:
+    """The subject's largest extent in the user's unit; 0 where it is not known."""
+    try:
+        silhouettes = silhouettes_of(folder, ranked.hypothesis.views)
+    except InputError:
+        return 0.0
+    focus, _ = subject_place(silhouettes)
+    return float(np.median([extent(s, focus).max() for s in silhouettes]))
+
+
+def _size_line(size: float) -> str:
+    """How large the subject is, and which unit would make it a person."""
+    if PERSON[0] <= size <= PERSON[1]:
+        return f"the subject is {size:.3g} units tall: a person in metres"
+    unit = next((n for n, u in _UNITS.items() if PERSON[0] <= size * u <= PERSON[1]), None)
+    if unit is None:
+        return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
+    option = f"calibration.unit={_UNITS[unit]:g}"
+    return f"the subject is {size:.4g} units tall, a person in {unit}: {option} makes it metres"
+
+
+def _healthy(folder: CaptureFolder, given: Ranked) -> Diagnosis:
+    size = _size(folder, given)
+    line = f"cameras and masks agree ({given.score:.0%} of each mask or more lies in the hull of the others)"
+    return Diagnosis(True, (line, _size_line(size)), "", (given,), size)
+
+
+def _explained(folder: CaptureFolder, given: Ranked, best: Ranked, tried: list[Ranked]) -> Diagnosis:
+    """Another meaning fits."""
+    size, hypothesis = _size(folder, best), best.hypothesis
+    line = f"{hypothesis.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"
+    lines = [line, _size_line(size)]
+    if hypothesis.option:
+        lines.insert(1, f"try {hypothesis.option}")
+    return Diagnosis(False, tuple(lines), hypothesis.option, tuple(tried), size, hypothesis.blames)
+
+
+def _unexplained(folder: CaptureFolder, given: Ranked, tried: list[Ranked]) -> Diagnosis:
+    """No meaning fits: the camera without which the others agree, if there is one."""
+    base = max((r for r in tried if not r.hypothesis.blames), key=lambda r: r.score)
+    base = base if base.score > given.score + BETTER else given
+    views = base.hypothesis.views
+    without = {}
+    for left_out in views if len(views) > 2 else ():
+        rest = tuple(view for view in views if view is not left_out)
+        without[left_out.name] = _rank(folder, replace(base.hypothesis, views=rest))
+    fitting = [name for name, others in without.items() if others.score >= AGREES]
+    best = max(without, key=lambda name: without[name].score, default=None)
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in base.shares.items())
+    lines = [f"masks and cameras disagree (share of each mask in the hull of the others: {shares})"]
+    if fitting and len(views) > 3:
+        lines.append(f"{best} disagrees with the others, which agree by {without[best].score:.0%} without it")
+    elif fitting:
+        lines.append(f"{' or '.join(fitting)} disagrees with the others (three cameras cannot tell for sure)")
+    size = _size(folder, base)
+    suspects = () if not fitting else (best,) if len(views) > 3 else tuple(fitting)
+    return Diagnosis(False, tuple(lines), "", tuple(tried), size, suspects)

@@ -1,0 +1,107 @@
+"""Cameras checked by eye: photographs with masks, hulls and epipolar lines."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from ghgs_lit.data.silhouettes import Silhouette, subject_place
+from ghgs_lit.prediction.capture.consistency import hull_outline
+from ghgs_lit.visualization.pictures import row, stack
+
+# Cells of the hull along the longer side of a photograph, and steps of an epipolar line.
+_CELLS, _STEPS = 160, 200
+_MASK, _HULL = (0, 255, 90), (255, 60, 40)
+_COLORS = ((255, 220, 0), (0, 200, 255), (255, 120, 255), (255, 160, 60), (160, 255, 120))
+
+
+def camera_sheet(
+    names: Sequence[str], images: Sequence[np.ndarray], views: Sequence[Silhouette]
+) -> np.ndarray:
+    """A row with masks (green) and the hulls of the others (red), and a row of epipolar lines for each view.
+
+    The first picture of a row of lines has points of the mask, the others the lines on which each must be,
+    where it is as far away as the subject: a line passes the same part of the body in every photograph.
+
+    Args:
+        names: of the cameras.
+        images: photographs [h, w, 3] uint8.
+        views: masks of the photographs' sizes with their cameras.
+
+    Returns:
+        [H, W, 3] uint8.
+    """
+    focus, radius = subject_place(views)
+    small = [_smaller(view) for view in views]
+    tiles = [
+        _outlined(image, view.mask, _enlarged(hull_outline(small, i), view.mask.shape))
+        for i, (image, view) in enumerate(zip(images, views, strict=True))
+    ]
+    rows = [row(tiles, [f"{name}: mask green, hull of the others red" for name in names])]
+    for i, view in enumerate(views):
+        order = [i, *(j for j in range(len(views)) if j != i)]
+        points = _extremes(view.mask)
+        tiles = [_dots(images[i], points)]
+        tiles += [_lines(images[j], view, views[j], points, focus, radius) for j in order[1:]]
+        rows.append(row(tiles, [f"points of {names[i]}", *(f"on {names[j]}" for j in order[1:])]))
+    return stack(rows)
+
+
+def _smaller(view: Silhouette) -> Silhouette:
+    """At most ``_CELLS`` along the longer side, by taking every nth pixel."""
+    step = max(-(-max(view.mask.shape) // _CELLS), 1)
+    intrinsics = view.intrinsics.copy()
+    intrinsics[:2] /= step
+    return Silhouette(view.mask[step // 2 :: step, step // 2 :: step], intrinsics, view.extrinsics)
+
+
+def _enlarged(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return np.asarray(Image.fromarray(mask).resize(shape[::-1], Image.Resampling.NEAREST))
+
+
+def _outlined(image: np.ndarray, mask: np.ndarray, hull: np.ndarray) -> np.ndarray:
+    picture = image.copy()
+    for shape, color in ((hull, _HULL), (mask, _MASK)):
+        picture[shape ^ ndimage.binary_erosion(shape)] = color
+    return picture
+
+
+def _extremes(mask: np.ndarray) -> np.ndarray:
+    """Pixels [5, 2] (column, row): the mask's top, bottom, left and right ones, and one in its middle."""
+    pixels = np.argwhere(mask)[:, ::-1]
+    middle = np.abs(pixels - np.median(pixels, 0)).sum(1).argmin()
+    ends = [pixels[:, 1].argmin(), pixels[:, 1].argmax(), pixels[:, 0].argmin(), pixels[:, 0].argmax()]
+    return pixels[[*ends, middle]] + 0.5
+
+
+def _dots(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    picture = Image.fromarray(image)
+    draw = ImageDraw.Draw(picture)
+    for (x, y), color in zip(points.tolist(), _COLORS, strict=True):
+        draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=color)
+    return np.asarray(picture)
+
+
+def _lines(
+    image: np.ndarray,
+    own: Silhouette,
+    other: Silhouette,
+    points: np.ndarray,
+    focus: np.ndarray,
+    radius: float,
+) -> np.ndarray:
+    """The lines of ``own``'s ``points`` on a photograph, as far from ``own`` as the subject is."""
+    picture = Image.fromarray(image)
+    draw = ImageDraw.Draw(picture)
+    middle = (own.extrinsics[:3, :3] @ focus + own.extrinsics[:3, 3])[2]
+    depths = middle + radius * np.linspace(-1, 1, _STEPS)
+    depths = depths[depths > 0]
+    for ray, color in zip(own.rays(points), _COLORS, strict=True):
+        local = (own.center + ray * depths[:, None]) @ other.extrinsics[:3, :3].T + other.extrinsics[:3, 3]
+        local = local[local[:, 2] > 0]
+        pixels = local @ other.intrinsics.T
+        line = (pixels[:, :2] / pixels[:, 2:]).clip(-1e4, 1e4)
+        if len(line) > 1:
+            draw.line([tuple(p) for p in line.tolist()], fill=color, width=1)
+    return np.asarray(picture)

@@ -1,0 +1,174 @@
+"""A folder of photographs with a calibration: one instant, or many."""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ghgs_lit.data.silhouettes import implausible
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
+from ghgs_lit.prediction.capture.calibration import (
+    Calibration,
+    Convention,
+    StoredCamera,
+    calibrate,
+    quarter_turned,
+)
+from ghgs_lit.prediction.capture.capture import Capture, Photograph
+from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
+from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
+from ghgs_lit.prediction.capture.photographs import (
+    Pixels,
+    find_instants,
+    fits_stored,
+    image_named,
+    read_pixels,
+)
+
+EXIF = ("auto", "stored", "shown")
+_CONVENTION = tuple(f.name for f in fields(Convention))
+
+
+@dataclass(frozen=True)
+class CaptureFolder:
+    """``folder.read(instant) -> Capture`` for each of ``folder.instants``.
+
+    Args:
+        images: folder of photographs named after their cameras; or of such folders, one for each instant.
+        cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`.
+        masks: folder of masks, laid out and named as the photographs; None: ``backgrounds``, ``segment``,
+            masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
+        backgrounds: folder of photographs without the subject, named after the cameras.
+        segment: a segmenter of :data:`ghgs_lit.prediction.capture.masks.SEGMENTERS`.
+        calibration: what the file does not say, or says wrongly: ``format``; the fields of
+            :class:`Convention`; ``exif`` (:func:`fits_stored`); ``names``, the camera of a photograph whose
+            name differs, as ``{photograph: camera}``. None and missing keys are as the format has it.
+
+    Raises:
+        InputError: a folder or file is missing or wrong.
+    """
+
+    images: str | Path
+    cameras: str | Path
+    masks: str | Path | None = None
+    backgrounds: str | Path | None = None
+    segment: str | None = None
+    calibration: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        known = ("format", "exif", "names", *_CONVENTION)
+        unknown = sorted(set(self.calibration) - set(known))
+        require(not unknown, "calibration", f"keys among {', '.join(known)}", unknown)
+        choice("calibration.exif", self._said("exif", "auto"), EXIF)
+        for name in ("masks", "backgrounds"):
+            path = getattr(self, name)
+            there = path is None or Path(path).expanduser().is_dir()
+            require(there, name, "a folder", str(path))
+        _ = self.paths  # what is missing is missed here
+
+    def _said(self, key: str, default: Any) -> Any:
+        value = self.calibration.get(key)
+        return default if value is None else value
+
+    @functools.cached_property
+    def file(self) -> CameraFile:
+        """The cameras as stored."""
+        return read_cameras(self.cameras, self._said("format", "auto"))
+
+    @functools.cached_property
+    def convention(self) -> Convention:
+        """What the stored numbers mean: as the format has it, but for what the user says."""
+        said = {name: self._said(name, getattr(self.file.convention, name)) for name in _CONVENTION}
+        return Convention(**said)
+
+    @functools.cached_property
+    def paths(self) -> dict[str, dict[str, Path]]:
+        """``{instant: {camera: path}}``."""
+        folder = Path(self.images).expanduser()
+        return find_instants(folder, self.file.cameras, dict(self._said("names", {})))
+
+    @property
+    def instants(self) -> list[str]:
+        """Names of the instants, in their order."""
+        return list(self.paths)
+
+    def read(self, instant: str) -> Capture:
+        """The photographs of one instant.
+
+        Raises:
+            InputError: a photograph or mask is missing or wrong.
+        """
+        views = zip(self.paths[instant], self.decode(instant), strict=True)
+        return Capture(instant, tuple(self.photograph(name, *view, self.convention) for name, view in views))
+
+    def decode(self, instant: str) -> list[tuple[StoredCamera, Pixels, np.ndarray]]:
+        """Camera, photograph and matte as shown of each view, before the calibration is applied."""
+        found = []
+        for name, path in self.paths[instant].items():
+            camera, pixels = self.file.cameras[name], read_pixels(path)
+            matte = self._matte(name, camera, path, pixels)
+            problem = implausible(matte > 127)
+            if problem is not None:
+                raise InputError(f"{path}: {problem}")
+            found.append((camera, pixels, matte))
+        return found
+
+    def photograph(
+        self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
+    ) -> Photograph:
+        """One view without distortion and upright, as a convention has it."""
+        image, turns = pixels.image, 0
+        if fits_stored(pixels, camera, self._said("exif", "auto")):
+            turns = pixels.turns
+            image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
+        size = image.shape[:2]
+        calibration = calibrate(camera, convention, size)
+        if calibration.distortion.any():
+            image, matte = undistort(image, matte, _grid(_key(calibration), *size))
+        calibration = quarter_turned(calibration, turns, size)
+        image, matte = np.rot90(image, turns), np.rot90(matte, turns)
+        return Photograph(name, image, matte, calibration.intrinsics, calibration.extrinsics)
+
+    def _matte(self, name: str, camera: StoredCamera, path: Path, pixels: Pixels) -> np.ndarray:
+        """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
+        images = Path(self.images).expanduser()
+        if self.masks is not None:
+            found = mask_path(path, images, Path(self.masks).expanduser())
+            require(found is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
+            return matte_of_file(found, pixels)
+        if self.backgrounds is not None:
+            background = image_named(Path(self.backgrounds).expanduser(), name)
+            expected = f"a photograph {name} without the subject"
+            require(background is not None, f"{self.backgrounds}", expected, "none")
+            return matte_of_background(pixels, background)
+        if self.segment is not None:
+            return _segmenter(self.segment)(pixels)
+        beside = mask_path(path, images, images)
+        named = beside if beside is not None else camera.mask
+        if named is not None:
+            return matte_of_file(named, pixels)
+        if pixels.alpha is not None:
+            return pixels.alpha
+        raise InputError(
+            f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
+            f" segment=rembg, {path.stem}_mask.png beside the photograph, or an alpha channel; found none"
+        )
+
+
+_segmenter = functools.cache(segmenter)
+
+
+def _key(calibration: Calibration) -> tuple:
+    """What undistortion depends on, hashable: many instants share it."""
+    return tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
+
+
+@functools.lru_cache(maxsize=16)
+def _grid(key: tuple, height: int, width: int) -> torch.Tensor:
+    intrinsics, distortion, fisheye = key
+    return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

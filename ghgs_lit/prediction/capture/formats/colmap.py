@@ -1,0 +1,68 @@
+"""COLMAP's sparse models, text and binary, by COLMAP's own reader (the extra ``colmap``)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, by_name
+
+#: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
+_MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+}
+_ORDER = {False: ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"], True: ["k1", "k2", "k3", "k4"]}
+
+
+def model_folder(path: Path) -> Path | None:
+    """The folder of a sparse model at or below ``path``, None where there is none."""
+    places = [path, path / "sparse" / "0", path / "sparse", path / "0"]
+    return next((p for p in places if (p / "cameras.bin").exists() or (p / "cameras.txt").exists()), None)
+
+
+def read_colmap(path: Path) -> CameraFile:
+    """Registered photographs of a sparse model.
+
+    Raises:
+        InputError: it cannot be read, pycolmap is not installed, or a camera model is not known.
+    """
+    folder = model_folder(path if path.is_dir() else path.parent)
+    require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
+    try:
+        import pycolmap
+    except ImportError:
+        raise InputError(
+            f"{path}: expected pycolmap to read COLMAP's models (pip install 'ghgs-lit[colmap]'); found none"
+        ) from None
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"{folder}: expected a COLMAP model; found {error}") from error
+    images = [image for image in model.images.values() if image.has_pose]
+    require(bool(images), str(folder), "photographs with a pose", "none")
+    cameras = [_camera(folder, image, model.cameras[image.camera_id]) for image in images]
+    return CameraFile(by_name(cameras), Convention(), "colmap")
+
+
+def _camera(folder: Path, image, camera) -> StoredCamera:
+    place, model = f"{folder}: {image.name}", camera.model.name
+    require(model in _MODELS, place, f"a camera model among {', '.join(_MODELS)}", model)
+    values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
+    fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))
+    intrinsics = np.array([[fx, 0, values["cx"]], [0, fy, values["cy"]], [0, 0, 1]])
+    fisheye = "FISHEYE" in model
+    distortion = np.array([values.get(name, 0.0) for name in _ORDER[fisheye]])
+    distortion = distortion if distortion.any() else np.zeros(0)
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().matrix()
+    size = (camera.height, camera.width)
+    return StoredCamera(image.name, place, intrinsics, pose, size, distortion, fisheye)

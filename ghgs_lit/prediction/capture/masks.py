@@ -1,0 +1,101 @@
+"""The subject's matte in a photograph: from a file, alpha, a photograph of the background, or rembg.
+
+A matte [h, w] uint8 is 255 times the share of each pixel that shows the subject; of a mask 0 and 255.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from ghgs_lit.data.decoding import read_image
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.prediction.capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
+
+#: Choices of ``segment``.
+SEGMENTERS = ("rembg",)
+# Labels of body parts are numbers below this; alpha and probabilities reach 255.
+_LABELS = 32
+# By how many deviations of the noise a pixel differs from the background, and by how much at least.
+_DEVIATIONS, _LEAST_DIFFERENCE = 6.0, 12.0
+# Regions below this share of the largest one's area are not of the subject.
+_SPECK = 0.05
+
+
+def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
+    """The matte of the photograph as shown, from labels (any but 0), or from grey of 8 or 16 bits.
+
+    Raises:
+        InputError: it cannot be decoded, or fits the photograph neither as shown nor as stored.
+    """
+    image = read_image(path)
+    values = np.asarray(image.getchannel("A") if image.mode in ("LA", "RGBA") else image)
+    require(values.dtype.kind in "bui", str(path), "a mask of whole numbers", values.dtype)
+    values = values if values.ndim == 2 else values.max(-1)
+    if values.shape != pixels.size:
+        fits = values.shape == pixels.stored_size
+        require(fits, str(path), f"the size of its photograph, {pixels.size} (height, width)", values.shape)
+        values = np.rot90(values, pixels.turns)
+    most = int(values.max(initial=0))
+    if most < _LABELS:
+        return (values > 0) * np.uint8(255)
+    return np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8)
+
+
+def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
+    """A mask: where a photograph differs from one without the subject, without specks and holes.
+
+    Raises:
+        InputError: the background's photograph has another size, or nothing differs.
+    """
+    background = read_pixels(path)
+    fits = background.size == pixels.size
+    require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)
+    difference = np.abs(pixels.image.astype(np.float32) - background.image).max(-1)
+    # Most pixels show the background, so that the median is of the noise: 1.48 times it is one deviation.
+    threshold = max(_DEVIATIONS * 1.4826 * float(np.median(difference)), _LEAST_DIFFERENCE)
+    radius = max(max(pixels.size) // 400, 1)
+    regions, count = ndimage.label(ndimage.binary_opening(difference > threshold, iterations=radius))
+    require(count > 0, str(path), "a background that differs from the photograph", "no difference")
+    areas = np.bincount(regions.ravel())
+    areas[0] = 0
+    subject = (areas >= _SPECK * areas.max())[regions]
+    radius *= 2
+    closed = ndimage.binary_closing(np.pad(subject, radius), iterations=radius)
+    return ndimage.binary_fill_holes(closed[radius:-radius, radius:-radius]) * np.uint8(255)
+
+
+def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
+    """A function from a photograph to its matte.
+
+    Args:
+        name: one of :data:`SEGMENTERS`.
+
+    Raises:
+        InputError: its package is not installed.
+    """
+    choice("segment", name, SEGMENTERS)
+    try:
+        import rembg
+    except ImportError:
+        raise InputError(
+            "segment: expected the extra segment for rembg (pip install 'ghgs-lit[segment]'); found none"
+        ) from None
+    session = rembg.new_session()
+
+    def matte(pixels: Pixels) -> np.ndarray:
+        alpha = rembg.remove(Image.fromarray(pixels.image), session=session, only_mask=True)
+        return np.asarray(alpha.convert("L"))
+
+    return matte
+
+
+def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
+    """The mask's file: in the same place below ``masks`` as the photograph below ``images``; None: none."""
+    folder = masks / photograph.resolve().parent.relative_to(images.resolve())
+    marked = f"{photograph.stem}{MASK_ENDING}"
+    # Beside a photograph the image of its name is the photograph itself.
+    beside = folder.resolve() == photograph.resolve().parent
+    return image_named(folder, *([marked] if beside else [photograph.stem, marked]))

@@ -1,0 +1,165 @@
+"""Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags
+
+from ghgs_lit.data.decoding import read_image
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
+#: A mask beside its photograph ends with this.
+MASK_ENDING = "_mask"
+#: How EXIF says to show a photograph: orientation to quarter turns as of ``numpy.rot90``.
+_TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
+_EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """One decoded photograph as it is shown.
+
+    Attributes:
+        image: [h, w, 3] uint8, RGB.
+        alpha: [h, w] uint8 where the file has it.
+        turns: quarter turns that showing it took, as of ``numpy.rot90``.
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray | None
+    turns: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) as shown."""
+        return self.image.shape[:2]
+
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """(height, width) as the file stores it."""
+        return self.size[::-1] if self.turns % 2 else self.size
+
+
+def read_pixels(path: Path) -> Pixels:
+    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says.
+
+    Raises:
+        InputError: it is missing, cannot be decoded, has other values, or is mirrored.
+    """
+    image = read_image(path)
+    require(image.mode in _EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
+    orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    if orientation not in _TURNS:
+        raise InputError(
+            f"{path}: expected a photograph that is not mirrored; found EXIF orientation {orientation}"
+        )
+    turns, alpha = _TURNS[orientation], None
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        alpha = np.rot90(np.asarray(image.getchannel("A")), turns)
+    return Pixels(np.rot90(np.asarray(image.convert("RGB")), turns), alpha, turns)
+
+
+def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
+    """Whether a camera was calibrated with the photograph as it is stored, not as it is shown.
+
+    The size of the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns
+    photographs when it reads them.
+
+    Args:
+        pixels: the photograph.
+        camera: of the file.
+        exif: ``auto`` | ``stored`` | ``shown``: what the user says.
+    """
+    if exif != "auto" or not pixels.turns:
+        return exif == "stored"
+    size = camera.size
+    return size is not None and same_ratio(size, pixels.stored_size) and not same_ratio(size, pixels.size)
+
+
+def images_in(folder: Path) -> dict[str, Path]:
+    """Photographs of a folder by name without suffix, sorted; masks beside them are left out.
+
+    Raises:
+        InputError: two of them have one name.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        if not is_image or path.stem.endswith(MASK_ENDING):
+            continue
+        twin = found.get(path.stem)
+        require(twin is None, str(path), "one file for each photograph", str(twin))
+        found[path.stem] = path
+    return found
+
+
+def image_named(folder: Path, *names: str) -> Path | None:
+    """The image of a folder with one of these names (without suffix), None where there is none."""
+    places = (folder / f"{name}{suffix}" for name in names for suffix in SUFFIXES)
+    return next((path for path in places if path.exists()), None)
+
+
+def find_instants(
+    folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
+) -> dict[str, dict[str, Path]]:
+    """The photographs of each instant: those of the folder itself, or of its folders.
+
+    Folders are instants, each with a photograph of every camera; folders with the names of cameras hold one
+    photograph for each instant.
+
+    Args:
+        folder: of the photographs.
+        cameras: by name.
+        names: the camera of a photograph (or of a camera's folder) whose name differs from the camera's.
+
+    Returns:
+        Paths by camera, by instant: ``{instant: {camera: path}}``.
+
+    Raises:
+        InputError: there are none, or photographs and cameras do not fit together.
+    """
+    there = "a file" if folder.exists() else "no such folder"
+    require(folder.is_dir(), str(folder), "a folder of photographs", there)
+    if own := images_in(folder):
+        return {folder.resolve().name: _by_camera(folder, own, cameras, names)}
+    below = {path.name: images_in(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+    folders = {name: found for name, found in below.items() if found}
+    require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
+    if all(names.get(name, name) in cameras for name in folders):
+        return _by_instant(folder, _by_camera(folder, folders, cameras, names))
+    return {name: _by_camera(folder / name, paths, cameras, names) for name, paths in folders.items()}
+
+
+def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
+    """``{camera: {instant: path}}`` the other way around."""
+    first, *others = by_camera
+    for other in others:
+        differing = sorted(set(by_camera[first]) ^ set(by_camera[other]))
+        expected = f"photographs named as those of {first}"
+        require(not differing, f"{folder}: {other}", expected, f"others: {', '.join(differing[:3])}")
+    return {
+        instant: {camera: paths[instant] for camera, paths in by_camera.items()}
+        for instant in by_camera[first]
+    }
+
+
+def _by_camera(
+    folder: Path, found: Mapping[str, Any], cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
+) -> dict[str, Any]:
+    """What was found under each photograph's name, by camera."""
+    unknown = [name for name in found if names.get(name, name) not in cameras]
+    if unknown:
+        raise InputError(
+            f"{folder}: expected photographs named after cameras ({', '.join(cameras)}), or"
+            f" calibration.names={{photograph: camera}}; found {', '.join(unknown)}"
+        )
+    require(len(found) >= 2, str(folder), "2 photographs or more", len(found))
+    by_camera = {names.get(name, name): value for name, value in found.items()}
+    require(len(by_camera) == len(found), "calibration.names", "one photograph for each camera", dict(names))
+    return by_camera

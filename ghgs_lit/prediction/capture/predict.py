@@ -1,0 +1,120 @@
+"""Photographs in, Gaussians out, in the user's world."""
+
+import functools
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ghgs_lit.config.settings import image_size
+from ghgs_lit.errors import require
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.model import GHGS
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Gaussians, Prediction
+from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.reading import SHIPPED, file_of
+
+
+@dataclass(frozen=True)
+class CapturePrediction:
+    """What a model makes of a capture, in the user's world and unit.
+
+    Attributes:
+        batch: what the model saw: crops around the subject, with their cameras, corrected ones where asked.
+        prediction: of this batch.
+        seconds: run time by stage.
+        moved: pixels that correcting moved the subject by in each crop; nothing where cameras stay.
+        changed: which share of the subject refining changed in each crop; nothing where masks stay.
+    """
+
+    batch: Batch
+    prediction: Prediction
+    seconds: dict[str, float] = field(default_factory=dict)
+    moved: tuple[float, ...] = ()
+    changed: tuple[float, ...] = ()
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return self.prediction.gaussians
+
+
+@torch.no_grad()
+def predict(
+    capture: Capture,
+    model: GHGS | str | Path = SHIPPED,
+    size: int | tuple[int, int] | None = None,
+    refine_cameras: int = 0,
+    refine_masks: int = 0,
+) -> CapturePrediction:
+    """The Gaussians of a capture.
+
+    Args:
+        capture: the photographs.
+        model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
+            one that comes with the package.
+        size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
+            (checkpoints only).
+        refine_cameras: rounds, at most, that correct the cameras until the photographs agree
+            (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
+        refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then found in the
+            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
+
+    Raises:
+        InputError: the checkpoint cannot be used, or the size does not fit the model.
+    """
+    if not isinstance(model, GHGS):
+        path = file_of(model)
+        size = size or trained_size(read_checkpoint(path)["config"])
+        model = _model(path, path.stat().st_mtime_ns)
+    require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
+    seconds, moved = {}, ()
+    batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
+    batch = batch.to(next(model.parameters()).device)
+    start = time.perf_counter()
+    if refine_cameras:
+        taken, batch = batch, CameraRefinement(refine_cameras, model, Renderer())(batch)
+        moved = tuple(pixels_moved(taken, batch)[0])
+        seconds["refine_cameras"] = time.perf_counter() - start
+    start = time.perf_counter()
+    # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
+    frame = Frame.of(batch)
+    prediction = frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
+    if batch.images.device.type == "cuda":
+        torch.cuda.synchronize()
+    seconds["predict"] = time.perf_counter() - start
+    return CapturePrediction(batch, prediction, seconds, moved, changed)
+
+
+def _crops(
+    capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
+) -> tuple[Batch, tuple[float, ...]]:
+    """What the model sees, and by how much refining changed each matte; notes the run time of both."""
+    start = time.perf_counter()
+    given = capture.batch(size)
+    seconds["crop"] = time.perf_counter() - start
+    if not refine_masks:
+        return given, ()
+    start = time.perf_counter()
+    batch = capture.batch(size, refine_masks)
+    seconds["refine_masks"] = time.perf_counter() - start
+    changed = (batch.alpha - given.alpha).abs().sum((-2, -1)) / given.alpha.sum((-2, -1))
+    return batch, tuple(changed[0].tolist())
+
+
+def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
+    """Side or (height, width) of the photographs that a checkpoint's model was trained with.
+
+    Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
+    """
+    return config.get("data", {}).get("size") or config["encoder"].get("image_size", 518)
+
+
+@functools.lru_cache(maxsize=1)
+def _model(path: Path, changed: int) -> GHGS:
+    return GHGS.from_checkpoint(path)

@@ -1,0 +1,83 @@
+"""Gaussians as binary glTF with the Khronos extension ``KHR_gaussian_splatting``.
+
+The vertices are in the world of the files; glTF's up is +y, so a node turns the world upright. Programs
+without the extension show coloured points.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ghgs_lit.errors import require
+from ghgs_lit.files import write_atomically
+from ghgs_lit.prediction.export.ply import SH_CONSTANT
+from ghgs_lit.prediction.export.world import AXES, turn
+from ghgs_lit.types import Gaussians
+
+EXTENSION = "KHR_gaussian_splatting"
+_KERNEL = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "zDepth",
+    "projection": "perspective",
+}
+
+
+def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
+    """Write the Gaussians of one subject (RGB colours).
+
+    Args:
+        gaussians: in the world of the files.
+        up: the unit vector [3] of that world that points up.
+        path: the file to write.
+
+    Raises:
+        InputError: there are none: glTF has no empty lists.
+    """
+    import pygltflib as gltf
+
+    require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)
+
+    means, scales, quaternions, opacities, colors = (
+        getattr(gaussians, name).detach().float().cpu()
+        for name in ("means", "scales", "quaternions", "opacities", "colors")
+    )
+    rgba = torch.cat([colors, opacities[:, None]], dim=-1).clamp(0, 1) * 255
+    columns = {
+        "POSITION": means,
+        "COLOR_0": rgba.round().byte(),
+        f"{EXTENSION}:ROTATION": torch.nn.functional.normalize(quaternions, dim=-1)[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": scales,
+        f"{EXTENSION}:OPACITY": opacities.clamp(0, 1),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (colors - 0.5) / SH_CONSTANT,
+    }
+    model, blob = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[0])]), b""
+    for name, values in columns.items():
+        data = np.ascontiguousarray(values.numpy()).tobytes()
+        model.bufferViews.append(
+            gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(data), target=gltf.ARRAY_BUFFER)
+        )
+        is_bytes = values.dtype == torch.uint8
+        accessor = gltf.Accessor(
+            bufferView=len(model.bufferViews) - 1,
+            componentType=gltf.UNSIGNED_BYTE if is_bytes else gltf.FLOAT,
+            normalized=is_bytes,
+            count=len(values),
+            type="SCALAR" if values.dim() == 1 else f"VEC{values.shape[1]}",
+        )
+        if name == "POSITION":
+            accessor.min, accessor.max = values.amin(0).tolist(), values.amax(0).tolist()
+        model.accessors.append(accessor)
+        blob += data
+    attributes = gltf.Attributes(**{name: index for index, name in enumerate(columns)})
+    primitive = gltf.Primitive(attributes=attributes, mode=gltf.POINTS, extensions={EXTENSION: _KERNEL})
+    w, x, y, z = turn(up.cpu(), torch.tensor(AXES["y"])).tolist()
+    model.nodes, model.meshes = (
+        [gltf.Node(mesh=0, rotation=[x, y, z, w])],
+        [gltf.Mesh(primitives=[primitive])],
+    )
+    model.extensionsUsed, model.buffers = [EXTENSION], [gltf.Buffer(byteLength=len(blob))]
+    model.set_binary_blob(blob)
+    content = b"".join(model.save_to_bytes())
+    write_atomically(path, lambda temporary: temporary.write_bytes(content))

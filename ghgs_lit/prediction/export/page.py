@@ -1,0 +1,56 @@
+"""A single HTML file that shows Gaussians in any browser with WebGL 2, without a network."""
+
+import base64
+import gzip
+import html
+import json
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from torch import Tensor
+
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.geometry.projection import look_at_point
+from ghgs_lit.prediction.export.splat import to_records
+from ghgs_lit.types import Cameras, Gaussians
+from ghgs_lit.visualization.turntable import pixel_size
+
+
+def write_page(
+    gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tensor, name: str, path: Path
+) -> None:
+    """Write the page; it begins at the first camera, and has a button for each.
+
+    Args:
+        gaussians: of one subject, RGB colours.
+        cameras: of the photographs [V].
+        views: their names.
+        up: the unit vector [3] that points up.
+        name: of the subject, for the title.
+        path: the file to write.
+    """
+    scene = {
+        "size": [cameras.width, cameras.height],
+        "up": up.tolist(),
+        "target": look_at_point(cameras).tolist(),
+        "pixel": pixel_size(cameras),
+        "low_pass": gaussians.low_pass,
+        "antialiased": gaussians.antialiased,
+        "cameras": [
+            {"name": view, "intrinsics": k, "extrinsics": e}
+            for view, k, e in zip(
+                views, cameras.intrinsics.tolist(), cameras.extrinsics.tolist(), strict=True
+            )
+        ],
+    }
+    data = base64.b64encode(gzip.compress(to_records(gaussians).tobytes(), mtime=0)).decode()
+    text = files("ghgs_lit.prediction.export").joinpath("page.html").read_text()
+    values = {
+        "title": html.escape(name),
+        # A script ends at "</" whatever is around it.
+        "scene": json.dumps(scene).replace("</", "<\\/"),
+        "data": data,
+    }
+    write_text_atomically(path, re.sub(r"\{\{(\w+)\}\}", lambda place: values[place[1]], text))

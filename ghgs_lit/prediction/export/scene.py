@@ -1,0 +1,188 @@
+"""What is written of one subject: its prediction, photographs and cameras, in the frame of the files."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.geometry.mattes import coverage, surface_colors
+from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import pixel_size, turntable, up_direction
+
+#: The package that a format needs, and the extra that installs it.
+PACKAGES = {
+    "compressed_ply": ("gaussforge", "formats"),
+    "spz": ("gaussforge", "formats"),
+    "sog": ("gaussforge", "formats"),
+    "glb": ("pygltflib", "formats"),
+    "mp4": ("imageio_ffmpeg", "video"),
+}
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """What is written, and how.
+
+    Args:
+        formats: names of :data:`ghgs_lit.prediction.export.prediction.WRITERS`.
+        up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
+        smooth: the files of Gaussians hold what a renderer adds in pixels of the photographs.
+        frames: pictures of the turntable.
+        fps: of these, per second of the video.
+    """
+
+    formats: tuple[str, ...] = ("ply",)
+    up: str | None = None
+    smooth: bool = False
+    frames: int = 24
+    fps: int = 12
+
+    def __post_init__(self):
+        choice("up", self.up, (None, *AXES))
+        require(self.frames >= 0, "turntable.frames", "a number of at least 0", self.frames)
+
+
+def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
+    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide.
+
+    These are ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
+    Gaussians, for others the geometric mean of their axes.
+    """
+    variances = gaussians.scales.square()
+    wider = variances + gaussians.low_pass * pixel**2
+    opacities = gaussians.opacities
+    if gaussians.antialiased:
+        ratio = variances / torch.where(wider > 0, wider, 1.0)
+        opacities = opacities * ratio.prod(-1).pow(1 / 3)
+    return dataclasses.replace(
+        gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False
+    )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
+
+    ``images`` are premultiplied by ``mattes``, which are the masks where there are none.
+    ``points`` are the unprojected pixels of the subject with their ``colors``; ``dropped`` counts Gaussians
+    that are not finite, which no renderer draws and no file holds.
+    """
+
+    name: str
+    views: tuple[str, ...]
+    gaussians: Gaussians
+    dropped: int
+    cameras: Cameras
+    images: Float[Tensor, "V 3 H W"]
+    masks: Bool[Tensor, "V H W"]
+    mattes: Float[Tensor, "V H W"]
+    depth: Float[Tensor, "V H W"]
+    depth_valid: Bool[Tensor, "V H W"]
+    points: Float[Tensor, "n 3"]
+    colors: Float[Tensor, "n 3"]
+    up: Float[Tensor, "3"]
+    renderer: Renderer
+    options: OutputOptions
+
+    @cached_property
+    def stored(self) -> Gaussians:
+        """The Gaussians as their files hold them.
+
+        A renderer adds ``low_pass`` square pixels of its own screen to a Gaussian that was made for the
+        photographs' pixels; with ``smooth`` the file has these already (as the 3D smoothing of
+        Mip-Splatting, Yu et al. 2024), and a larger screen shows no gaps.
+        """
+        if not self.options.smooth:
+            return self.gaussians
+        return smoothed(self.gaussians, pixel_size(self.cameras))
+
+    @cached_property
+    def turntable(self) -> list[np.ndarray]:
+        """Pictures [h, w, 3] uint8 from all around."""
+        orbit = turntable(self.cameras, self.options.frames)
+        images = (
+            self.renderer(self.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
+            for frame in range(self.options.frames)
+        )
+        return [to_uint8(image) for image in images]
+
+
+def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions) -> Scene:
+    """The scene of a batch of one subject.
+
+    Raises:
+        InputError: several subjects.
+    """
+    count = len(batch.images)
+    require(count == 1, "write_prediction", "a batch of one subject", count)
+    cameras, gaussians = batch.cameras[0], prediction.gaussians.detach()
+    finite = gaussians.is_finite
+    kept = int(finite.sum())
+    dropped = len(gaussians) - kept
+    gaussians = gaussians.select(finite, (kept,)) if dropped else gaussians
+    up = up_direction(cameras)
+    if options.up is not None:
+        end = up.new_tensor(AXES[options.up])
+        gaussians, cameras = rotate_world(turn(up, end), gaussians, cameras)
+        up = end
+    depth, valid = prediction.depth[0].detach(), prediction.depth_valid[0] & batch.masks[0]
+    valid = valid & depth.isfinite() & (depth > 0)
+    return Scene(
+        name=batch.subjects[0] if batch.subjects else "subject",
+        views=batch.views[0] if batch.views else tuple(map(str, range(batch.images.shape[1]))),
+        gaussians=gaussians,
+        dropped=dropped,
+        cameras=cameras,
+        images=batch.images[0],
+        masks=batch.masks[0],
+        mattes=coverage(batch)[0],
+        depth=depth,
+        depth_valid=valid,
+        points=unproject_maps(depth, cameras)[valid],
+        colors=surface_colors(batch)[0].movedim(1, -1)[valid],
+        up=up,
+        renderer=renderer,
+        options=options,
+    )
+
+
+def file_name(view: str) -> str:
+    """The name of a photograph as a part of a file's name."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+
+
+def options_of(config: Mapping[str, Any], known: tuple[str, ...]) -> OutputOptions:
+    """The options of a verb's configuration: ``formats``, ``up`` and ``turntable``.
+
+    Args:
+        config: plain data.
+        known: the formats that there are; ``all`` stands for them.
+
+    Raises:
+        InputError: an unknown format, a value out of range, or a package that is not installed.
+    """
+    formats = config["formats"]
+    formats = [formats] if isinstance(formats, str) else formats
+    formats = known if "all" in formats else tuple(dict.fromkeys(formats))
+    for name in formats:
+        choice("formats", name, ("all", *known))
+        package, extra = PACKAGES.get(name, (None, None))
+        if package is not None and find_spec(package) is None:
+            hint = f"pip install 'ghgs-lit[{extra}]'"
+            raise InputError(f"formats: expected the package {package} for {name} ({hint}); found none")
+    table = config["turntable"]
+    frames = table["frames"]
+    require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
+    return OutputOptions(formats, config["up"], config["smooth"], frames, table["fps"])

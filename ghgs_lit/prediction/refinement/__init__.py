@@ -1,0 +1,6 @@
+"""Seconds of optimisation through the rasterizer, from a prediction."""
+
+from ghgs_lit.prediction.refinement.cameras import CameraRefinement, pixels_moved
+from ghgs_lit.prediction.refinement.refinement import Change, Refinement, Report
+
+__all__ = ["CameraRefinement", "Change", "Refinement", "Report", "pixels_moved"]

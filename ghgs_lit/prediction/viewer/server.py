@@ -1,0 +1,201 @@
+"""The page: a viser server with the Gaussians, cameras, points and hull, and controls for them."""
+
+import logging
+import math
+import threading
+from typing import Any
+
+import numpy as np
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.projection import look_at_point
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
+from ghgs_lit.prediction.export.scene import smoothed
+from ghgs_lit.prediction.viewer.content import Content
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import pixel_size
+
+PICTURES = ("render", "photograph", "FLIP")
+
+
+class Viewer:
+    """A running page.
+
+    Args:
+        content: what is shown.
+        host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
+        port: the first one to try.
+
+    Raises:
+        InputError: viser is not installed.
+    """
+
+    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
+        try:
+            import viser
+        except ImportError as error:
+            raise InputError(
+                f"ghgs view: expected the extra viewer (pip install 'ghgs-lit[viewer]'); found {error}"
+            ) from error
+        self.content = content
+        self._lock = threading.Lock()  # controls are answered by several threads
+        logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor otherwise
+        self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
+        self.server.scene.set_up_direction(content.up.numpy())
+        self._prepare()
+        with self.server.gui.add_folder("Gaussians"):
+            self._add_splat_controls()
+        self._add_points()
+        if content.batch is not None:
+            self._add_cameras()
+            with self.server.gui.add_folder("Photographs"):
+                self._add_comparison()
+        self.show_splats()
+
+    @property
+    def address(self) -> str:
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        self.server.stop()
+
+    def _prepare(self) -> None:
+        """Covariances of all Gaussians, in the order in which a count takes them."""
+        g, order = self.content.gaussians, self.content.order
+        if self.content.batch is not None:
+            # On a screen that is larger than the photographs there would be gaps.
+            g = smoothed(g, pixel_size(self.content.cameras))
+        root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
+        covariances = (root @ root.mT).numpy()
+        self._covariances = covariances
+        self._colors = g.colors[order].clamp(0, 1).numpy()
+        self._opacities = g.opacities[order][:, None].numpy()
+
+    def _add_splat_controls(self) -> None:
+        gui, count = self.server.gui, len(self.content.gaussians)
+        self.visible = gui.add_checkbox("show", True)
+        self.opacity = gui.add_slider("opacity", 0.0, 2.0, 0.05, 1.0, hint="factor of all opacities")
+        self.count = gui.add_slider("count", min(1, count), max(1, count), 1, max(1, count))
+        for control in (self.visible, self.opacity, self.count):
+            control.on_update(lambda _: self.show_splats())
+
+    def show_splats(self) -> None:
+        """Show as many Gaussians, and as opaque ones, as the controls say."""
+        with self._lock:
+            n = min(self.count.value, len(self._opacities))
+            self.splats = self.server.scene.add_gaussian_splats(
+                "/gaussians",
+                self.content.points[0][:n],
+                self._covariances[:n],
+                self._colors[:n],
+                (self._opacities[:n] * self.opacity.value).clip(0, 1),
+                visible=self.visible.value,
+            )
+
+    def _add_points(self) -> None:
+        means, colors = self.content.points
+        extent = np.ptp(means, axis=0).max() if len(means) else 1.0
+        clouds = {"points": (means, colors)}
+        if self.content.batch is not None:
+            clouds["hull"] = (self.content.hull, np.array([90, 160, 255], np.uint8))
+        with self.server.gui.add_folder("Layers"):
+            for name, cloud in clouds.items():
+                node = self.server.scene.add_point_cloud(
+                    f"/{name}", *cloud, point_size=float(extent) / 400, precision="float32", visible=False
+                )
+                self._switch(name, node)
+
+    def _switch(self, name: str, node: Any) -> None:
+        """A checkbox that shows and hides a node of the scene."""
+        box = self.server.gui.add_checkbox(name, node.visible)
+
+        @box.on_update
+        def _(_) -> None:
+            node.visible = box.value
+
+    def _show_frustums(self) -> None:
+        """At a camera, ``picture`` says whether its photograph lies over the Gaussians."""
+        for view, frustum in enumerate(self._frustums):
+            is_clear = view != self._at or self._shown == "photograph"
+            frustum.visible = self.cameras.value and is_clear
+
+    def _add_cameras(self) -> None:
+        from viser.transforms import SO3
+
+        cameras, batch = self.content.cameras, self.content.batch
+        self._poses, self._frustums = [], []
+        target = look_at_point(cameras).numpy()
+        size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
+        for view, name in enumerate(batch.views[0]):
+            k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
+            pose = {
+                "wxyz": SO3.from_matrix(e[:3, :3].T).wxyz,
+                "position": -e[:3, :3].T @ e[:3, 3],
+            }
+            fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
+            alpha = batch.masks[0, view].numpy() * np.uint8(255)
+            node = self.server.scene.add_camera_frustum(
+                f"/cameras/{name}",
+                fov,
+                cameras.width / cameras.height,
+                scale=size / 12,
+                thickness=size / 400,
+                image=np.dstack([to_uint8(batch.images[0, view]), alpha]),
+                **pose,
+            )
+            node.on_click(lambda _, view=view: self.go_to(view))
+            self._frustums.append(node)
+            self._poses.append((pose, fov))
+        self.cameras = self.server.gui.add_checkbox("cameras", True)
+        self.cameras.on_update(lambda _: self._show_frustums())
+        self._at: int | None = None  # the camera that visitors were put at
+        # Behind the first camera and beside it: its photograph would hide the subject.
+        away, up = self._poses[0][0]["position"] - target, self.content.up.numpy().astype(np.float64)
+        start = self.server.initial_camera
+        start.position = target + 1.5 * away + 0.6 * np.cross(up, away)
+        start.look_at, start.up, start.fov = target, up, self._poses[0][1]
+
+    def go_to(self, view: int) -> None:
+        """Put every visitor at the camera of a photograph."""
+        pose, fov = self._poses[view]
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.wxyz, client.camera.position = pose["wxyz"], pose["position"]
+                client.camera.fov = fov
+        self.view.value = self.content.batch.views[0][view]
+        self._at = view
+        self._show_frustums()
+
+    def _add_comparison(self) -> None:
+        gui, views = self.server.gui, self.content.batch.views[0]
+        self.view = gui.add_dropdown("view", views)
+        self.picture = gui.add_button_group("picture", PICTURES, hint="one after the other at one place")
+        self.text = gui.add_markdown("")
+        self._shown = PICTURES[0]
+        self._comparison = self.content.comparison(0)
+        self.image = gui.add_image(self._comparison[self._shown])
+        go = gui.add_button("go to this camera")
+        go.on_click(lambda _: self.go_to(views.index(self.view.value)))
+
+        def show() -> None:
+            found = self._comparison
+            self._show_frustums()
+            self.image.image = found[self._shown]
+            self.text.content = (
+                f"{self._shown} of {self.view.value}; in the subject's box:"
+                f" FLIP {found['flip']:.4f}, PSNR {found['psnr']:.2f} dB"
+            )
+
+        @self.view.on_update
+        def _(_) -> None:
+            with self._lock:
+                self._comparison = self.content.comparison(views.index(self.view.value))
+                show()
+
+        @self.picture.on_click
+        def _(_) -> None:
+            with self._lock:
+                self._shown = self.picture.value
+                show()
+
+        show()

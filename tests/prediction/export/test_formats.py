@@ -1,0 +1,153 @@
+"""Gaussians in each format, read by programs that are not ours, and rendered again."""
+
+import base64
+import gzip
+import json
+import re
+import subprocess
+
+import numpy as np
+import pygltflib
+import pytest
+import torch
+import trimesh
+from gaussforge import GaussForge
+from imageio_ffmpeg import get_ffmpeg_exe, read_frames
+from scipy.spatial.transform import Rotation
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.metrics import psnr
+from ghgs_lit.prediction.export.compact import FORMATS, write_compact
+from ghgs_lit.prediction.export.gltf import EXTENSION, write_glb
+from ghgs_lit.prediction.export.page import write_page
+from ghgs_lit.prediction.export.ply import SH_CONSTANT, ply_bytes, read_ply
+from ghgs_lit.prediction.export.splat import RECORD, to_records
+from ghgs_lit.prediction.export.video import write_mp4
+from ghgs_lit.rendering import render
+from ghgs_lit.types import Gaussians
+from tests.helpers.splats import body, camera_ring
+
+UP = torch.tensor([0.0, -1.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def gaussians():
+    return body(2000, 120)
+
+
+def decibels(found: Gaussians, wanted: Gaussians) -> float:
+    """The least PSNR of two views."""
+    cameras = camera_ring(2, 100, 80)
+    images = [render(g, cameras, backend="cpu").image.flatten(0, 1) for g in (found, wanted)]
+    assert images[1].max() > 0.5
+    return float(psnr(*images).min())
+
+
+def converted(data: bytes, name: str, path) -> Gaussians:
+    """The content of a file as gaussforge reads it."""
+    path.write_bytes(GaussForge().convert(data, name, "ply")["data"])
+    return read_ply(path)
+
+
+# What is lost is quantization; a wrong axis, order or unit is below 25 dB.
+@pytest.mark.parametrize(("name", "least"), [("compressed_ply", 45), ("spz", 45), ("sog", 55)])
+def test_compact_files_render_alike(gaussians, name, least, tmp_path):
+    path = tmp_path / f"a.{FORMATS[name]}"
+    write_compact(ply_bytes(gaussians), path, name)
+    ply = len(ply_bytes(gaussians))
+    assert path.stat().st_size < ply / 2
+    assert decibels(converted(path.read_bytes(), FORMATS[name], tmp_path / "a.ply"), gaussians) > least
+
+
+def test_a_splat_file_renders_alike_and_begins_with_large_gaussians(gaussians, tmp_path):
+    records = to_records(gaussians)
+    assert records.nbytes == 32 * len(gaussians)
+    read = converted(records.tobytes(), "splat", tmp_path / "a.ply")
+    assert decibels(read, gaussians) > 50
+    found, wanted = (
+        torch.nn.functional.normalize(g.quaternions[g.means[:, 0].argsort()], dim=-1)
+        for g in (read, gaussians)
+    )
+    assert (found * wanted).sum(-1).abs().min() > 0.9998  # two degrees
+    size = records["scale"].astype(np.float64).prod(-1) * records["color"][:, 3]
+    assert size[:500].mean() > 2 * size[-500:].mean()
+
+
+def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path):
+    """Linear scales, opacities, xyzw, SH; lossless; the node turns the world's up to glTF's +y."""
+    write_glb(gaussians, UP, tmp_path / "a.glb")
+    model = pygltflib.GLTF2().load(tmp_path / "a.glb")
+    primitive, blob = model.meshes[0].primitives[0], model.binary_blob()
+    assert model.extensionsUsed == [EXTENSION]
+    assert primitive.mode == pygltflib.POINTS
+    assert primitive.extensions[EXTENSION]["kernel"] == "ellipse"
+
+    def column(name: str) -> torch.Tensor:
+        accessor = model.accessors[vars(primitive.attributes)[name]]
+        view = model.bufferViews[accessor.bufferView]
+        assert view.byteOffset % 4 == 0
+        data = blob[view.byteOffset : view.byteOffset + view.byteLength]
+        return torch.from_numpy(np.frombuffer(data, "<f4").reshape(accessor.count, -1).copy())
+
+    read = Gaussians(
+        means=column("POSITION"),
+        quaternions=column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
+        scales=column(f"{EXTENSION}:SCALE"),
+        opacities=column(f"{EXTENSION}:OPACITY")[:, 0],
+        colors=column(f"{EXTENSION}:SH_DEGREE_0_COEF_0") * SH_CONSTANT + 0.5,
+        splits=gaussians.splits,
+    )
+    assert decibels(read, gaussians) > 80
+    turned = Rotation.from_quat(model.nodes[0].rotation).apply(UP.numpy())
+    assert np.allclose(turned, [0, 1, 0], atol=1e-6)
+    cloud = trimesh.load(tmp_path / "a.glb").to_geometry()  # as points, for programs without the extension
+    upright = gaussians.means.numpy() * [1, -1, -1]
+    assert np.allclose(np.sort(cloud.vertices[:, 1]), np.sort(upright[:, 1]), atol=1e-5)
+    colors = (gaussians.colors.clamp(0, 1) * 255).round().numpy()
+    assert np.array_equal(cloud.colors[:, :3], colors)
+    with pytest.raises(InputError, match="at least one Gaussian; found 0"):
+        write_glb(gaussians.select(slice(0, 0), (0,)), UP, tmp_path / "b.glb")
+
+
+def test_a_ply_is_lossless(gaussians, tmp_path):
+    assert decibels(converted(ply_bytes(gaussians), "ply", tmp_path / "a.ply"), gaussians) > 80
+
+
+def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
+    """One file: no address, the records as they are in .splat, the cameras; names cannot end the script."""
+    cameras = camera_ring(2, 100, 80)[0]
+    name = "</title><script>{{data}}"
+    write_page(gaussians, cameras, ("a", "</script>"), UP, name, tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text()
+    assert not re.search(r"https?://|src=|href=|import ", text)
+    assert text.count("<script") == text.count("</script>") == 3
+    parts = dict(re.findall(r'<script type="[^"]+" id="(\w+)">(.*?)</script>', text, re.S))
+    scene = json.loads(parts["scene"])
+    assert [camera["name"] for camera in scene["cameras"]] == ["a", "</script>"]
+    assert np.allclose(scene["cameras"][1]["extrinsics"], cameras.extrinsics[1])
+    assert scene["size"] == [80, 100]
+    records = np.frombuffer(gzip.decompress(base64.b64decode(parts["data"])), RECORD)
+    assert np.array_equal(records, to_records(gaussians))
+
+
+def test_a_video_shows_the_pictures_in_their_colors(tmp_path):
+    """Odd sides are padded; saturated colours come back, and the file says by which matrix."""
+    bars = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [0, 255, 255], [255, 0, 255]])
+    row = np.repeat(bars, 10, axis=0)
+    pictures = [
+        np.tile(np.concatenate([row, row[-1:]]) * (5 - frame) // 5, (45, 1, 1)).astype(np.uint8)
+        for frame in range(5)
+    ]
+    write_mp4(pictures, tmp_path / "a.mp4", 10)
+    frames = read_frames(str(tmp_path / "a.mp4"))
+    meta = next(frames)
+    assert meta["source_size"] == (62, 46)
+    assert meta["fps"] == pytest.approx(10)
+    assert meta["codec"] == "h264"
+    info = subprocess.run([get_ffmpeg_exe(), "-i", tmp_path / "a.mp4"], capture_output=True, text=True)
+    assert "yuv420p(tv, bt709" in info.stderr
+    read = [np.frombuffer(frame, np.uint8).reshape(46, 62, 3)[:45, :61].astype(int) for frame in frames]
+    assert len(read) == 5
+    middle = np.arange(61) % 10 // 3 == 1  # 4:2:0 mixes colours at their borders
+    for found, wanted in zip(read, pictures, strict=True):
+        assert np.abs(found - wanted)[:, middle].mean() < 4

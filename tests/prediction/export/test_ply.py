@@ -1,0 +1,65 @@
+"""Splats on disk."""
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.export.ply import read_ply, write_ply
+from ghgs_lit.rendering import render
+from ghgs_lit.types import Gaussians
+from tests.helpers.training import ring
+
+
+def gaussians(n=50, seed=0) -> Gaussians:
+    g = torch.Generator().manual_seed(seed)
+    return Gaussians(
+        means=torch.randn(n, 3, generator=g) * 0.3,
+        quaternions=torch.randn(n, 4, generator=g) * 3,
+        scales=torch.rand(n, 3, generator=g) * 0.05 + 0.01,
+        opacities=torch.rand(n, generator=g) * 0.9 + 0.05,
+        colors=torch.rand(n, 3, generator=g),
+        splits=(n,),
+    )
+
+
+def test_a_ply_renders_as_what_was_written(tmp_path):
+    """Opacities, scales, colours and the world frame survive the file: both render to the same image."""
+    written = gaussians()
+    write_ply(written, tmp_path / "a.ply")
+    read = read_ply(tmp_path / "a.ply")
+    for name in ("means", "scales", "opacities", "colors"):
+        assert torch.allclose(getattr(read, name), getattr(written, name), atol=1e-5)
+    assert torch.allclose(read.quaternions.norm(dim=-1), torch.ones(50), atol=1e-6)
+    cameras = ring(2, 24)[None]
+    a, b = (render(g, cameras, backend="reference").image for g in (written, read))
+    assert a.max() > 0.2
+    assert torch.allclose(a, b, atol=1e-4)
+
+
+def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
+    """Viewers of 3D Gaussian Splatting read the columns by name; empty and bad files are handled."""
+    plyfile = pytest.importorskip("plyfile")
+    one = Gaussians(
+        torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[2.0, 0, 0, 0]]), torch.tensor([[0.1, 1.0, 0.0]]),
+        torch.tensor([0.5]), torch.tensor([[0.5, 1.0, 0.0]]), (1,),
+    )  # fmt: skip
+    write_ply(one, tmp_path / "one.ply")
+    vertex = plyfile.PlyData.read(tmp_path / "one.ply")["vertex"]
+    value = {p.name: float(vertex[p.name][0]) for p in vertex.properties}
+    assert [value[n] for n in ("x", "y", "z", "rot_0", "rot_1")] == [1, 2, 3, 1, 0]
+    assert value["opacity"] == pytest.approx(0, abs=1e-6)
+    assert value["scale_0"] == pytest.approx(np.log(0.1), rel=1e-6)
+    assert np.isfinite(value["scale_2"])
+    assert value["f_dc_0"] == pytest.approx(0, abs=1e-6)
+    assert value["f_dc_1"] == pytest.approx(0.5 / 0.28209479177387814, rel=1e-6)
+    nothing = one.select(slice(0, 0), (0,))
+    write_ply(nothing, tmp_path / "none.ply")
+    assert len(read_ply(tmp_path / "none.ply")) == 0
+    with pytest.raises(InputError, match="one subject"):
+        write_ply(one.select(slice(0, 1), (1, 0)), tmp_path / "two.ply")
+    (tmp_path / "no.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
+    )
+    with pytest.raises(InputError, match=r"no\.ply"):
+        read_ply(tmp_path / "no.ply")

@@ -1,0 +1,125 @@
+"""Refinement: nearer to photographs, better from elsewhere, within its bounds."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.baselines import splats_at
+from ghgs_lit.geometry.projection import world_to_camera
+from ghgs_lit.metrics.functional import psnr
+from ghgs_lit.prediction.refinement import Refinement
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch
+from tests.helpers.scenes import painted_ellipsoid, ring
+
+RENDERER = Renderer("cpu")
+
+
+def scene(batch=1, views=4, size=56):
+    """Photographs, dull and thin splats at the true depth, and a view between the inputs."""
+    around = ring(batch, 2 * views, size, size)
+    images, masks, depths = painted_ellipsoid(around[:, ::2])
+    inputs = Batch(images, masks, around[:, ::2])
+    splats = splats_at(inputs, depths, masks, sigma=0.25)
+    splats = dataclasses.replace(splats, colors=0.95 * splats.colors)
+    return splats, inputs, around[:, 1:2]
+
+
+def quality(gaussians, cameras, images):
+    return float(psnr(RENDERER(gaussians, cameras).image.flatten(0, 1), images.flatten(0, 1)).mean())
+
+
+def test_a_view_that_nobody_saw_gets_better():
+    """It is for other views that a user refines; the inputs' PSNR must be what is reported."""
+    splats, inputs, between = scene()
+    target = painted_ellipsoid(between)[0]
+    refinement = Refinement(15, RENDERER)
+    refined = refinement(splats, inputs)
+    assert quality(refined, between, target) > quality(splats, between, target) + 2
+    report = refinement.report(splats, refined, inputs)
+    found = [quality(gaussians, inputs.cameras, inputs.images) for gaussians in (splats, refined)]
+    assert report.inputs == pytest.approx(found, abs=1e-3)
+    assert found[1] > found[0] + 2
+    assert report.held_out[1] > report.held_out[0] + 1
+    assert str(report).startswith(
+        f"refine: 15 steps; inputs {found[0]:.2f} -> {found[1]:.2f} dB; an input held"
+    )
+
+
+def test_changes_are_bounded():
+    """What no photograph shows must stay near the prediction, however long it is refined."""
+    splats, inputs, _ = scene(size=42)
+    noise = dataclasses.replace(inputs, images=torch.rand(inputs.images.shape) * inputs.masks[:, :, None])
+    refined = Refinement(70, RENDERER)(splats, noise)
+    depth = world_to_camera(splats.means, inputs.cameras.extrinsics[0][splats.image])[:, 2]
+    footprint = (depth / inputs.cameras.intrinsics[0, 0, 0, 0])[:, None]
+    moved = (refined.means - splats.means).abs() / footprint
+    assert 0.5 < moved.max() <= 1.001
+    assert 0.5 < (refined.scales / splats.scales).log().abs().max() <= 1.001
+    assert 0.02 < (refined.colors - splats.colors).abs().max() <= 0.0501
+    assert ((refined.opacities > 0) & (refined.opacities < 1)).all()
+    assert torch.equal(refined.quaternions, splats.quaternions)
+
+
+def test_the_input_that_is_held_out_takes_no_part(monkeypatch):
+    """Neither its photograph nor its own splats: else it would say nothing of other views."""
+    splats, inputs, _ = scene(size=28)
+    refinement, seen, drawn = Refinement(2, RENDERER), [], []
+
+    def watched(self, gaussians, batch, views):
+        seen.append((list(views), set(gaussians.image.tolist())))
+        drawn.append(gaussians)
+        return 0.0
+
+    monkeypatch.setattr(Refinement, "_psnr", watched)
+    dark = dataclasses.replace(inputs, images=inputs.images.clone())
+    dark.images[:, 3] = 0
+    kept = splats.select(splats.image != 3, (int((splats.image != 3).sum()),))
+    expected = refinement(kept, dark, [0, 1, 2])
+    assert torch.equal(refinement(kept, inputs, [0, 1, 2]).means, expected.means)
+    refinement.report(splats, splats, inputs)
+    assert seen == [([0, 1, 2, 3], {0, 1, 2, 3})] * 2 + [([3], {0, 1, 2})] * 2
+    assert torch.equal(drawn[-1].means, expected.means)
+
+
+def test_what_is_beside_the_subject_takes_no_part():
+    """Photographs may come with their background; those with a matte are premultiplied by it, on black."""
+    splats, inputs, _ = scene(size=42)
+    room = dataclasses.replace(inputs, images=torch.where(inputs.masks[:, :, None], inputs.images, 0.7))
+    matte = dataclasses.replace(inputs, alpha=inputs.masks.float())
+    expected, *found = (Refinement(3, RENDERER)(splats, batch) for batch in (inputs, room, matte))
+    for refined in found:
+        assert torch.equal(refined.means, expected.means)
+        assert torch.equal(refined.colors, expected.colors)
+
+
+def test_two_inputs_are_refined_without_one_that_is_held_out():
+    """A single input says nothing of another view."""
+    splats, inputs, _ = scene(views=2, size=28)
+    refinement = Refinement(3, RENDERER)
+    report = refinement.report(splats, refinement(splats, inputs), inputs)
+    assert report.held_out is None
+    assert "held out" not in str(report)
+
+
+def test_elements_are_refined_as_if_alone():
+    """A result must not depend on batch mates."""
+    splats, inputs, _ = scene(batch=2, size=28)
+    together = Refinement(6, RENDERER)(splats, inputs)
+    assert together.splits == splats.splits
+    for b in range(2):
+        one = Batch(inputs.images[b : b + 1], inputs.masks[b : b + 1], inputs.cameras[b : b + 1])
+        alone = Refinement(6, RENDERER)(dataclasses.replace(splats[b], image=splats[b].image - 4 * b), one)
+        for name in ("means", "scales", "opacities", "colors"):
+            torch.testing.assert_close(getattr(alone, name), getattr(together[b], name), rtol=1e-4, atol=1e-5)
+
+
+def test_what_cannot_be_refined_is_refused():
+    """Splats of a file belong to no pixel of these photographs."""
+    splats, inputs, _ = scene(size=28)
+    with pytest.raises(InputError, match="refine: expected Gaussians of the inputs' pixels"):
+        Refinement(1, RENDERER)(dataclasses.replace(splats, image=None), inputs)
+    with pytest.raises(InputError, match="refine: expected 1 or more steps"):
+        Refinement(0, RENDERER)
