@@ -57,7 +57,9 @@ def test_attention_is_as_near_as_pytorchs(n, heads, tokens, width, dtype, scale)
     found = cpu.attend(q, k, v)
     assert found.dtype == dtype
     assert found.shape == (n, tokens, heads, width)
-    least = 2e-7 if dtype == torch.float32 else 2e-3
+    # A logit of standard deviation scale^2 is rounded by that times 2^-24, and its weight repeats this error:
+    # which of both is luckier depends on the processor.
+    least = max(2e-7, scale**2 * 2.0**-24) if dtype == torch.float32 else 2e-3
     assert error(found, q, k, v) < max(1.5 * error(pytorch(q, k, v), q, k, v), least)
 
 
