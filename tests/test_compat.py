@@ -24,7 +24,7 @@ QUIRKS = {
     ("unprojection", "tokens"): ("subject", "release"),
     ("unprojection", "border"): (0, 3),
     ("depth_head", "parameterization"): ("bounded_inverse", "inverse_linear"),
-    ("bounds", "_target_"): ("ghgs_lit.bounds.SubjectBox", "ghgs_lit.bounds.NoBounds"),
+    ("bounds", "kind"): ("box", "none"),
     ("recalibration", "similarity"): ("product", "product_clamped"),
     ("recalibration", "tokens"): ("subject", "all"),
     ("gaussian_head", "parameterization"): ("footprint", "release"),

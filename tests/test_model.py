@@ -265,9 +265,9 @@ def test_an_ablation_wins_over_the_releases_values():
 
 def test_named_models_choose_their_parts_and_the_command_line_wins():
     """What is written on the command line must be what one gets."""
-    assert config("model=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
-    assert config("model=paper")["bounds"]["_target_"] == "ghgs_lit.bounds.SubjectBox"
-    assert config("model=paper", "bounds=hull")["bounds"]["_target_"] == "ghgs_lit.bounds.VisualHull"
+    assert config("model=hull")["bounds"]["kind"] == "hull"
+    assert config("model=paper")["bounds"]["kind"] == "box"
+    assert config("model=paper", "bounds=hull")["bounds"]["kind"] == "hull"
     assert config("model=paper", "depth_head=hull")["depth_head"]["parameterization"] == "linear"
     assert config("model=hull", "recalibration=paper")["recalibration"]["s_min"] == 0.01
 

@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from ghgs_lit.config import register
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics, check_name, read_array, read_image
@@ -76,6 +77,7 @@ class MyPeople(DataSet):
         return MyReader(self.folder / phase, self.limit[phase], strict)
 
 
+@register("data", "my_people")
 class MyDataModule(PhotographsDataModule):
     """Samples, batches and loaders are those of all data sets."""
 

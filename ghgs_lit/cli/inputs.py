@@ -86,7 +86,7 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
     Raises:
         InputError: there is no checkpoint, or it was not trained.
     """
-    if "_target_" in (cfg.get("data") or {}):
+    if "kind" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
         raise InputError("data: expected data=<option> where there is no checkpoint; found none")

@@ -17,7 +17,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import is_below
-from ghgs_lit.config.legacy import GONE
 from ghgs_lit.config.schema import KINDS
 from ghgs_lit.errors import InputError
 
@@ -70,8 +69,6 @@ def _composition(error: HydraException) -> str:
     if named is None:
         return f"{' '.join(sys.argv[1:])}: expected overrides that fit; found {error} {error.__cause__ or ''}"
     key = named[1]
-    if key in GONE:
-        return f"{key}: expected {GONE[key]} in its place; found a key of an earlier version"
     # A key without its group counts as close, too: lr for optimizer.lr.
     keys = [known for known in KINDS if "*" not in known]
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 def run(cfg: DictConfig) -> None:
     """Run the task and print the folder of its result last."""
     choice("task", cfg.task, ("render", "miniature", "check"))
-    data = build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
+    data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
     root = Path(data.dataset.root or ".").expanduser().resolve()
     if cfg.task == "render":
         render(data)

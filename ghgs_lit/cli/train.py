@@ -87,9 +87,10 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
         build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()
     ]
     callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    partial = build({**config["trainer"], "_partial_": True}, "trainer")
     try:
-        trainer = partial(
+        trainer = build(
+            config["trainer"],
+            "trainer",
             logger=built or False,
             plugins=[AtomicCheckpointIO()],
             callbacks=[*further, *callbacks],

@@ -44,7 +44,7 @@ NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 EXPECTED_TO_DIFFER = (
     *WITHOUT_INFLUENCE,
     "evaluation",
-    "metrics._target_",
+    "metrics.kind",
     "recalibration.neighborhood",
     "recalibration.similarity",
     "seed",

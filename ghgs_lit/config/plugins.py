@@ -1,6 +1,6 @@
-"""The user's own classes in configurations: modules outside of this package that a ``_target_`` may name.
+"""The user's own code: modules that register kinds of options (:mod:`ghgs_lit.config.registry`).
 
-A configuration can come from somebody else's checkpoint, so it cannot allow modules itself. The user does,
+A configuration can come from somebody else's checkpoint, so it cannot name modules itself. The user does,
 with ``GHGS_PLUGINS`` in the environment (Python files or names of modules, separated as in ``PATH``), or by
 installing a package that declares an entry point in the group ``ghgs_lit.plugins``.
 """
@@ -18,14 +18,15 @@ from ghgs_lit.errors import InputError
 VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
 
 
-def is_allowed(target: str) -> bool:
-    """Whether ``target`` is in a module that the user allows; that module is then imported."""
+def load_plugins() -> None:
+    """Import the modules that the user names, so that they register their kinds.
+
+    Raises:
+        InputError: a file is missing, or another module has its name. Errors inside a module keep their type.
+    """
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
-        if target.startswith(f"{name}."):
-            importlib.import_module(name)
-            return True
-    return False
+        importlib.import_module(name)
 
 
 @cache

@@ -34,6 +34,7 @@ from ghgs_lit.config.kinds import (
     one_of,
     text_like,
 )
+from ghgs_lit.config.registry import is_typed
 from ghgs_lit.config.schema_model import MODEL
 from ghgs_lit.errors import require
 
@@ -311,7 +312,7 @@ KINDS: dict[str, Kind] = {
 
 def kind_of(key: str) -> Kind | None:
     """The entry of a dotted key in ``KINDS``, None where there is none."""
-    if key.endswith("_target_"):
+    if key.endswith(".kind") and key not in KINDS:
         return TEXT
     return next((kind for pattern, kind in KINDS.items() if fnmatchcase(key, pattern)), None)
 
@@ -336,12 +337,11 @@ def check(config: Mapping[str, Any], parent: str = "") -> None:
     Raises:
         InputError: names the key, what was expected and what was found.
     """
-    target = config.get("_target_")
-    if isinstance(target, str) and not target.startswith(("ghgs_lit.", "lightning.")):
-        return  # a class of the user's own, whose keys may mean anything
     # Nodes last: data.render.size repeats data.size, and a message about it would puzzle.
     for name, value in sorted(config.items(), key=lambda item: isinstance(item[1], Mapping)):
         key = f"{parent}.{name}" if parent else str(name)
+        if is_typed(key, value):
+            continue
         kind, node = kind_of(key), is_node(key)
         if isinstance(value, Mapping) and (node or kind is None):
             check(value, key)

@@ -1,4 +1,4 @@
-"""The DataModules of the data sets that are read as they are: ``_target_`` of ``conf/data``."""
+"""The DataModules of the data sets that are read as they are: the kinds of ``conf/data``."""
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.humman.dataset import HuMMan

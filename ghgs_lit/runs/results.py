@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from ghgs_lit.config.keys import lookup
-from ghgs_lit.config.legacy import upgrade_provenance
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import config_hash
@@ -163,4 +162,4 @@ def read_results(path: Path) -> dict[str, Any]:
         fitting, hashed = config_hash(source["config"]), source.get("config_hash")
         expected = f"a configuration that fits its config_hash {hashed}"
         require(fitting == hashed, f"{path}: provenance.config", expected, f"one of {fitting}")
-    return {**content, "provenance": upgrade_provenance(source)}
+    return {**content, "provenance": dict(source)}

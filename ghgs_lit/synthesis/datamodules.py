@@ -1,4 +1,4 @@
-"""The DataModules of the data sets that can be rendered: ``_target_`` of ``conf/data``."""
+"""The DataModules of the data sets that can be rendered: the kinds of ``conf/data``."""
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.synthesis.datasets import Scans, Synthetic

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from ghgs_lit.config import build
-from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.faults import Fault, Step, first_fault
@@ -39,7 +38,7 @@ def replay(path: str | Path) -> Replay:
     content = open_file(path)
     if not isinstance(content, Mapping) or any(key not in content for key in _KEYS):
         raise InputError(f"{path}: expected a step that a training saved; found {describe(content)}")
-    config = upgrade(content["config"])
+    config = content["config"]
     model = GHGS.from_config(config)
     # Not checked for fit to be finite: the weights may be what is at fault.
     model.load_state_dict(content["state_dict"], assign=True)

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
@@ -21,7 +20,7 @@ STATE_PREFIX = "model."
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a checkpoint of this package; its configuration is returned in today's keys.
+    """Read a checkpoint of this package.
 
     Args:
         path: the file; its tensors are mapped from the disk, not read.
@@ -43,7 +42,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     if not 1 <= version <= FORMAT_VERSION:
         newer = ", of a newer version of this package" if version > FORMAT_VERSION else ""
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
-    return {**checkpoint, "config": upgrade(checkpoint["config"])}
+    return dict(checkpoint)
 
 
 def _is_published(content: Any) -> bool:

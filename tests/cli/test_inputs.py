@@ -21,7 +21,7 @@ TRAINED = ("model=hull", "skip=balanced")
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "a.ckpt"
-    write_checkpoint(path, {}, {**config(*TRAINED), "data": {"_target_": "x", "root": "old", "size": 42}})
+    write_checkpoint(path, {}, {**config(*TRAINED), "data": {"kind": "scans", "root": "old", "size": 42}})
     return str(path)
 
 
@@ -103,7 +103,7 @@ def test_data_that_moved_are_one_override(composed, checkpoint, verb):
     """``data.root=`` alone acts on the data that a checkpoint was trained on."""
     cfg = composed(verb, f"checkpoint={checkpoint}", "data.root=new")
     found = resolve(inputs.with_trained_data(cfg))["data"]
-    assert found == {"_target_": "x", "root": "new", "size": 42}
+    assert found == {"kind": "scans", "root": "new", "size": 42}
     chosen = resolve(inputs.with_trained_data(composed(verb, f"checkpoint={checkpoint}", "data=scans")))
     assert chosen["data"]["name"] == "scans"
     with pytest.raises(InputError, match="data: expected data=<option> where there is no checkpoint"):

@@ -91,7 +91,6 @@ def test_the_table_has_no_entry_without_a_key():
         ("data.splits.train", [{"sequences": [313]}], "frames"),
         ("bounds", "box", "a mapping of its keys"),
         ("data.rig", None, "a mapping of its keys"),
-        ("bounds._target_", 7, "a text"),
     ],
 )
 def test_a_wrong_value_is_named_with_what_was_expected_and_found(key, value, expected):
@@ -124,11 +123,6 @@ def test_a_wrong_value_is_named_with_what_was_expected_and_found(key, value, exp
 def test_what_the_documentation_allows_passes(key, value):
     """The table must not forbid values that work."""
     check(nested(key, value))
-
-
-def test_a_class_of_the_users_own_has_keys_of_its_own():
-    """``GHGS_PLUGINS`` allows classes whose ``lr`` may be a text."""
-    check({"optimizer": {"_target_": "my_module.Optimizer", "lr": "auto"}})
 
 
 def test_resolve_checks():

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from ghgs_lit.config import build, plugins
+from ghgs_lit.config import build, plugins, registry
 from ghgs_lit.data.check import inspect
 from ghgs_lit.errors import InputError
 from tests.helpers.training import ring
@@ -53,6 +53,7 @@ def clean(monkeypatch):
     """Each test starts without admitted or imported modules."""
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(plugins.VARIABLE, raising=False)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
     plugins._installed.cache_clear()
     yield
     plugins._installed.cache_clear()
@@ -61,7 +62,7 @@ def clean(monkeypatch):
 
 
 def node(project: Path, **changes) -> dict:
-    about = {"_target_": "my_people.MyDataModule", "name": "m", "root": str(project / "photographs")}
+    about = {"kind": "my_people", "name": "m", "root": str(project / "photographs")}
     return {**about, "size": 56, "ring": CAMERAS, **KEYS, **changes}
 
 
@@ -89,9 +90,11 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
         "evaluation.targets=[cameras]", "evaluation.pictures=0", "hydra.run.dir=measured",
     ]  # fmt: skip
     monkeypatch.delenv(plugins.VARIABLE)
+    registry._REGISTERED.clear()
+    sys.modules.pop("my_people")
     assert ghgs(*arguments) == 1
     said = capsys.readouterr().err
-    assert "data._target_: expected a class of ghgs_lit" in said
+    assert "data.kind: expected one of" in said
     assert plugins.VARIABLE in said
     monkeypatch.setenv(plugins.VARIABLE, "my_people.py")
     assert ghgs(*arguments) == 0
@@ -131,31 +134,30 @@ def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
 
 def test_nothing_is_admitted_by_a_configuration(project):
     """A checkpoint of somebody else cannot have foreign code imported."""
-    for target in ("my_people.MyDataModule", "os.system", "ghgs_lit_evil.x"):
-        with pytest.raises(InputError, match=r"data\._target_"):
-            build(node(project, _target_=target), "data")
+    for kind in ("my_people", "my_people.MyDataModule", "os.system"):
+        with pytest.raises(InputError, match=r"data\.kind: expected one of"):
+            build(node(project, kind=kind), "data")
     assert "my_people" not in sys.modules
 
 
-def test_an_admitted_module_admits_no_other(project, monkeypatch):
-    """Admitting one module must not admit names that only resemble it."""
-    monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
-    for target in ("my_people_2.X", "os.system", "my_people"):
-        with pytest.raises(InputError, match="expected a class of ghgs_lit"):
-            build(node(project, _target_=target), "data")
-
-
-def test_a_module_and_an_installed_package_can_be_admitted(monkeypatch):
-    """Both documented ways of admitting code work, and end when they are taken back."""
-    monkeypatch.setenv(plugins.VARIABLE, "fractions")
-    assert build({"_target_": "fractions.Fraction", "numerator": 3}).numerator == 3
-    monkeypatch.delenv(plugins.VARIABLE)
-    with pytest.raises(InputError, match="fractions"):
-        build({"_target_": "fractions.Fraction", "numerator": 3})
-    plugins._installed.cache_clear()
-    points = {plugins.GROUP: [SimpleNamespace(value="fractions")]}
-    monkeypatch.setattr(plugins.importlib.metadata, "entry_points", lambda group: points.get(group, []))
-    assert build({"_target_": "fractions.Fraction", "numerator": 3}).numerator == 3
+def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch):
+    """Both documented ways of admitting code register its kinds."""
+    monkeypatch.syspath_prepend(str(project))
+    points = {plugins.GROUP: [SimpleNamespace(value="my_people")]}
+    for admit in (
+        lambda: monkeypatch.setenv(plugins.VARIABLE, "my_people"),
+        lambda: monkeypatch.setattr(
+            plugins.importlib.metadata, "entry_points", lambda group: points.get(group, [])
+        ),
+    ):
+        with pytest.raises(InputError, match="my_people"):
+            build(node(project), "data")
+        admit()
+        assert build(node(project), "data").dataset.name == "m"
+        monkeypatch.delenv(plugins.VARIABLE, raising=False)
+        registry._REGISTERED.clear()
+        sys.modules.pop("my_people")
+        plugins._installed.cache_clear()
 
 
 def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
@@ -169,9 +171,9 @@ def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
             (tmp_path / name).write_text("")
         monkeypatch.setenv(plugins.VARIABLE, str(tmp_path / name))
         with pytest.raises(InputError, match=said):
-            build({"_target_": "x.Y"})
+            build({"kind": "x"}, "bounds")
     # An error in the user's own file is shown as it is.
     (tmp_path / "numbers_of_mine.py").write_text("1 / 0")
     monkeypatch.setenv(plugins.VARIABLE, str(tmp_path / "numbers_of_mine.py"))
     with pytest.raises(ZeroDivisionError):
-        build({"_target_": "numbers_of_mine.Y"})
+        build({"kind": "y"}, "bounds")

@@ -2,8 +2,6 @@
 
 import pytest
 
-from ghgs_lit.config import build
-from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.data.datamodules import HuMManDataModule, RenderedDataModule
 from ghgs_lit.data.layout import Rendered
 from ghgs_lit.errors import InputError
@@ -47,24 +45,3 @@ def test_evaluation_takes_protocols_and_no_bare_names(tmp_path):
     """A name alone would ignore the file of the protocol in conf/targets."""
     with pytest.raises(InputError, match="targets: expected a mapping of the settings of TargetProtocol"):
         RenderedDataModule(V4, RELEASE, root=str(tmp_path), size=28).evaluation_loader(targets="midway")
-
-
-def test_data_of_earlier_checkpoints_is_built(tmp_path):
-    """The configuration in a checkpoint of before has other class names and keys."""
-    old = {
-        "data": {
-            "_target_": "ghgs_lit.data.SyntheticDataModule", "name": "synthetic", "size": 28,
-            "people": {"train": 2, "val": 1}, "cache_dir": str(tmp_path), "rig": {"height": None},
-            "render": {"size": 28, "samples": 1, "vids": [0, 3, 4]},
-        },
-        "targets": {"name": "release", "kind": "release", "vid": 4, "training_vids": [3]},
-    }  # fmt: skip
-    config = upgrade(old)
-    data = build(config["data"], "data", views=V4, targets=config["targets"], seed=0)
-    assert isinstance(data, SyntheticDataModule)
-    assert data.dataset.render.views == (0, 3, 4)
-    assert (data.targets.view, data.targets.training_views) == (4, (3,))
-    for name in ("HuMMan", "Rendered", "Scans", "Synthetic", "THuman2", "ZJUMoCap"):
-        target = upgrade({"data": {"_target_": f"ghgs_lit.data.{name}DataModule"}})["data"]["_target_"]
-        with pytest.raises(InputError, match="data"):  # the class exists, and wants its keys
-            build({"_target_": target, "nothing": 1}, "data", views=V4, targets=RELEASE)

@@ -39,7 +39,7 @@ def _options(name: str) -> dict:
         for node, file in (("encoder", name), ("skip", "none"))
     }
     options = OmegaConf.to_container(OmegaConf.create(nodes), resolve=True)["encoder"]
-    assert options.pop("_target_") == "ghgs_lit.encoder.VGGTEncoder"
+    assert options.pop("kind") == "vggt"
     return options
 
 

@@ -20,7 +20,7 @@ def test_every_config_builds_a_renderer(name):
     """Each file of the config group builds a renderer with the backend of its name."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         options = dict(compose(f"renderer/{name}").renderer)
-    assert options.pop("_target_") == "ghgs_lit.rendering.Renderer"
+    assert options.pop("kind") == "splats"
     assert Renderer(**options).backend == {"release": "auto"}.get(name, name)
 
 
@@ -59,7 +59,7 @@ def test_the_release_renders_with_its_own_constants(verb):
         OmegaConf.to_container(project_compose(verb, overrides).renderer)
         for overrides in ([], ["compat=release"], ["compat=release", "renderer.near=0.05"])
     ]
-    renderers = [Renderer(**{k: v for k, v in node.items() if k != "_target_"}) for node in nodes]
+    renderers = [Renderer(**{k: v for k, v in node.items() if k != "kind"}) for node in nodes]
     assert [renderer.near for renderer in renderers] == [0.01, 0.2, 0.05]
     assert [renderer.settings.get("alpha_max", 0.999) for renderer in renderers] == [0.999, 0.99, 0.99]
     views = Cameras(torch.tensor([[[[20.0, 0, 5], [0, 20, 5], [0, 0, 1]]]]), torch.eye(4)[None, None], 10, 10)

@@ -237,7 +237,7 @@ def test_memory_is_that_of_this_process():
 
 def test_wandb_is_built_where_it_is_installed(tmp_path):
     """Without the package the error names the extra; with it a run is written."""
-    node = {"_target_": "ghgs_lit.training.loggers.WandbLog", "project": "ghgs_lit", "offline": True}
+    node = {"kind": "wandb", "project": "ghgs_lit", "offline": True}
     if importlib.util.find_spec("wandb") is None:
         with pytest.raises(InputError, match=r"logger\.wandb.*ghgs-lit\[wandb\]"):
             build(node, "logger.wandb", save_dir=str(tmp_path))

@@ -9,11 +9,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from ghgs_lit.config import legacy
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import make_batch
 
@@ -51,17 +50,6 @@ def test_a_checkpoint_that_does_not_fit_names_key_and_shapes(tmp_path):
     checkpoint(path, state_dict={})
     with pytest.raises(InputError, match=r"a\.ckpt: encoder.*expected a tensor of shape"):
         GHGS.from_checkpoint(path)
-
-
-def test_a_checkpoint_of_an_earlier_version_loads(tmp_path, monkeypatch):
-    """Renamed keys must not make earlier checkpoints useless."""
-    monkeypatch.setitem(legacy.KEYS, "spaces.old_name", "recalibration.k")
-    model, old = make_model(), config()
-    old["spaces"] = {"old_name": old["recalibration"].pop("k")}
-    checkpoint(tmp_path / "a.ckpt", config=old, format_version=1)
-    assert read_checkpoint(tmp_path / "a.ckpt")["config"]["recalibration"] == config()["recalibration"]
-    state = GHGS.from_checkpoint(tmp_path / "a.ckpt").state_dict()
-    assert all(torch.equal(state[name], value) for name, value in model.state_dict().items())
 
 
 class Foreign:

@@ -15,7 +15,6 @@ import yaml
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.ablation import ABLATIONS, switches_of
 from ghgs_lit.config.keys import lookup
-from ghgs_lit.config.legacy import upgrade
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import METHOD, by_protocol, entry, mean, metric_names, read_results
 
@@ -236,7 +235,6 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
         return None
     if not isinstance(config, Mapping) or not all(k in config for k in ("trainer", "data")):
         return None
-    config = upgrade(config)
     if "recalibration" not in config:
         return None
     data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()

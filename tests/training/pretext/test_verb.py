@@ -16,9 +16,7 @@ BRANCH = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8, parts: 1
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.num_heads=2"]
 TINY += ["evaluation.views=[3]", "evaluation.pictures=0", "logger=none", "callbacks=none"]
 TINY += ["evaluation.targets=[release]", "trainer.limit_val_batches=0"]
-EACH = (
-    "ghgs_lit.training.checkpoints.Checkpoints, filename: 'at_{step}', every_n_train_steps: 2, save_top_k: -1"
-)
+EACH = "kind: checkpoints, filename: 'at_{step}', every_n_train_steps: 2, save_top_k: -1"
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +34,7 @@ def data(tmp_path_factory):
 def pretrained(data, tmp_path_factory):
     """A run of four steps, with a checkpoint after two."""
     directory = tmp_path_factory.mktemp("pretext") / "run"
-    steps = ["trainer.max_steps=4", "trainer.val_check_interval=2", f"+callbacks.each={{_target_: {EACH}}}"]
+    steps = ["trainer.max_steps=4", "trainer.val_check_interval=2", f"+callbacks.each={{{EACH}}}"]
     assert ghgs("pretext", *data, BRANCH, *steps, f"hydra.run.dir={directory}") == 0
     return directory
 

@@ -1,0 +1,156 @@
+"""Options: what a stage can be told, defined once beside the stage as a class of typed fields.
+
+A field has its type and range, its default and, in the text below it, its unit and meaning. Values are
+checked wherever they come from (YAML, command line, checkpoint, Python), and ``ghgs <verb> --help <group>``
+shows the same fields.
+"""
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, ClassVar, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ghgs_lit.config.describe import Words, expected, options_of
+from ghgs_lit.errors import InputError
+
+_T = TypeVar("_T", bound="Options")
+
+Text = Annotated[str, Field(min_length=1)]
+Path = Annotated[str, Field(min_length=1), Words("a path")]
+Count = Annotated[int, Field(ge=1)]
+Index = Annotated[int, Field(ge=0)]
+Amount = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+Workers = Annotated[int, Field(ge=0, le=1024)]
+Width = Annotated[int, Field(ge=1, le=65536)]
+# A photograph of more pixels would need gigabytes before anything could refuse it.
+Side = Annotated[int, Field(ge=1, le=8192)]
+Size = Side | tuple[Side, Side]
+
+
+def multiple_of_four(value: int) -> int:
+    """``value``, refused unless four divides it."""
+    if value % 4:
+        raise ValueError("a multiple of 4")
+    return value
+
+
+MultipleOfFour = Annotated[int, Field(ge=4, le=65536), AfterValidator(multiple_of_four)]
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """`` (did you mean ...?)`` with the closest of ``known``, or nothing."""
+    close = difflib.get_close_matches(str(name), list(known), 1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+class _Checked(type(BaseModel)):
+    """Errors of options that are made in Python are an :class:`InputError`, too."""
+
+    def __call__(cls, *args: Any, **values: Any) -> Any:
+        try:
+            return super().__call__(*args, **values)
+        except ValidationError as error:
+            raise _input_error(cls, cls.group, values, error) from None
+
+
+class Options(BaseModel, metaclass=_Checked):
+    """Base of all options: immutable, without unknown fields, without silent conversions.
+
+    ``replace`` makes changed options, ``build`` what they describe (the options themselves where they do the
+    work, too). ``group`` is the dotted key under which configurations have them, for messages.
+
+    Raises:
+        InputError: "<key>: expected ...; found ...", for the first wrong value.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, strict=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True
+    )
+    group: ClassVar[str] = ""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _lists_become_tuples(cls, values: Any) -> Any:
+        return (
+            {name: _immutable(value) for name, value in values.items()}
+            if isinstance(values, dict)
+            else values
+        )
+
+    @classmethod
+    def read(cls: type[_T], values: Any, key: str) -> _T:
+        """The options in ``values``, a mapping (or options already).
+
+        Args:
+            values: by name; what is missing has its default.
+            key: dotted key of the mapping, for messages.
+
+        Raises:
+            InputError: names the key of the first wrong value, what was expected and what was found.
+        """
+        if isinstance(values, cls):
+            return values
+        if not isinstance(values, Mapping):
+            raise InputError(f"{key}: expected a mapping of its keys; found {values!r}")
+        try:
+            return cls.model_validate(dict(values))
+        except ValidationError as error:
+            raise _input_error(cls, key, values, error) from None
+
+    def replace(self: _T, **changes: Any) -> _T:
+        """The options with some fields changed; the result is checked."""
+        return type(self)(**{**dict(self), **changes})
+
+    def require(self, condition: bool, name: str, expected: str) -> None:
+        """Refuse the value of the field ``name`` unless ``condition`` is true: for ``model_validator``."""
+        if not condition:
+            raise InputError(f"{name}: expected {expected}; found {_plain(getattr(self, name))!r}")
+
+    def build(self) -> Any:
+        """What the options describe; here they are it."""
+        return self
+
+
+def _immutable(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(map(_immutable, value))
+    return {key: _immutable(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def _plain(value: Any) -> Any:
+    """``value`` as YAML has it."""
+    if isinstance(value, tuple):
+        return list(map(_plain, value))
+    return {key: _plain(item) for key, item in value.items()} if isinstance(value, dict) else value
+
+
+def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
+    """The first of pydantic's errors, in the words of this package."""
+    first = error.errors(include_url=False)[0]
+    own = first.get("ctx", {}).get("error")
+    path = [key] if key else []
+    for name in first["loc"]:
+        field = cls.model_fields.get(name) if isinstance(name, str) else None
+        if field is None:
+            break
+        path.append(name)
+        values = values[name] if isinstance(values, Mapping) and name in values else None
+        nested = options_of(field.annotation)
+        if nested is None or not isinstance(values, Mapping):
+            break
+        cls = nested
+    dotted = ".".join(path)
+    if isinstance(own, InputError):  # of a validator over several fields
+        return InputError(f"{dotted}.{own}" if dotted else str(own))
+    if first["type"] == "extra_forbidden":
+        name, known = first["loc"][-1], list(cls.model_fields)
+        text = f"expected one of {', '.join(sorted(known))}; found {name!r}{did_you_mean(name, known)}"
+        return InputError(f"{dotted} key: {text}".strip())
+    if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
+        return InputError(f"{dotted}: expected a value; found none")
+    wanted = str(own) if own is not None else expected(field) if field is not None else first["msg"]
+    return InputError(f"{dotted}: expected {wanted}; found {_plain(values)!r}")

@@ -1,0 +1,119 @@
+"""A configuration names kinds of options; nothing that it says imports or calls code."""
+
+import contextlib
+import importlib
+import inspect
+import pkgutil
+
+import pytest
+
+import ghgs_lit
+from ghgs_lit.config import build
+from ghgs_lit.config.options import Options
+from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_node, register
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from tests.helpers.configs import composed
+from tests.helpers.weights import config
+
+
+def everything_callable():
+    """Paths of all functions and classes that the package defines."""
+    for info in pkgutil.walk_packages(ghgs_lit.__path__, "ghgs_lit."):
+        if info.name.endswith("__main__"):
+            continue
+        try:
+            module = importlib.import_module(info.name)
+        except ImportError:  # an optional dependency
+            continue
+        for name, value in vars(module).items():
+            if (inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == info.name:
+                yield f"{info.name}.{name}"
+
+
+EXTRA = {"data": {"views": {"name": "v3"}, "targets": {"name": "cameras"}}, "logger": {"save_dir": "."}}
+
+
+def key_of(group):
+    return f"{group}.x" if group in NAMED else group
+
+
+OUTSIDE = ["os.system", "subprocess.run", "builtins.eval", "torch.load", "lightning.pytorch.Trainer"]
+
+
+@pytest.mark.parametrize("group", sorted(KINDS))
+def test_no_function_or_class_is_a_kind_by_its_path(group):
+    """A checkpoint said ``_target_: ghgs_lit.runs.job._run_process`` with a command, and the command ran."""
+    paths = [*everything_callable(), *OUTSIDE]
+    assert len(paths) > 1500
+    for path in paths:
+        with pytest.raises(InputError, match=rf"{group}.*(kind|expected one of)"):
+            build({"kind": path}, key_of(group))
+
+
+@pytest.mark.parametrize("group", sorted(KINDS))
+@pytest.mark.parametrize("key", ["_target_", "_partial_", "_args_", "_convert_", "_recursive_"])
+def test_the_words_of_hydras_instantiate_mean_nothing(group, key, tmp_path):
+    """At every node, and nested; what a file says is data."""
+    node = composed("train", "model=recurrent", "logger=wandb").get(group)
+    if group in NAMED:
+        name = next(iter(node))
+        node = node[name]
+    call = {"_target_": "pathlib.Path.touch", "_args_": [str(tmp_path / "called")]}
+    with pytest.raises(InputError, match=f"{key}|expected"):
+        build({**dict(node), key: call}, key_of(group), **EXTRA.get(group, {}))
+    for name in node:
+        if name == "kind":
+            continue
+        with contextlib.suppress(Exception):  # whatever it answers
+            build({**dict(node), name: call}, key_of(group), **EXTRA.get(group, {}))
+    assert not (tmp_path / "called").exists()
+
+
+@pytest.mark.parametrize("stage", ["bounds", "encoder", "depth_head", "recalibration", "gaussian_head"])
+def test_a_model_is_built_of_kinds_alone(stage):
+    """The same through the door that checkpoints take."""
+    settings = config()
+    settings[stage] = {"_target_": "ghgs_lit.runs.job._run_process", "command": ["false"]}
+    with pytest.raises(InputError, match=rf"{stage}\.kind: expected"):
+        GHGS.from_config(settings)
+
+
+def test_every_kind_exists():
+    """A path in the table that is wrong would fail for its first user."""
+    for group, kinds in KINDS.items():
+        for kind in kinds:
+            assert inspect.isclass(class_of(group, kind, group))
+
+
+def test_kinds_of_the_users_own(monkeypatch):
+    """A registered kind is read and built like those of the package, and hides none of them."""
+    monkeypatch.setattr("ghgs_lit.config.registry._REGISTERED", {})
+
+    @register("bounds", "sphere")
+    class Sphere(Options):
+        radius: float = 1.0
+
+        def build(self):
+            return f"a sphere of {self.radius} m"
+
+    assert build({"kind": "sphere", "radius": 2}, "bounds") == "a sphere of 2.0 m"
+    with pytest.raises(
+        InputError, match=r"bounds key: expected one of radius; found 'radios' \(did you mean radius"
+    ):
+        read_node({"kind": "sphere", "radios": 2}, "bounds")
+    with pytest.raises(
+        InputError, match=r"bounds\.kind: expected one of box, hull, none, sphere; found 'spere'"
+    ):
+        read_node({"kind": "spere"}, "bounds")
+    with pytest.raises(InputError, match="a new kind of bounds; found 'hull'"):
+        register("bounds", "hull")(Sphere)
+    with pytest.raises(InputError, match=r"register: expected one of .*; found 'shape'"):
+        register("shape", "sphere")
+
+
+def test_a_node_without_a_kind_names_those_that_there_are():
+    with pytest.raises(InputError, match=r"bounds\.kind: expected one of box, hull, none; found None"):
+        build({}, "bounds")
+    with pytest.raises(InputError, match=r"bounds: expected a mapping of its keys; found 'box'"):
+        build("box", "bounds")
