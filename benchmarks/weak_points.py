@@ -2,8 +2,8 @@
 
     python benchmarks/weak_points.py
 
-Prints the table of ``docs/stress.md``. W1 to W22 number weak points of the authors' release; each plain
-formula is written out here. Those that are not about numbers are named in the document.
+Prints the figures of ``docs/evidence/stress.md``. W1 to W22 number weak points of the authors' release; each
+plain formula is written out here. Those that are not about numbers are named in the document.
 """
 
 from collections.abc import Callable

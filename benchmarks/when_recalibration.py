@@ -2,10 +2,10 @@
 
     python benchmarks/when_recalibration.py runs/ablation
 
-Reads the runs of a sweep over ``ablation`` measured on ``evaluation.split=bench`` (docs/ablation.md), sorts
-the frozen people into thirds by what the paper's argument speaks of, and compares the whole method with each
-of the other rows: PSNR inside the box, averaged over seeds, Wilcoxon's test over the people of a third,
-without correction. Sorted by
+Reads the runs of a sweep over ``ablation`` measured on ``evaluation.split=bench``
+(docs/evidence/ablation.md), sorts the frozen people into thirds by what the paper's argument speaks of, and
+compares the whole method with each of the other rows: PSNR inside the box, averaged over seeds, Wilcoxon's
+test over the people of a third, without correction. Sorted by
 
 - limbs: the share of the skin that lies within 5 cm of another part of the body that is not its neighbour,
 - texture: the contrast of the photographs within the subject, finer than 4 pixels,

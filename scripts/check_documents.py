@@ -104,6 +104,7 @@ SMALL = [
 
 _SCANS = "ghgs prepare task=miniature data=thuman2 data.source={} miniature.size=64 miniature.people.train=2"
 _RENDER = "ghgs prepare task=render data=scans data.source={} data.root=rendered data.render.size=60"
+_RENDERED = (_SCANS.format("scans"), _RENDER.format("scans"))
 _RUN = f"ghgs train experiment=demo {TINY} {SHORT}"
 _SWEEP = (
     f"ghgs train -m experiment=demo {TINY} {SHORT} ablation=full,neither 'evaluation.views=[4]' "
@@ -152,20 +153,24 @@ Path("cameras.json").write_text(json.dumps({"cameras": cameras}))
 END"""
 # A document, and the commands that make what its reader has.
 BEFORE = {
-    "docs/add_a_data_set.md": (_SCANS.format("scans"), _RENDER.format("scans"), _PHOTOGRAPHS),
+    "docs/add_a_data_set.md": (*_RENDERED, _PHOTOGRAPHS),
     "docs/benchmark.md": _CHECKPOINTS,
     "docs/data.md": (
         f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
         _SCANS.format("THuman2.0_Release"),
     ),
     "docs/encoder.md": _CHECKPOINTS,
+    "docs/evidence/benchmark.md": _RENDERED,
+    "docs/evidence/models.md": _RENDERED,
+    "docs/evidence/photographs.md": _RENDERED,
+    "docs/evidence/rounds.md": _RENDERED,
     "docs/outputs.md": _CHECKPOINTS,
     "docs/photographs.md": (
         f"{_RUN} hydra.run.dir=runs/mine",
-        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
+        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW} miniature.size=112",
         _CAPTURE,
     ),
-    "docs/rounds.md": (_SCANS.format("scans"), _RENDER.format("scans")),
+    "docs/rounds.md": _RENDERED,
     "docs/sweeps.md": (_SWEEP,),
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (
@@ -235,7 +240,7 @@ class Command:
 
 def documents() -> list[str]:
     """All documents that have commands, relative to the repository."""
-    found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+    found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [path.relative_to(ROOT).as_posix() for path in found]
 
 

@@ -1,6 +1,6 @@
 """Broken HuMMan-Recon data: each case gets one line that says where, what was expected and what was found.
 
-The lines are listed in ``docs/data_humman.md``.
+The lines are listed in ``docs/evidence/broken_files.md``.
 """
 
 import json

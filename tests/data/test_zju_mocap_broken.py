@@ -1,6 +1,6 @@
 """Broken ZJU-MoCap data: each case gets one line that says where, what was expected and what was found.
 
-The lines are listed in ``docs/data_zju_mocap.md``.
+The lines are listed in ``docs/evidence/broken_files.md``.
 """
 
 import shutil

@@ -115,7 +115,7 @@ def changed_state(change):
 
 TOKEN = "model.encoder.aggregator.camera_token"
 
-#: name: (content, part of the message); docs/weights.md lists the messages.
+#: name: (content, part of the message); docs/evidence/broken_files.md lists the messages.
 BAD_FILES = {
     "empty": (lambda _: b"", "found an empty file"),
     "web page": (lambda _: b"<!DOCTYPE html><html><title>Sign in</title>", "found a web page"),

@@ -1,6 +1,6 @@
 """Gaussians in the compact formats of 3DGS viewers, which the package gaussforge makes from the PLY.
 
-They store few bits: ``docs/outputs.md`` has their sizes and what is lost.
+They store few bits: ``docs/evidence/outputs.md`` has their sizes and what is lost.
 """
 
 from pathlib import Path
