@@ -7,13 +7,13 @@ from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.text import Text
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.terminal import print_uncut
 
 
 def _listed(key: str, value: Any, kind: type) -> tuple | None:
@@ -49,9 +49,7 @@ def run(cfg: DictConfig) -> None:
     config = save_config(cfg, directory)
     options = _options(config)
     folders = [Path(p).expanduser() for p in _listed("runs", config["runs"], str) or ()]
-    others = [
-        r for p in _listed("others", config["others"], str) or () for r in t.read_others(Path(p).expanduser())
-    ]
+    others = [t.read_others(Path(p).expanduser()) for p in _listed("others", config["others"], str) or ()]
     sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
@@ -67,5 +65,5 @@ def run(cfg: DictConfig) -> None:
 def _print(table: t.Table) -> None:
     console = Console()
     console.print(table.caption.replace("`", ""), highlight=False)
-    print_uncut(t.to_terminal(table))
+    console.print(Text.from_ansi(t.to_terminal(table, console.width)), soft_wrap=True)
     console.print("\n".join(table.notes).replace("**", "").replace("`", ""), markup=False, highlight=False)

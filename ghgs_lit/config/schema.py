@@ -126,7 +126,6 @@ KINDS: dict[str, Kind] = {
     "vs": PATH,
     "test.against": TEXT,
     "test.alpha": number(above=0, below=1),
-    "test.kind": TEXT,
     "test.unit": TEXT | NULL,
     "token_budgets": list_of(one_of("all", "window") | integer(least=0)) | NULL,
     "turntable.fps": COUNT,

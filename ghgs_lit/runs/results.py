@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ghgs_lit.config.keys import lookup
-from ghgs_lit.config.legacy import upgrade_provenance
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import config_hash
 
 FORMAT_VERSION = 3
-"""The version that is written; earlier ones are read too."""
+"""The version that is written, and the only one that is read."""
 METHOD = "model"
 """The method of the rows of a trained model; others are baselines."""
 KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
@@ -143,7 +142,7 @@ def _check_rows(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``; its configurations are returned in today's keys.
+    """Read a ``metrics.json``.
 
     Raises:
         InputError: the file is not a whole ``metrics.json``, or its configuration is not the one that was
@@ -154,13 +153,14 @@ def read_results(path: Path) -> dict[str, Any]:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected a metrics.json; found {error}") from error
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
-    if found not in range(1, FORMAT_VERSION + 1):
-        raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {found}")
+    if found != FORMAT_VERSION:
+        raise InputError(
+            f"{path}: expected format_version {FORMAT_VERSION}; found {found} (`ghgs evaluate` measures again)"
+        )
     _check_rows(path, content)
     source = entry(str(path), content, "provenance", dict)
-    # The keys without influence changed since earlier versions, and with them the hashes.
-    if found == FORMAT_VERSION and isinstance(source.get("config"), dict):
+    if isinstance(source.get("config"), dict):
         fitting, hashed = config_hash(source["config"]), source.get("config_hash")
         expected = f"a configuration that fits its config_hash {hashed}"
         require(fitting == hashed, f"{path}: provenance.config", expected, f"one of {fitting}")
-    return {**content, "provenance": upgrade_provenance(source)}
+    return content

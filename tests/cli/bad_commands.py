@@ -244,7 +244,7 @@ NAMES = [
     ("predict checkpoint={ckpt} data=synthetic device=gpu", 1, "device: expected one of auto", "'gpu'"),
     ("prepare task=paint", 1, "task: expected one of render, miniature, check; found 'paint'"),
     ("table runs={tmp} layout=table9", 1, "layout: expected one of ablation", "found 'table9'"),
-    ("table runs={tmp} test.kind=anova", 1, "test.kind: expected one of", "'anova'"),
+    ("table runs={tmp} test.against=worst", 1, "test.against: expected one of", "'worst'"),
     ("table runs={tmp} test.unit=x", 1, "test.unit: expected a regular expression with a group"),
     ("table runs={tmp} 'test.unit=\"(\"'", 1, "test.unit: expected a regular expression"),
     ("import out={tmp}/x.ckpt encoder=vggt_nano", 1, "compat: expected none", "found 'release'"),

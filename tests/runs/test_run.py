@@ -9,7 +9,6 @@ import time
 
 import pytest
 
-from ghgs_lit.config import legacy
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory, State
@@ -54,18 +53,6 @@ def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):
     assert not RunDirectory(tmp_path).done
     write_finished_run(tmp_path, {"seed": 1})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.csv", "metrics.json"]
-
-
-def test_results_of_an_earlier_version_are_read_in_todays_names(tmp_path, monkeypatch):
-    """Tables must put runs from before and after a renaming into the same row."""
-    monkeypatch.setitem(legacy.KEYS, "optim.rate", "optimizer.lr")
-    old = {"seed": 1, "optim": {"rate": 0.1}}
-    source = {"config": old, "checkpoint_config": old, "choices": {"optimizer": "pilot", "data": "scans"}}
-    path = tmp_path / "metrics.json"
-    path.write_text(json.dumps({"format_version": 1, "provenance": source, "summary": [], "rows": []}))
-    found = read_results(path)["provenance"]
-    assert found["config"]["optimizer"] == found["checkpoint_config"]["optimizer"] == {"lr": 0.1}
-    assert found["choices"] == {"optimizer": "from_scratch", "data": "scans"}
 
 
 def test_a_session_that_was_killed_while_it_was_noted(tmp_path):

@@ -17,9 +17,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.records import Record, Setting, Variant
-from ghgs_lit.runs.results import mean
+from ghgs_lit.evaluation.tables.records import SETTING, Variant
 
 FORMAT, FORMAT_VERSION = "ghgs_lit.others", 1
 _TOP = {"format": str, "format_version": int, "method": str, "source": str, "rows": list}
@@ -76,8 +77,10 @@ def _cell(row: Mapping[str, Any]) -> tuple:
     return (*(row[k] for k in ("data", "split", "targets", "protocol", "views")), row.get("seed", 0))
 
 
-def read_others(path: Path) -> list[Record]:
-    """The records of another method's results file.
+def read_others(path: Path) -> pd.DataFrame:
+    """The lines of another method's results file, as :class:`Sweep` has them of ours.
+
+    ``said`` is the file's ``source``; lines that are means have no ``subject`` and may have a ``count``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -90,21 +93,13 @@ def read_others(path: Path) -> list[Record]:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected JSON; found {error}") from error
     _validate(content, path.name)
-    groups: dict[tuple, list[dict]] = {}
-    for row in content["rows"]:
-        groups.setdefault(_cell(row), []).append(row)
-    records = []
-    for (data, split, targets, protocol, views, seed), rows in groups.items():
-        subjects = {row["subject"]: row["metrics"] for row in rows if "subject" in row}
-        if subjects and len(subjects) < len(rows):
+    rows = pd.DataFrame([{"subject": None, "subjects": None, "seed": 0} | row for row in content["rows"]])
+    for (data, _, _, _, views, _), part in rows.groupby([*SETTING, "views", "seed"], sort=False)["subject"]:
+        if part.notna().any() and len(part) > part.notna().sum():
             raise InputError(
                 f"{path.name}: expected subjects or one mean for data={data}, views={views}; found both"
             )
-        names = dict.fromkeys(name for row in rows for name in row["metrics"])
-        means = {name: mean(row["metrics"].get(name) for row in rows) for name in names}
-        count = len(subjects) or rows[0].get("subjects")
-        setting = Setting(data, split, targets, protocol)
-        about = {"source": content["source"]}
-        variant = Variant("other", content["method"])
-        records.append(Record(variant, setting, views, seed, means, str(path), count, subjects, None, about))
-    return records
+    metrics = pd.DataFrame(list(rows.pop("metrics"))).astype(float)
+    variant, rows = Variant("other", content["method"]), rows.rename(columns={"subjects": "count"})
+    rows = rows.assign(variant=variant, source=str(path), run=None, said=content["source"])
+    return rows.join(metrics).astype({"count": float})

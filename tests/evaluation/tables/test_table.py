@@ -8,7 +8,7 @@ import pytest
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown
-from ghgs_lit.evaluation.tables.text import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS, deviation
+from ghgs_lit.evaluation.tables.notes import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS
 from ghgs_lit.runs.results import read_results, summarize, write_results
 from tests.helpers.tables import body, start_run, tables_of, write_run
 
@@ -40,7 +40,6 @@ def test_several_seeds_give_a_deviation(tmp_path):
     rows, _ = body(to_markdown(table))
     assert rows["✓", "✓"][0] == "25.00 ± 1.00"
     assert "3 seeds" in table.caption
-    assert deviation([1.0]) is None
 
 
 def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
@@ -67,7 +66,9 @@ def test_runs_that_are_planned_or_going_are_said(tmp_path):
     (table,) = tables_of(tmp_path, views=(4,))
     rows, _ = body(to_markdown(table))
     assert rows["✓", "✓"][0] == "**25.50 ± 0.71 (2/3)**"
-    assert rows["✗", "✗"][0] == "24.00 (1/3)"
+    # No run of it with seed 3 is planned.
+    assert rows["✗", "✗"][0] == "24.00 (1/2)"
+    assert any("different seeds (✗ ✗: 1; ✓ ✓ (a): 1, 2)" in note for note in table.notes)
     assert any("synthetic paper neither seed 2" in note for note in table.notes)
     assert not any("seed 1" in note for note in table.notes)
 
@@ -127,8 +128,8 @@ def test_targets_are_tables_of_their_own_and_can_be_picked(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 18.0, targets="midway")
     write_run(tmp_path / "2", "full", 18.0, protocol="release")
-    settings = [tuple(t.records[0].setting.__dict__.values()) for t in tables_of(tmp_path)]
-    assert [s[2:] for s in settings] == [
+    settings = [tuple(t.rows[["targets", "protocol"]].iloc[0]) for t in tables_of(tmp_path)]
+    assert settings == [
         ("release", "correct"),
         ("midway", "correct"),
         ("release", "release"),
@@ -143,7 +144,9 @@ def test_two_runs_of_one_cell_are_refused_and_can_be_told_apart(tmp_path):
     """No run is averaged with another by accident; the message says how to separate them."""
     write_run(tmp_path / "0", "full", 20.0, optimizer={"lr": 0.1})
     write_run(tmp_path / "1", "full", 21.0, optimizer={"lr": 0.2})
-    expected = r"ablation=full, 3 views, seed 1; found .*0/metrics\.json .*by=\[optimizer\.lr\]"
+    expected = (
+        r"ablation=full, 3 views, seed 1; found .*0/metrics\.json and .*1/metrics.json .*by=\[optimizer\.lr\]"
+    )
     with pytest.raises(InputError, match=expected):
         tables_of(tmp_path)
     first, second = tables_of(tmp_path, by=["optimizer.lr"])
@@ -156,7 +159,7 @@ def test_the_same_numbers_twice_are_one_run(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 20.0, verb="evaluate")
     (table,) = tables_of(tmp_path)
-    assert all(list(cell.seeds) == [1] for line in table.lines for cell in line.cells.values())
+    assert list(table.measured["seeds"]) == [(1,)] * 9
 
 
 def test_csv_has_every_cell_in_full(tmp_path):
@@ -184,8 +187,11 @@ def test_results_that_are_none_are_refused(tmp_path):
     path.write_text("{")
     with pytest.raises(InputError, match=r"metrics\.json"):
         read_sweep([tmp_path])
+    path.write_text(json.dumps({"format_version": 2}))
+    with pytest.raises(InputError, match="format_version 3; found 2 .*evaluate"):
+        read_results(path)
     path.write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="format_version 1 to 3; found 99"):
+    with pytest.raises(InputError, match="format_version 3; found 99"):
         read_results(path)
     with pytest.raises(InputError, match="at least one"):
         write_results(tmp_path, [], {})

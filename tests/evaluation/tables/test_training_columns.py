@@ -37,28 +37,12 @@ def test_rows_of_different_steps_are_said(tmp_path):
 def test_a_row_is_what_the_model_does(tmp_path):
     """A label that says something else than the model must not choose the row."""
     changed = {"neighborhood": "image_plane", "similarity": "log"}
-    path = write_run(tmp_path / "0", "full", 20.0, recalibration=changed)
-    content = json.loads(path.read_text())
-    content["format_version"] = 2  # its hash was of other keys
-    content["provenance"]["config"]["ablation"] = {"name": "full", "unprojection": True, "semantic": True}
-    path.write_text(json.dumps(content))
+    labels = {"name": "full", "unprojection": True, "semantic": True}
+    write_run(tmp_path / "0", "full", 20.0, recalibration=changed, ablation=labels)
     (table,) = tables_of(tmp_path, views=(4,))
     rows, _ = body(to_markdown(table))
     assert rows["✗", "✓"][0] == "24.00"
     assert rows["✓", "✓"][0] == "missing"
-
-
-def test_results_of_before_keep_their_rows(tmp_path):
-    """Earlier results say their ablation in a node of its own."""
-    path = write_run(tmp_path / "0", "full", 20.0)
-    content = json.loads(path.read_text())
-    content["format_version"] = 2  # its hash was of other keys
-    config = content["provenance"]["config"]
-    del config["recalibration"]
-    config["ablation"] = {"name": "no_semantic", "unprojection": True, "semantic": False}
-    path.write_text(json.dumps(content))
-    (table,) = tables_of(tmp_path, views=(4,))
-    assert body(to_markdown(table))[0]["✓", "✗"][0] == "24.00"
 
 
 def test_a_checkpoint_that_was_changed_is_another_row(tmp_path):
