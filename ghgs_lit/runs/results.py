@@ -154,9 +154,8 @@ def read_results(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected a metrics.json; found {error}") from error
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT_VERSION:
-        raise InputError(
-            f"{path}: expected format_version {FORMAT_VERSION}; found {found} (`ghgs evaluate` measures again)"
-        )
+        again = "`ghgs evaluate` measures again"
+        raise InputError(f"{path}: expected format_version {FORMAT_VERSION}; found {found} ({again})")
     _check_rows(path, content)
     source = entry(str(path), content, "provenance", dict)
     if isinstance(source.get("config"), dict):

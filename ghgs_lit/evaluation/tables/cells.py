@@ -82,8 +82,7 @@ def _values(table: Table) -> pd.DataFrame:
     )
     rows = rows[rows["group"] >= 0]
     size = rows.groupby(["line", "group", "seed", "source"])["line"].transform("size")
-    given = rows["count"] if "count" in rows else size
-    rows = rows.assign(count=given.fillna(size), run=rows["run"].fillna(rows["source"]))
+    rows = rows.assign(count=rows.get("count", size).fillna(size), run=rows["run"].fillna(rows["source"]))
     rows = rows.reindex(columns=[*facts, "count", *table.metrics])
     return rows.melt([*facts, "count"], var_name="metric").dropna(subset="value")
 
@@ -173,9 +172,8 @@ def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
     for cell, comparison in tested:
         if cell is not None:
             table.cells.at[cell, "test"] = comparison
-            table.cells.at[cell, "marked"] = (
-                comparison.corrected is not None and comparison.corrected < test.alpha
-            )
+            p = comparison.corrected
+            table.cells.at[cell, "marked"] = p is not None and p < test.alpha
 
 
 def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tuple[int | None, bool]:

@@ -58,7 +58,7 @@ def _column_spec(table: Table) -> str:
 
 
 def _frame(table: Table) -> pd.DataFrame:
-    """The cells, first columns included, below the headings of groups (where the layout has any) and metrics."""
+    """The texts of the table below the headings of groups (where the layout has any) and of metrics."""
     numbers = texts(table, _number)
     named = table.layout.heading != "none"
     stub = [

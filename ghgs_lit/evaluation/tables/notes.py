@@ -110,8 +110,8 @@ def _about_test(table: Table, test: PairedTest) -> list[str]:
     needed = needed_errors(test.alpha, fewest, table.comparisons)
     return [
         f"{MARK} differs beyond chance from {against}: two-sided t test over {_range(seeds)} seeds and"
-        f" {_range(subjects)} subjects together, Holm's correction over the {table.comparisons} comparisons of"
-        f" this table, p < {test.alpha:g}; in brackets the {100 * (1 - test.alpha):g} % interval of the"
+        f" {_range(subjects)} subjects together, Holm's correction over the {table.comparisons} comparisons"
+        f" of this table, p < {test.alpha:g}; in brackets the {100 * (1 - test.alpha):g} % interval of the"
         f" difference. With {fewest} seeds or subjects a difference must be {needed:.3g} standard errors."
     ]
 

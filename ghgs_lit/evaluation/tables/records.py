@@ -77,9 +77,9 @@ class Sweep:
     """Everything below the directories of a sweep.
 
     Args:
-        rows: a line for each subject of each method of a run, number of views and kind of targets: ``variant``,
-            ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's hash), ``git``
-            (in words), ``subject``, and the metrics, averaged over the subject's targets.
+        rows: a line for each subject of each method of a run, number of views and kind of targets:
+            ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's
+            hash), ``git`` (in words), ``subject``, and the metrics, averaged over the subject's targets.
         planned: the training runs, finished or not.
         configs: the configuration of our model by ``source``.
     """

@@ -1,8 +1,9 @@
 """Tests of two rows over seeds and subjects together, corrected for the number of tests in a table.
 
-A method is one of many trainings, measured on some of many subjects: both are drawn by chance. The squared
-standard errors over seeds and over subjects are added (min F', Clark 1973), and the freedom is that of the fewer
-of the two (Mickey and Brown 1966), so that the level holds whatever share of the chance is whose.
+A row is some of many possible trainings, measured on some of many subjects: both are drawn by chance. The
+squared standard errors over seeds and over subjects are added (min F', Clark 1973), and the degrees of
+freedom are those of the fewer of the two (Mickey and Brown 1966), so that the level holds whichever varies
+more.
 """
 
 import math
@@ -74,10 +75,8 @@ def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> 
         return Comparison(seeds, subjects, mean)
     variance = differences.mean(axis="columns").var() / seeds + differences.mean().var() / subjects
     error = math.sqrt(variance)
-    if error > 0:
-        p = float(2 * stats.t.sf(abs(mean) / error, freedom))
-    else:
-        p = 0.0 if mean else 1.0
+    errors = abs(mean) / error if error > 0 else math.inf if mean else 0.0
+    p = float(2 * stats.t.sf(errors, freedom))
     half = needed_errors(alpha, freedom + 1) * error
     return Comparison(seeds, subjects, mean, mean - half, mean + half, p)
 

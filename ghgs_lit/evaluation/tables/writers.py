@@ -71,7 +71,7 @@ def to_markdown(table: Table) -> str:
 
 
 def to_terminal(table: Table, width: int) -> str:
-    """The numbers for a terminal of ``width`` columns; groups stand below one another where they are wider."""
+    """The numbers for a terminal; groups stand below one another where the table is wider than ``width``."""
 
     def write(number: str, tail: str, best: bool) -> str:
         # An interval stands below its number: beside it few tables would fit.

@@ -38,7 +38,7 @@ def test_a_configuration_against_itself_is_marked_at_most_at_the_level(seeds, ow
 
 
 def test_a_table_of_one_configuration_is_marked_at_most_at_the_level(tmp_path):
-    """Four names of one configuration, three seeds each, the row of the whole method or the best as reference."""
+    """Three names, three seeds each; the reference is the row of the whole method or the best."""
     rng, trials, alpha = np.random.default_rng(2), 12, 0.05
     marked = {"full": 0, "best": 0}
     for trial in range(trials):

@@ -188,7 +188,7 @@ def test_results_that_are_none_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"metrics\.json"):
         read_sweep([tmp_path])
     path.write_text(json.dumps({"format_version": 2}))
-    with pytest.raises(InputError, match="format_version 3; found 2 .*evaluate"):
+    with pytest.raises(InputError, match=r"format_version 3; found 2 .*evaluate"):
         read_results(path)
     path.write_text(json.dumps({"format_version": 99}))
     with pytest.raises(InputError, match="format_version 3; found 99"):
