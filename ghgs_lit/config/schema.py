@@ -113,8 +113,6 @@ KINDS: dict[str, Kind] = {
     "share": SHARE,
     "size": SIZE | NULL,
     "smooth": FLAG,
-    "splats.opacity": SHARE,
-    "splats.sigma": POSITIVE,
     "split": TEXT,
     "subject": TEXT | integer(least=0),
     "subjects": COUNT | NULL,
