@@ -1,4 +1,4 @@
-"""``ghgs table``: the runs below a directory as one of the paper's tables."""
+"""``ghgs table``: the runs below a directory as one of the paper's tables, or as a list."""
 
 import re
 from collections.abc import Sequence
@@ -8,12 +8,14 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.text import Text
+from tabulate import tabulate
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.listing import list_runs
 
 
 def _listed(key: str, value: Any, kind: type) -> tuple | None:
@@ -44,11 +46,17 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the tables, and the path of the Markdown file last."""
+    """The verb; prints the tables, and the path of the Markdown file last; with ``list`` the runs."""
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
     folders = [Path(p).expanduser() for p in _listed("runs", config["runs"], str) or ()]
+    if config["list"]:
+        runs = list_runs(folders)
+        write_text_atomically(directory / "runs.csv", runs.to_csv(index=False))
+        print(tabulate(runs, "keys", showindex=False, disable_numparse=True))
+        announce(directory / "runs.csv")
+        return
     others = [t.read_others(Path(p).expanduser()) for p in _listed("others", config["others"], str) or ()]
     sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
     tables = t.build_tables(sweep, others, options)

@@ -78,6 +78,7 @@ KINDS: dict[str, Kind] = {
     "init_strict": FLAG,
     "knobs": NULL | Kind("a mapping of lists", lambda value: isinstance(value, Mapping)),
     "layout": TEXT,
+    "list": FLAG,
     "masks": PATH,
     "miniature.people.*": integer(least=0),
     "miniature.size": SIDE,

@@ -179,7 +179,7 @@ def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Lay
             note = " (a)" if pair[1] and not first.has_semantics else ""
             lines.append(Line(replace(first, switches=pair), (unprojection, semantic + note)))
         return lines
-    variants = list(dict.fromkeys([*variants, *(p.variant for p in planned)]))
+    variants = list(dict.fromkeys([*variants, *(p.variant for p in planned if not p.done)]))
     order = ("baseline", "other", "model")
     models = [v for v in variants if v.kind == "model"]
     return [

@@ -12,12 +12,13 @@ from typing import Any
 
 import pandas as pd
 import yaml
+from pydantic import BaseModel, ConfigDict, Field
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.ablation import ABLATIONS, switches_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.runs.results import KEYS, METHOD, entry, read_results
+from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
 SETTING = ["data", "split", "targets", "protocol"]
 """What numbers in one column must have in common."""
@@ -25,6 +26,7 @@ TRAINING = ("steps", "seconds", "peak_gb")
 """Metrics of the training, which no subject has."""
 #: Keys of `ghgs evaluate` that change its numbers beside the model, the data and the metrics.
 _OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
+_ROW = ["method", "views", "targets", "subject"]
 # Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("patch_size", "width", "heads", "depth", "layers", "vit")
 
@@ -117,7 +119,8 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     Raises:
         InputError: the configuration has no recalibration, by which the ablation is told.
     """
-    recalibration = entry(source, config, "recalibration", dict)
+    recalibration = config.get("recalibration")
+    require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")
     model = [str(lookup(config, "model.name") or "unnamed")]
     model += [f"compat {compat}"] * (compat not in (None, "none"))
@@ -135,20 +138,55 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     )
 
 
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+
+class _Data(_Strict):
+    name: str
+    split: str
+
+
+class _Protocol(_Strict):
+    metrics: str
+
+
+class _Git(_Strict):
+    commit: str
+    changed: bool = False
+
+
+class _Training(_Strict):
+    steps: float | None = None
+    seconds: float | None = None
+    peak_bytes: float | None = None
+
+
+class _Provenance(_Strict):
+    """What tables read of the provenance of results."""
+
+    config: dict[str, Any]
+    config_hash: str | None = None
+    # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint
+    # does, but for what the command line changed.
+    checkpoint_config: dict[str, Any] | None = None
+    changed_model: dict[str, Any] | None = Field(None, alias="model_config")
+    seed: int | None = None
+    data: _Data
+    protocol: _Protocol
+    git: _Git | None = None
+    training: _Training | None = None
+
+
 def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, Any]]:
     """The lines of a ``metrics.json``, and the configuration of its model as it was trained and measured."""
     content = read_results(path)
-    source, at = content["provenance"], f"{path}: provenance"
-    measured = entry(at, source, "config", dict)
-    # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint
-    # does, but for what the command line changed.
-    trained = dict(measured)
-    for part in ("checkpoint_config", "model_config"):
-        if source.get(part) is not None:
-            changed = entry(at, source, part, dict)
-            trained = changed if part == "checkpoint_config" else {**trained, **changed}
+    source = validated(_Provenance, content["provenance"], f"{path}: provenance")
+    trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
     kept = (*_OF_EVALUATION, "data", "metrics")
-    config = trained | {key: measured.get(key) for key in kept if key in measured or key in trained}
+    config = trained | {key: source.config.get(key) for key in kept if key in {*source.config, *trained}}
+    seed = trained.get("seed", source.seed)
+    require(isinstance(seed, int), f"{path}: provenance.seed", "a whole number", seed)
     rows = pd.DataFrame(content["rows"])
     rows = rows.drop(columns=[key for key in KEYS if key in rows and key not in _ROW])
     # In tables ``seconds`` are those of the training.
@@ -156,41 +194,24 @@ def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, An
     rows = rows.astype({name: float for name in rows if name not in _ROW})
     rows = rows.groupby(_ROW, sort=False).mean().dropna(axis="columns", how="all").reset_index()
     is_model = rows["method"] == METHOD
-    for name, value in _training(at, source).items():
-        rows.loc[is_model, name] = value
+    if (training := source.training) is not None:
+        peak = None if training.peak_bytes is None else training.peak_bytes / 1e9
+        for name, value in zip(TRAINING, (training.steps, training.seconds, peak), strict=True):
+            if value is not None:
+                rows.loc[is_model, name] = value
     model = model_variant(config, str(path), by) if is_model.any() else None
+    git = source.git and source.git.commit[:9] + " with changes" * source.git.changed
     facts = {
         "variant": [model if m == METHOD else Variant("baseline", m) for m in rows.pop("method")],
-        "data": entry(at, source, "data.name", str),
-        "split": entry(at, source, "data.split", str),
-        "protocol": entry(at, source, "protocol.metrics", str),
-        "seed": entry(at, trained if "seed" in trained else source, "seed", int),
+        "data": source.data.name,
+        "split": source.data.split,
+        "protocol": source.protocol.metrics,
+        "seed": seed,
         "source": str(path),
-        "run": source.get("config_hash"),
-        "git": _git(at, source),
+        "run": source.config_hash,
+        "git": git,
     }
     return rows.assign(**facts), config
-
-
-_ROW = ["method", "views", "targets", "subject"]
-
-
-def _training(at: str, source: Mapping[str, Any]) -> dict[str, float]:
-    """What the training took: ``steps``, ``seconds`` and ``peak_gb``, as far as the results say."""
-    if source.get("training") is None:
-        return {}
-    said = entry(at, source, "training", dict)
-    taken = {key: entry(f"{at}.training", said, key, float) for key in ("steps", "seconds", "peak_bytes")}
-    peak = taken.pop("peak_bytes")
-    taken["peak_gb"] = None if peak is None else peak / 1e9
-    return {key: float(value) for key, value in taken.items() if value is not None}
-
-
-def _git(at: str, source: Mapping[str, Any]) -> str | None:
-    if source.get("git") is None:
-        return None
-    commit = entry(at, source, "git.commit", str)
-    return commit[:9] + " with changes" * bool(source["git"].get("changed"))
 
 
 def _planned(path: Path, by: Sequence[str]) -> Planned | None:

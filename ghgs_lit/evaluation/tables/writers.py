@@ -1,5 +1,6 @@
 """Tables as Markdown, on a terminal and as CSV."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -74,19 +75,15 @@ def to_terminal(table: Table, width: int) -> str:
     """The numbers for a terminal; groups stand below one another where the table is wider than ``width``."""
 
     def write(number: str, tail: str, best: bool) -> str:
-        # An interval stands below its number: beside it few tables would fit.
-        text = (number + tail).replace(f"{MARK} [", f"{MARK}\n[")
-        return "\n".join(_BEST.format(part) for part in text.split("\n")) if best else text
+        # What is in brackets stands below its number: beside it few tables would fit.
+        lines = re.sub(r" (?=[\[(])", "\n", number + tail).split("\n")
+        return "\n".join(_BEST.format(line) if best else line for line in lines)
 
     numbers = texts(table, write)
     whole = _terminal(table, numbers)
-    if max(len(line) for line in _terminal(table, texts(table, _plain)).splitlines()) <= width:
+    if max(map(len, re.sub(r"\033\[[\d;]*m", "", whole).splitlines())) <= width:
         return whole
     return "\n\n".join(_terminal(table, numbers[[group]]) for group in range(len(table.groups)))
-
-
-def _plain(number: str, tail: str, best: bool) -> str:
-    return (number + tail).replace(f"{MARK} [", f"{MARK}\n[")
 
 
 def _terminal(table: Table, numbers: pd.DataFrame) -> str:

@@ -3,11 +3,12 @@
 import csv
 import io
 import json
+import re
 
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown
+from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown, to_terminal
 from ghgs_lit.evaluation.tables.notes import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS
 from ghgs_lit.runs.results import read_results, summarize, write_results
 from tests.helpers.tables import body, start_run, tables_of, write_run
@@ -217,3 +218,54 @@ def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
     assert lines[0].startswith("method,subject,views,targets,target,inputs,psnr,psnr_box,depth_error_mm")
     assert lines[1].startswith("model,a,3,release,t,a b,20.0,,")
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_table_fits_a_narrow_terminal(tmp_path):
+    """Groups of columns stand below one another where they do not fit beside one another."""
+    for ablation, psnr in (("full", 20.0), ("neither", 18.0)):
+        for seed in (1, 2):
+            write_run(tmp_path / f"{ablation}{seed}", ablation, psnr + seed / 10, seed=seed)
+    start_run(tmp_path / "going", "neither", seed=3)
+    (table,) = tables_of(tmp_path)
+    wide, narrow = (re.sub(r"\033\[[\d;]*m", "", to_terminal(table, width)) for width in (200, 80))
+    assert max(map(len, narrow.splitlines())) <= 80 < max(map(len, wide.splitlines()))
+    assert wide.count("✗") == 4
+    assert narrow.count("✗") == 3 * 4
+    assert narrow.count("(2/3)") == wide.count("(2/3)") == 9
+    assert "23.15 ± 0.07" in narrow
+
+
+def test_a_row_can_be_told_by_the_checkpoint_that_was_measured(tmp_path):
+    """Keys of `ghgs evaluate` tell rows apart, too; keys that no run has are refused."""
+    for name, psnr, seed in (("a.ckpt", 20.0, 1), ("b.ckpt", 21.0, 1), ("c.ckpt", 22.0, 2)):
+        write_run(tmp_path / name, "full", psnr, seed, verb="evaluate", measured={"checkpoint": name})
+    with pytest.raises(
+        InputError, match=r"a.ckpt/metrics.json and .*b.ckpt/metrics.json .*by=\[checkpoint\]"
+    ):
+        tables_of(tmp_path)
+    (table,) = tables_of(tmp_path, "table2", by=["checkpoint"], reported=False)
+    rows, _ = body(to_markdown(table))
+    assert {name: row[0] for name, row in rows.items()} == {
+        "Ours (checkpoint=a.ckpt)": "23.00",
+        "Ours (checkpoint=b.ckpt)": "24.00",
+        "Ours (checkpoint=c.ckpt)": "**25.00**",
+    }
+    # Each has the one seed that it was trained with: no run is lacking.
+    assert not table.measured["lacking"].map(bool).any()
+    assert not any("(2/3)" in note for note in table.notes)
+    with pytest.raises(InputError, match="by: expected keys of the runs' configurations; found 'chekpoint'"):
+        tables_of(tmp_path, "table2", by=["chekpoint"])
+
+
+def test_all_runs_that_claim_one_cell_are_named(tmp_path):
+    """Not only the first two, and each with its partner."""
+    for seed in range(5):
+        write_run(tmp_path / f"{seed}a", "full", 20.0, seed=seed, optimizer={"lr": 0.1})
+        write_run(tmp_path / f"{seed}b", "full", 21.0, seed=seed, optimizer={"lr": 0.2})
+    with pytest.raises(InputError) as error:
+        tables_of(tmp_path)
+    said = str(error.value)
+    assert all(f"{seed}{letter}/metrics.json" in said for seed in range(3) for letter in "ab")
+    assert "and 2 more such pairs" in said
+    assert "by=[optimizer.lr] gives each a row" in said
+    assert "\n" not in said
