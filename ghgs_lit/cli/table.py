@@ -1,7 +1,6 @@
 """``ghgs table``: the runs below a directory as one of the paper's tables, or as a list."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,9 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.listing import list_runs
 
 
-def _listed(key: str, value: Any, kind: type) -> tuple | None:
+def _listed(value: Any) -> tuple | None:
     """A value or a list of values as a tuple; None for null and an empty list."""
-    values = [value] if isinstance(value, kind) else value or ()
-    valid = isinstance(values, Sequence) and all(isinstance(v, kind) for v in values)
-    require(valid, key, f"one or more of type {kind.__name__}, or null", value)
-    return tuple(values) or None
+    return (value,) if isinstance(value, str | int) else tuple(value or ()) or None
 
 
 def _options(config: dict[str, Any]) -> t.TableOptions:
@@ -35,9 +31,9 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
         layout=t.layout_named(config["layout"]),
-        views=_listed("evaluation.views", evaluation["views"], int),
-        targets=_listed("evaluation.targets", evaluation["targets"], str),
-        metrics=_listed("columns", config["columns"], str),
+        views=_listed(evaluation["views"]),
+        targets=_listed(evaluation["targets"]),
+        metrics=_listed(config["columns"]),
         reported=config["reported"],
         test=from_config(t.PairedTest, "test", config["test"]),
         unit=unit,
@@ -50,15 +46,15 @@ def run(cfg: DictConfig) -> None:
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
-    folders = [Path(p).expanduser() for p in _listed("runs", config["runs"], str) or ()]
+    folders = [Path(p).expanduser() for p in _listed(config["runs"]) or ()]
     if config["list"]:
         runs = list_runs(folders)
         write_text_atomically(directory / "runs.csv", runs.to_csv(index=False))
         print(tabulate(runs, "keys", showindex=False, disable_numparse=True))
         announce(directory / "runs.csv")
         return
-    others = [t.read_others(Path(p).expanduser()) for p in _listed("others", config["others"], str) or ()]
-    sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
+    others = [t.read_others(Path(p).expanduser()) for p in _listed(config["others"]) or ()]
+    sweep = t.read_sweep(folders, _listed(config["by"]) or ())
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))

@@ -10,6 +10,19 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.runs.run import RunDirectory, State
 
 
+def files_below(folders: Sequence[Path], name: str) -> list[Path]:
+    """The files of a name below folders, sorted in each; without those of Hydra.
+
+    Raises:
+        FileNotFoundError: a folder is missing.
+    """
+    for folder in folders:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
+    paths = [path for folder in folders for path in sorted(folder.rglob(name))]
+    return [path for path in paths if path.parent.name != ".hydra"]
+
+
 def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
     """A line for each training and each evaluation: ``run``, ``state``, ``best`` and ``overrides``.
 
@@ -21,22 +34,19 @@ def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
         InputError: there is no run below the folders.
     """
     runs = []
-    for folder in folders:
-        if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
-        for path in sorted({file.parent for file in folder.rglob("config.yaml")}):
-            run = RunDirectory(path)
-            if path.name != ".hydra" and (run.state != State.MISSING or _trains(path)):
-                runs.append((str(path), str(run.state), _best(run), _overrides(path)))
+    for path in files_below(folders, "config.yaml"):
+        run = RunDirectory(path.parent)
+        if run.state != State.MISSING or _trains(path):
+            runs.append((str(path.parent), str(run.state), _best(run), _overrides(path.parent)))
     if not runs:
         raise InputError(f"{', '.join(map(str, folders))}: expected runs below it; found none")
     return pd.DataFrame(runs, columns=["run", "state", "best", "overrides"])
 
 
 def _trains(path: Path) -> bool:
-    """Whether the configuration is that of a training, which may not have begun."""
+    """Whether a ``config.yaml`` is that of a training, which may not have begun."""
     try:
-        return "trainer" in yaml.safe_load((path / "config.yaml").read_text())
+        return "trainer" in yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError, TypeError):
         return False
 

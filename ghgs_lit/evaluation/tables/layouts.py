@@ -159,7 +159,7 @@ class Table:
         """The cells with a number that was measured, not reported."""
         known = self.cells[self.cells["mean"].notna()]
         reported = [self.lines[i].is_reported for i in known.index.get_level_values("line")]
-        return known[[not is_reported for is_reported in reported]]
+        return known.loc[[not is_reported for is_reported in reported]]
 
     @property
     def blocks(self) -> list[list[int]]:

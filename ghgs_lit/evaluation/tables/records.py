@@ -4,7 +4,7 @@ A run is identified by its configuration, never by the name of its directory.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -18,6 +18,7 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.config.ablation import ABLATIONS, switches_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.runs.listing import files_below
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
 SETTING = ["data", "split", "targets", "protocol"]
@@ -227,20 +228,6 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
 
 
-def below(folders: Iterable[Path], name: str) -> list[Path]:
-    """The files of a name below folders, sorted in each; without those of Hydra.
-
-    Raises:
-        FileNotFoundError: a folder is missing.
-    """
-    paths = []
-    for folder in folders:
-        if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
-        paths += [path for path in sorted(folder.rglob(name)) if path.parent.name != ".hydra"]
-    return paths
-
-
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     """All runs below some folders, finished or not.
 
@@ -252,8 +239,8 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         FileNotFoundError: a folder is missing.
         InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``.
     """
-    runs = {str(path): _read_run(path, by) for path in below(folders, "metrics.json")}
-    planned = [p for path in below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
+    runs = {str(path): _read_run(path, by) for path in files_below(folders, "metrics.json")}
+    planned = [p for path in files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
     if not runs:
         names = ", ".join(map(str, folders))
         begun = f"{len(planned)} runs without one" if planned else "none"

@@ -269,3 +269,15 @@ def test_all_runs_that_claim_one_cell_are_named(tmp_path):
     assert "and 2 more such pairs" in said
     assert "by=[optimizer.lr] gives each a row" in said
     assert "\n" not in said
+
+
+def test_a_table_of_numbers_of_views_that_nobody_measured_says_so(tmp_path):
+    """Every cell is missing, in every format."""
+    write_run(tmp_path / "0", "full", 20.0)
+    for layout in ("ablation", "table2"):
+        (table,) = tables_of(tmp_path, layout, views=(7,), reported=False)
+        rows, _ = body(to_markdown(table))
+        assert {cell for row in rows.values() for cell in row} == {"missing"}
+        assert "no subjects" in table.caption
+        assert "missing" in to_terminal(table, 80)
+        assert to_csv([table]).count("\n") == 1 + 3 * len(rows)
