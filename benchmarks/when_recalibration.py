@@ -2,10 +2,10 @@
 
     python benchmarks/when_recalibration.py runs/ablation
 
-Reads the runs of a sweep over ``ablation`` measured on ``evaluation.split=bench``
-(docs/evidence/ablation.md), sorts the frozen people into thirds by what the paper's argument speaks of, and
-compares the whole method with each of the other rows: PSNR inside the box, averaged over seeds, Wilcoxon's
-test over the people of a third, without correction. Sorted by
+Reads the runs of a sweep over ``ablation`` measured on ``evaluation.split=bench`` (docs/evidence/ablation.md), sorts
+the frozen people into thirds by what the paper's argument speaks of, and compares the whole method with each
+of the other rows: PSNR inside the box, the test of tables over seeds and the people of a third together,
+without correction. Sorted by
 
 - limbs: the share of the skin that lies within 5 cm of another part of the body that is not its neighbour,
 - texture: the contrast of the photographs within the subject, finer than 4 pixels,
@@ -14,42 +14,39 @@ test over the people of a third, without correction. Sorted by
 
 import argparse
 import json
-from collections import defaultdict
 from pathlib import Path
-from statistics import mean
 
 import numpy as np
+import pandas as pd
 import torch.nn.functional as F
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
-from scipy.stats import wilcoxon
 
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.groups import read_option
 from ghgs_lit.errors import require
+from ghgs_lit.evaluation.tables.significance import compare
 from ghgs_lit.synthesis.bench import definition, names
 from ghgs_lit.synthesis.jobs import SyntheticSource
 from ghgs_lit.synthesis.people.body import load_body
 from ghgs_lit.training.pretext.parts import PARTS, vertex_parts
 
 NEAR = 0.05  # metres
-#: Results: [row of the ablation][views, targets][person] has values of seeds.
-Values = dict[str, dict[tuple[int, str], dict[str, list[float]]]]
+ROW = ["row", "views", "targets", "seed", "subject"]
 
 
-def read(folder: Path, metric: str) -> Values:
-    """A metric of the runs of a sweep."""
-    values: Values = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+def read(folder: Path, metric: str) -> pd.DataFrame:
+    """A metric of the runs of a sweep: by row of the ablation, views, targets and seed, and by person."""
+    runs = []
     for file in sorted(folder.glob("*/metrics.json")):
         content = json.loads(file.read_text())
-        recalibration = content["provenance"]["config"]["recalibration"]
-        row = f"{recalibration['neighborhood']}, {recalibration['similarity']}"
-        for one in content["rows"]:
-            if one["method"] == "model" and one.get(metric) is not None:
-                values[row][one["views"], one["targets"]][one["subject"]].append(one[metric])
-    return values
+        config = content["provenance"]["config"]
+        row = f"{config['recalibration']['neighborhood']}, {config['recalibration']['similarity']}"
+        runs.append(pd.DataFrame(content["rows"]).assign(row=row, seed=config["seed"]))
+    rows = pd.concat(runs)
+    return rows[rows["method"] == "model"].groupby(ROW)[metric].mean().unstack("subject")
 
 
 def neighbors() -> np.ndarray:
@@ -100,22 +97,22 @@ def main() -> None:
     parser.add_argument("runs", type=Path, help="folder of the sweep")
     folder, whole = parser.parse_args().runs, "xyz, product"
     values, depths = (read(folder, name) for name in ("psnr_box", "depth_error_mm"))
-    require(whole in values, "runs", f"{folder}/<run>/metrics.json of the whole method", sorted(values))
+    found = list(values.index.unique("row"))
+    require(whole in found, "runs", f"{folder}/<run>/metrics.json of the whole method", found)
     touch, texture = neighbors(), contrasts()
-    errors = {person: mean(own) for person, own in depths[whole][4, "midway"].items()}
+    errors = depths.loc[whole, 4, "midway"].mean().to_dict()
     orders = {"limbs": {p: close_limbs(p, touch) for p in names()}, "texture": texture, "depth, mm": errors}
     groups = [("all", "", names())]
     groups += [(name, span, people) for name, order in orders.items() for span, people in thirds(order)]
-    settings = sorted(values[whole])
-    for row in sorted(set(values) - {whole}):
+    settings = sorted(values.loc[whole].index.droplevel("seed").unique())
+    for row in sorted(set(found) - {whole}):
         columns = ["by", "of", *(f"{views} views, {targets}" for views, targets in settings)]
         table = Table(*columns, title=f"{whole} minus {row}, dB in the box (p)")
         for name, span, people in groups:
             cells = []
             for setting in settings:
-                pairs = [[mean(values[r][setting][p]) for r in (whole, row)] for p in people]
-                gains = np.subtract(*np.transpose(pairs))
-                cells.append(f"{gains.mean():+.2f} ({wilcoxon(gains).pvalue:.3f})")
+                test = compare(*(values.loc[(r, *setting)][people] for r in (whole, row)))
+                cells.append(f"{test.difference:+.2f} ({'-' if test.p is None else f'{test.p:.3f}'})")
             table.add_row(name, span, *cells)
         Console(width=180).print(table)
 

@@ -165,8 +165,8 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         def build():
             return make_model("model=paper").to(device)
 
-        options = {"sigma": 0.3, "opacity": 0.9}, {"steps": 1, "start": "photo_depth"}
-        methods = {name: baseline(name, REFERENCE, build, *options) for name in BASELINES}
+        per_scene = {"steps": 1, "start": "photo_depth"}
+        methods = {name: baseline(name, REFERENCE, build, per_scene) for name in BASELINES}
         methods["model"] = ModelMethod(build().eval(), REFERENCE)
         methods["refined"] = ModelMethod(build().eval(), REFERENCE, Refinement(1, REFERENCE))
         refined = build().eval()

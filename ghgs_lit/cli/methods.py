@@ -45,8 +45,9 @@ def baselines_of(
 ) -> dict[str, Method]:
     """The baselines called ``names``, or ``all``; other arguments as for :func:`trained_method`."""
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
-    renderer, options = build_renderer(config, device), (config["splats"], config["per_scene"])
-    return {
-        name: baseline(name, renderer, lambda: GHGS.from_config(config).to(device), *options)
-        for name in names
-    }
+    renderer = build_renderer(config, device)
+
+    def untrained() -> GHGS:
+        return GHGS.from_config(config).to(device)
+
+    return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}

@@ -1,27 +1,25 @@
-"""``ghgs table``: the runs below a directory as one of the paper's tables."""
+"""``ghgs table``: the runs below a directory as one of the paper's tables, or as a list."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.text import Text
+from tabulate import tabulate
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.terminal import print_uncut
+from ghgs_lit.runs.listing import list_runs
 
 
-def _listed(key: str, value: Any, kind: type) -> tuple | None:
+def _listed(value: Any) -> tuple | None:
     """A value or a list of values as a tuple; None for null and an empty list."""
-    values = [value] if isinstance(value, kind) else value or ()
-    valid = isinstance(values, Sequence) and all(isinstance(v, kind) for v in values)
-    require(valid, key, f"one or more of type {kind.__name__}, or null", value)
-    return tuple(values) or None
+    return (value,) if isinstance(value, str | int) else tuple(value or ()) or None
 
 
 def _options(config: dict[str, Any]) -> t.TableOptions:
@@ -33,9 +31,9 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
         layout=t.layout_named(config["layout"]),
-        views=_listed("evaluation.views", evaluation["views"], int),
-        targets=_listed("evaluation.targets", evaluation["targets"], str),
-        metrics=_listed("columns", config["columns"], str),
+        views=_listed(evaluation["views"]),
+        targets=_listed(evaluation["targets"]),
+        metrics=_listed(config["columns"]),
         reported=config["reported"],
         test=from_config(t.PairedTest, "test", config["test"]),
         unit=unit,
@@ -44,15 +42,19 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the tables, and the path of the Markdown file last."""
+    """The verb; prints the tables, and the path of the Markdown file last; with ``list`` the runs."""
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
-    folders = [Path(p).expanduser() for p in _listed("runs", config["runs"], str) or ()]
-    others = [
-        r for p in _listed("others", config["others"], str) or () for r in t.read_others(Path(p).expanduser())
-    ]
-    sweep = t.read_sweep(folders, _listed("by", config["by"], str) or ())
+    folders = [Path(p).expanduser() for p in _listed(config["runs"]) or ()]
+    if config["list"]:
+        runs = list_runs(folders)
+        write_text_atomically(directory / "runs.csv", runs.to_csv(index=False))
+        print(tabulate(runs, "keys", showindex=False, disable_numparse=True))
+        announce(directory / "runs.csv")
+        return
+    others = [t.read_others(Path(p).expanduser()) for p in _listed(config["others"]) or ()]
+    sweep = t.read_sweep(folders, _listed(config["by"]) or ())
     tables = t.build_tables(sweep, others, options)
     labels = [f"table:{options.layout.name}" + (f"-{i}" if i else "") for i in range(len(tables))]
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))
@@ -67,5 +69,5 @@ def run(cfg: DictConfig) -> None:
 def _print(table: t.Table) -> None:
     console = Console()
     console.print(table.caption.replace("`", ""), highlight=False)
-    print_uncut(t.to_terminal(table))
+    console.print(Text.from_ansi(t.to_terminal(table, console.width)), soft_wrap=True)
     console.print("\n".join(table.notes).replace("**", "").replace("`", ""), markup=False, highlight=False)

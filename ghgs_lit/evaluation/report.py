@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from lightning.pytorch import LightningDataModule
-from rich.table import Table
+from tabulate import tabulate
 
 from ghgs_lit.config import build
 from ghgs_lit.config.ablation import ablation_of
@@ -14,7 +14,6 @@ from ghgs_lit.evaluation.measure import Method, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_results
-from ghgs_lit.runs.terminal import print_uncut
 
 #: Metrics that are printed, with their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
@@ -90,8 +89,11 @@ def measure_and_write(
 def print_summary(rows: list[Row]) -> None:
     """Print means over subjects as a table; the files have all numbers."""
     names = [name for name in PRINTED if name in metric_names(rows)]
-    table = Table("method", "views", "targets", *names)
+    about = ["method", "views", "targets"]
+    lines = []
     for mean in summarize(rows):
-        numbers = ("-" if mean[n] is None else f"{mean[n]:.{PRINTED[n]}f}" for n in names)
-        table.add_row(mean["method"], str(mean["views"]), mean["targets"], *numbers)
-    print_uncut(table)
+        numbers = ("-" if mean[name] is None else f"{mean[name]:.{PRINTED[name]}f}" for name in names)
+        lines.append([*(mean[key] for key in about), *numbers])
+    heads = [*about, *(name.replace("_", "\n") for name in names)]
+    align = ["left", "right", "left", *["right"] * len(names)]
+    print(tabulate(lines, heads, colalign=align, disable_numparse=True), flush=True)

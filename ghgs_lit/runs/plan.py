@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
+from tabulate import tabulate
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import is_multirun
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
-from ghgs_lit.runs.terminal import print_uncut
 
 OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
 
@@ -73,10 +72,10 @@ def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
 def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
     """Print one line for each run; overrides that all runs share are left out."""
     shared = set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
-    table = Table("run", "overrides", *columns)
-    for item, *cells in zip(planned, *columns.values(), strict=True):
-        table.add_row(item.name, " ".join(o for o in item.shown if o not in shared), *cells)
-    print_uncut(table)
+    names = [item.name for item in planned]
+    overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
+    table = {"run": names, **columns, "overrides": overrides}
+    print(tabulate(table, "keys", disable_numparse=True))
 
 
 def _counts(states: Sequence[State]) -> str:

@@ -4,32 +4,26 @@ import csv
 import io
 import json
 import math
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from ghgs_lit.config.keys import lookup
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import config_hash
 
 FORMAT_VERSION = 3
-"""The version that is written; earlier ones are read too."""
+"""The version that is written, and the only one that is read."""
 METHOD = "model"
 """The method of the rows of a trained model; others are baselines."""
 KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
 """What a row describes; all other entries of a row are metrics."""
 
-#: Types of JSON, in words for messages.
-_KINDS = {
-    str: "a text",
-    int: "a whole number",
-    float: "a number or null",
-    list: "a list",
-    dict: "a mapping",
-}
-
 Row = dict[str, Any]
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def mean(values: Iterable[float | None]) -> float | None:
@@ -108,58 +102,61 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
     return path
 
 
-def entry(place: str, content: Any, key: str, kind: type) -> Any:
-    """The value at a dotted key of results that were read.
+class _Mean(BaseModel):
+    """What others rely on in an entry of ``summary``: all that is not named is a number."""
 
-    Args:
-        place: the file, or the place in it, for messages.
-        content: the results, or a part of them.
-        key: the dotted key.
-        kind: the type of the value; ``float`` is any number or None.
-
-    Raises:
-        InputError: there is no such key, or its value is of another type; names place and key.
-    """
-    value = lookup(content, key)
-    kinds = int | float | None if kind is float else kind
-    fits = isinstance(value, kinds) and not isinstance(value, bool)
-    short = isinstance(value, str | int | float)
-    require(fits, f"{place}: {key}", _KINDS[kind], value if short else type(value).__name__)
-    return value
+    model_config = ConfigDict(extra="allow", strict=True)
+    __pydantic_extra__: dict[str, float | None]
+    method: str
+    views: int
+    targets: str
 
 
-def _check_rows(path: Path, content: Mapping[str, Any]) -> None:
-    """Refuse rows and means that were edited until they are none."""
-    for part, texts in (("rows", ("method", "subject", "targets")), ("summary", ("method", "targets"))):
-        for index, row in enumerate(entry(str(path), content, part, list)):
-            place = f"{path}: {part}[{index}]"
-            for key in texts:
-                entry(place, row, key, str)
-            entry(place, row, "views", int)
-            for key in row:
-                if key not in KEYS:
-                    entry(place, row, key, float)
+class _Row(_Mean):
+    subject: str
+    target: str | None = None
+    inputs: list[str] = []
+    skip: str | None = None
+
+
+class _Results(BaseModel):
+    model_config = ConfigDict(strict=True)
+    provenance: dict[str, Any]
+    summary: list[_Mean]
+    rows: list[_Row]
+
+
+def validated(model: type[Model], content: Any, where: str) -> Model:
+    """``content`` as a pydantic model; an InputError names ``where`` and the first key that is wrong."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"])
+    said = {"missing": "expected a value; found none", "extra_forbidden": "expected no such key"}
+    expected = first["msg"].replace("Input should", "expected to")
+    otherwise = f"{expected}; found {reprlib.repr(first['input'])}"
+    raise InputError(f"{where}{key}: {said.get(first['type'], otherwise)}")
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``; its configurations are returned in today's keys.
+    """Read a ``metrics.json``.
 
     Raises:
-        InputError: the file is not a whole ``metrics.json``, or its configuration is not the one that was
-            measured; the message names it.
+        InputError: the file is not a whole ``metrics.json`` of today's format, or its configuration is not
+            the one that was measured; the message names it.
     """
     try:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected a metrics.json; found {error}") from error
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
-    if found not in range(1, FORMAT_VERSION + 1):
-        raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {found}")
-    _check_rows(path, content)
-    source = entry(str(path), content, "provenance", dict)
-    # The keys without influence changed since earlier versions, and with them the hashes.
-    if found == FORMAT_VERSION and isinstance(source.get("config"), dict):
+    if found != FORMAT_VERSION:
+        again = "`ghgs evaluate` measures again"
+        raise InputError(f"{path}: expected format_version {FORMAT_VERSION}; found {found} ({again})")
+    source = validated(_Results, content, str(path)).provenance
+    if isinstance(source.get("config"), dict):
         fitting, hashed = config_hash(source["config"]), source.get("config_hash")
         expected = f"a configuration that fits its config_hash {hashed}"
         require(fitting == hashed, f"{path}: provenance.config", expected, f"one of {fitting}")
-    return {**content, "provenance": dict(source)}
+    return content

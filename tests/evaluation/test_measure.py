@@ -327,10 +327,16 @@ def test_a_sweep_becomes_a_table(boxes, tmp_path):
     assert (tmp_path / "table" / "table.csv").read_text().count(",full,") == 9
     # The directory under the name that is a group of `train`, too; the paper's layout; a bad one.
     again = ["table", f"sweep=[{tmp_path / 'sweep'}]", f"hydra.run.dir={tmp_path / 'second'}"]
-    assert ghgs(*again, "layout=table2", "columns=psnr_box", "test.kind=t") == 1
-    assert ghgs(*again, "layout=table2", "columns=psnr", "test.kind=t", r'test.unit="(.+)"') == 0
+    assert ghgs(*again, "layout=table2", "columns=psnr_box") == 1
+    assert ghgs(*again, "layout=table2", "columns=psnr", "test.against=best", r'test.unit="(.+)"') == 0
     assert "RoGSplat" in (tmp_path / "second" / "table.md").read_text()
-    for wrong in ("layout=table9", "evaluation.views=four", "test.kind=anova", "test.unit=x", "test.unt=1"):
+    for wrong in (
+        "layout=table9",
+        "evaluation.views=four",
+        "test.against=worst",
+        "test.unit=x",
+        "test.unt=1",
+    ):
         assert ghgs(*again, wrong) == 1
     # Jobs that share a process cannot start others.
     assert ghgs("train", "-m", *data_of(boxes), *quick, "seed=1,2", "trainer=ddp_cpu") == 1

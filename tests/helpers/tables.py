@@ -17,8 +17,8 @@ SWITCHES = {
 SHIFTS = {"a": -1.0, "b": 1.0}
 
 
-def config_of(ablation, seed=1, data="synthetic", weights=None, **changes) -> dict:
-    unprojection, semantic = SWITCHES[ablation]
+def config_of(row, seed=1, data="synthetic", weights=None, **changes) -> dict:
+    unprojection, semantic = SWITCHES[row]
     return {
         "recalibration": {
             "neighborhood": "xyz" if unprojection else "image_plane",
@@ -34,12 +34,12 @@ def config_of(ablation, seed=1, data="synthetic", weights=None, **changes) -> di
 
 
 def write_run(
-    folder: Path, ablation, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None,
+    folder: Path, row, psnr, seed=1, views=(3, 4, 5), targets="release", lpips=None, weights=None,
     shifts=SHIFTS, data="synthetic", protocol="correct", method="model", git=None, verb="train",
-    training=None, **changes,
+    training=None, measured=None, **changes,
 ):  # fmt: skip
     """A run whose mean PSNR at n views is ``psnr + n``; each subject differs from it by its shift."""
-    config = config_of(ablation, seed, data, weights, **changes)
+    config = config_of(row, seed, data, weights, **changes)
     rows = [
         {
             "method": method, "subject": subject, "views": n, "targets": targets, "target": "000/3",
@@ -59,7 +59,7 @@ def write_run(
     }
     if verb == "evaluate":
         source["checkpoint_config"] = config
-        source["config"] = {**config_of("neither", 99), "data": {"name": data}}
+        source["config"] = {**config_of("neither", 99), "data": {"name": data}, **(measured or {})}
     source["config_hash"] = config_hash(source["config"])
     path = write_results(folder, rows, source)
     (folder / "config.yaml").write_text(yaml.safe_dump(config))

@@ -11,49 +11,38 @@ from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.baselines.images import black, nearest_view
 from ghgs_lit.evaluation.baselines.per_scene import PerScene
 from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
-from ghgs_lit.evaluation.baselines.splats import (
-    body_depth,
-    splats_at,
-    splatted,
-    true_depth,
-    true_discs,
-)
+from ghgs_lit.evaluation.baselines.splats import body_depth, splats_at, splatted, true_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, Renderer
 
 __all__ = ["BASELINES", "baseline", "black", "nearest_view", "splats_at", "splatted"]
 
-#: By name, what gives the depth of a baseline's splats.
+#: By name, what gives the depth of a baseline's discs.
 DEPTHS = {
     "body_depth": body_depth,
     "hull": hull_depth,
     "photo_depth": photo_depth,
     "true_depth": true_depth,
 }
-BASELINES = ("black", "nearest_view", *DEPTHS, "true_discs", "per_scene", "untrained")
+BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 
 
 def baseline(
     name: str,
     renderer: Renderer,
     untrained: Callable[[], torch.nn.Module],
-    splats: Mapping[str, Any],
     per_scene: Mapping[str, Any],
 ) -> Method:
     """The baseline called ``name``, one of ``BASELINES``.
 
     Args:
         name: which one.
-        renderer: draws its splats.
+        renderer: draws its Gaussians.
         untrained: builds a model with random weights, for the baseline ``untrained``.
-        splats: ``sigma`` and ``opacity`` of the splats at a depth, as for :func:`splats_at`.
         per_scene: options of :class:`PerScene`.
     """
     choice("baselines", name, BASELINES)
     if name in DEPTHS:
-        form = partial(splats_at, **splats)
-        return partial(splatted, depth_of=DEPTHS[name], renderer=renderer, form=form)
-    if name == "true_discs":
-        return partial(true_discs, renderer=renderer)
+        return partial(splatted, depth_of=DEPTHS[name], renderer=renderer)
     if name == "per_scene":
         return PerScene(renderer, **per_scene)
     if name == "untrained":

@@ -16,7 +16,7 @@ from ghgs_lit.types import Batch, DepthMaps, Gaussians
 #: Of :func:`discs_at`, as ``model=recurrent`` starts: standard deviations along the surface and across it and
 #: distance behind it in footprints of a pixel, opacity, and the rendering's low-pass filter.
 _ALONG, _ACROSS, _INWARD, _OPACITY, _LOW_PASS = 0.5, 0.1, 0.4, 0.8, 0.1
-#: Share of the subject above which :func:`true_discs` give a pixel a disc.
+#: Share of the subject above which a pixel gets a disc.
 _MATTE = 0.125
 
 
@@ -89,31 +89,21 @@ def body_depth(batch: Batch) -> Tensor:
 def true_depth(batch: Batch) -> Tensor:
     """Depth maps [B, V, H, W] of the data, metres."""
     if batch.depths is None:
-        raise InputError("baselines: true_depth and true_discs expect depth maps in the data; found none")
+        raise InputError("baselines: true_depth expects depth maps in the data; found none")
     return batch.depths
 
 
-def splatted(
-    batch: Batch,
-    depth_of: Callable[[Batch], Tensor],
-    renderer: Renderer,
-    form: Callable[[Batch, Tensor, Tensor], Gaussians] = splats_at,
-) -> Estimate:
-    """The subject's pixels as splats at a depth that is not learned.
+def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
+    """Discs at a depth that is not learned, of pixels at the rim, too, where the data have mattes.
 
     Args:
         batch: inputs and targets.
         depth_of: gives depths of the inputs [B, V, H, W], metres.
-        renderer: draws the splats.
-        form: gives splats of a batch at depths, for the pixels that are valid.
+        renderer: draws the discs.
     """
+    batch = with_matte(batch, _MATTE)
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)
-    gaussians = form(batch, depth, valid)
+    gaussians = discs_at(batch, depth, valid)
     image = renderer(gaussians, batch.targets.cameras).image
     return Estimate(image, depth, valid, gaussians.splits)
-
-
-def true_discs(batch: Batch, renderer: Renderer) -> Estimate:
-    """Discs at the true depth, of pixels at the rim, too, where the data have mattes."""
-    return splatted(with_matte(batch, _MATTE), true_depth, renderer, discs_at)

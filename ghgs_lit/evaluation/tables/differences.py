@@ -1,6 +1,6 @@
 """The settings in which runs differ that stand side by side in a table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ghgs_lit.config.keys import EXPECTED_TO_DIFFER, flatten, is_below
@@ -23,3 +23,8 @@ def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:
     shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:limit]]
     more = len(keys) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def telling_apart(configs: Sequence[Mapping[str, Any]], keys: Mapping[str, Sequence[str]]) -> Iterable[str]:
+    """One of the ``keys`` in which ``configs`` differ if it tells all of them apart, else all."""
+    return next(([key] for key, values in keys.items() if len(values) == len(configs)), list(keys))

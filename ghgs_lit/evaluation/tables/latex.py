@@ -5,8 +5,11 @@ A table needs ``\usepackage{booktabs,multirow,adjustbox,pifont}``.
 
 import re
 
-from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, title
-from ghgs_lit.evaluation.tables.text import CellText, cell_text
+import pandas as pd
+
+from ghgs_lit.evaluation.tables.layouts import Table, arrow, title
+from ghgs_lit.evaluation.tables.notes import MARK
+from ghgs_lit.evaluation.tables.writers import texts
 
 PREAMBLE = r"""% \usepackage{booktabs,multirow,adjustbox,pifont}
 \providecommand{\cmark}{\ding{51}}
@@ -40,18 +43,9 @@ def prose(text: str) -> str:
     )
 
 
-def _number(text: CellText) -> str:
-    mean = rf"\textbf{{{text.mean}}}" if text.best else escape(text.mean)
-    spread = rf" $\pm$ {text.spread}" if text.spread else ""
-    return mean + spread + escape(text.tail).replace("*", "$^{*}$")
-
-
-def _row(table: Table, line: Line) -> str:
-    stub = [escape(part) for part in line.stub]
-    if line.is_ours and table.layout.rows == "methods":
-        stub = [rf"\textbf{{{part}}}" for part in stub]
-    numbers = [_number(cell_text(line.cells.get(column), line, column[1])) for column in table.columns]
-    return " & ".join((*stub, *numbers)) + r" \\"
+def _number(number: str, tail: str, best: bool) -> str:
+    number = rf"\textbf{{{number}}}" if best else escape(number)
+    return number + escape(tail).replace(MARK, "$^{*}$")
 
 
 def _column_spec(table: Table) -> str:
@@ -63,41 +57,52 @@ def _column_spec(table: Table) -> str:
     return spec.replace(" |", "", 1) if table.layout.columns == "data" else spec
 
 
-def _header(table: Table) -> list[str]:
-    """The groups with rules below them, then the metrics."""
-    first, width = len(table.stub), len(table.metrics)
-    metrics = [f"{escape(title(m))}{_ARROWS[arrow(m)]}" for _, m in table.columns]
-    if table.layout.heading == "none":
-        return [" & ".join((*map(escape, table.stub), *metrics)) + r" \\"]
-    stub = [rf"\multirow{{2}}{{*}}{{{escape(name)}}}" for name in table.stub]
-    groups = [rf"\multicolumn{{{width}}}{{c}}{{{escape(group.title)}}}" for group in table.groups]
-    starts = [first + 1 + i * width for i in range(len(groups))]
-    rules = "".join(rf"\cmidrule(lr){{{start}-{start + width - 1}}}" for start in starts)
-    return [
-        " & ".join((*stub, *groups)) + r" \\",
-        rules,
-        " & ".join([""] * first + metrics).strip() + r" \\",
+def _frame(table: Table) -> pd.DataFrame:
+    """The texts of the table below the headings of groups (where the layout has any) and of metrics."""
+    numbers = texts(table, _number)
+    named = table.layout.heading != "none"
+    stub = [
+        (rf"\multirow{{2}}{{*}}{{{escape(name)}}}", "") if named else ("", escape(name))
+        for name in table.stub
     ]
+    metrics = [
+        (escape(table.groups[group].title), f"{escape(title(metric))}{_ARROWS[arrow(metric)]}")
+        for group, metric in numbers
+    ]
+    rows = []
+    for i in (i for block in table.blocks for i in block):
+        bold = table.lines[i].is_ours and table.layout.rows == "methods"
+        names = map(escape, table.lines[i].stub)
+        rows.append([*(rf"\textbf{{{name}}}" if bold else name for name in names), *numbers.loc[i]])
+    columns = pd.MultiIndex.from_tuples([*stub, *metrics])
+    return pd.DataFrame(rows, columns=columns if named else columns.droplevel(0))
 
 
 def _tabular(table: Table) -> str:
-    """The ``tabular`` environment alone."""
-    lines = [rf"\begin{{tabular}}{{{_column_spec(table)}}}", r"\toprule", *_header(table)]
-    width = len(table.stub) + len(table.columns)
+    """The ``tabular`` environment alone: that of pandas, with rules below groups and above blocks."""
+    frame = _frame(table)
+    text = frame.style.hide(axis="index").to_latex(
+        column_format=_column_spec(table), hrules=True, multicol_align="c"
+    )
+    lines = text.strip().split("\n")
+    first, end = lines.index(r"\midrule") + 1, lines.index(r"\bottomrule")
+    head, rows, body = lines[: first - 1], lines[first:end], []
+    if table.layout.heading != "none":
+        stub, width = len(table.stub), len(table.metrics)
+        starts = [stub + 1 + i * width for i in range(len(table.groups))]
+        head.insert(-1, "".join(rf"\cmidrule(lr){{{start}-{start + width - 1}}}" for start in starts))
     for block in table.blocks:
-        lines.append(r"\midrule")
+        body.append(r"\midrule")
         if len(table.blocks) > 1:
             name = escape(table.block_title(block))
-            lines += [rf"\multicolumn{{{width}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
-        lines += [_row(table, line) for line in block]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
+            body += [rf"\multicolumn{{{frame.shape[1]}}}{{l}}{{\emph{{{name}}}}} \\", r"\midrule"]
+        body += [rows.pop(0) for _ in block]
+    return "\n".join([*head, *body, *lines[end:]])
 
 
 def to_latex(table: Table, label: str) -> str:
     """A float with the table, its caption, its notes in small print and its label."""
-    name = "table*" if len(table.columns) >= _WIDE else "table"
-    # Deviations, marks and long names make rows wide; the paper scales its tables to the line, too.
-    body = "\\begin{adjustbox}{max width=\\linewidth}\n" + _tabular(table) + "\n\\end{adjustbox}"
+    name = "table*" if len(table.groups) * len(table.metrics) >= _WIDE else "table"
     notes = [r"\par\smallskip", r"\parbox{\linewidth}{\footnotesize"]
     notes += [rf"{prose(note)}\par" for note in table.notes] + ["}"]
     return "\n".join(
@@ -105,7 +110,10 @@ def to_latex(table: Table, label: str) -> str:
             rf"\begin{{{name}}}[t]",
             r"\centering",
             r"\small",
-            body,
+            # Deviations, marks and long names make rows wide; the paper scales its tables to the line, too.
+            r"\begin{adjustbox}{max width=\linewidth}",
+            _tabular(table),
+            r"\end{adjustbox}",
             *(notes if table.notes else []),
             rf"\caption{{{prose(table.caption)}}}",
             rf"\label{{{label}}}",

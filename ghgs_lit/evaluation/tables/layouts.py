@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field
 
+import pandas as pd
+
 from ghgs_lit.errors import choice
-from ghgs_lit.evaluation.tables.records import Planned, Record, Variant
-from ghgs_lit.evaluation.tables.significance import Comparison
+from ghgs_lit.evaluation.tables.records import Planned, Variant
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
 DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
@@ -87,51 +88,12 @@ class Group:
     data: str | None = None
 
 
-Column = tuple[Group, str]
-
-
-@dataclass
-class Cell:
-    """One number of a table.
-
-    Attributes:
-        seeds: mean over subjects for each seed.
-        missing_seeds: seeds that other runs of the sweep have.
-        by_seed: values of each subject, one for each seed.
-        count: number of subjects, where it is known.
-        runs: hashes or paths of the runs.
-        best: whether it is the best of its column, as printed.
-        test: the comparison with the reference row.
-        marked: whether it differs from the reference row beyond chance.
-    """
-
-    seeds: dict[int, float] = field(default_factory=dict)
-    missing_seeds: tuple[int, ...] = ()
-    by_seed: dict[str, list[float]] = field(default_factory=dict)
-    count: int | None = None
-    runs: list[str] = field(default_factory=list)
-    best: bool = False
-    test: Comparison | None = None
-    marked: bool = False
-
-    @property
-    def mean(self) -> float:
-        """Mean over seeds."""
-        return sum(self.seeds.values()) / len(self.seeds)
-
-    @property
-    def subjects(self) -> dict[str, float]:
-        """Mean of each subject over the seeds."""
-        return {name: sum(values) / len(values) for name, values in self.by_seed.items()}
-
-
-@dataclass
+@dataclass(frozen=True)
 class Line:
-    """A row of a table: a variant, its texts in the first columns, its cells, and the text of others."""
+    """A row of a table: a variant, its texts in the first columns, and the text of cells without a number."""
 
     variant: Variant
     stub: tuple[str, ...]
-    cells: dict[Column, Cell] = field(default_factory=dict)
     absent: str = "missing"
 
     @property
@@ -150,36 +112,42 @@ class Line:
         return self.variant.kind in ("model", "other")
 
 
+CELL = ["line", "group", "metric"]
+"""What tells the cells of a table apart: numbers of the line and of the group of columns, and the metric."""
+
+
 @dataclass
 class Table:
     """One table: everything that a writer of a format needs.
 
     Args:
         layout: its layout.
-        records: what was measured.
+        rows: what was measured, as in :class:`Sweep`.
         planned: the training runs of the sweep, finished or not, that belong to it.
         stub: headings of the first columns.
         groups, metrics: the columns.
         lines: the rows.
+        cells: by ``CELL``, every line and column in order: ``mean`` over subjects and seeds (nan: no number),
+            ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as
+            tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best``: whether it is the best of its
+            column as printed, ``test`` (a :class:`Comparison` or None), and ``marked``.
         caption, notes: the texts around it.
         reported_on: data of the reported figures, where it has any.
+        comparisons: number of tests that were made.
     """
 
     layout: Layout
-    records: list[Record]
+    rows: pd.DataFrame
     planned: list[Planned]
     stub: tuple[str, ...]
     groups: list[Group]
     metrics: list[str]
     lines: list[Line]
+    cells: pd.DataFrame = field(default_factory=pd.DataFrame)
     caption: str = ""
     notes: list[str] = field(default_factory=list)
     reported_on: str | None = None
-
-    @property
-    def columns(self) -> list[Column]:
-        """Every metric in every group."""
-        return [(group, metric) for group in self.groups for metric in self.metrics]
+    comparisons: int = 0
 
     @property
     def ours(self) -> list[Line]:
@@ -187,17 +155,22 @@ class Table:
         return [line for line in self.lines if line.is_ours]
 
     @property
-    def measured(self) -> list[Cell]:
-        """The cells that were measured, not reported."""
-        return [cell for line in self.lines if not line.is_reported for cell in line.cells.values()]
+    def measured(self) -> pd.DataFrame:
+        """The cells with a number that was measured, not reported."""
+        known = self.cells[self.cells["mean"].notna()]
+        reported = [self.lines[i].is_reported for i in known.index.get_level_values("line")]
+        return known.loc[[not is_reported for is_reported in reported]]
 
     @property
-    def blocks(self) -> list[list[Line]]:
-        """Reported rows, then measured rows; a block without rows is left out."""
-        parts = [[line for line in self.lines if line.is_reported == reported] for reported in (True, False)]
+    def blocks(self) -> list[list[int]]:
+        """Numbers of the reported rows, then of the measured rows; a block without rows is left out."""
+        parts = [
+            [i for i, line in enumerate(self.lines) if line.is_reported == reported]
+            for reported in (True, False)
+        ]
         return [part for part in parts if part]
 
-    def block_title(self, block: list[Line]) -> str:
+    def block_title(self, block: list[int]) -> str:
         """What stands above a block where a table has reported rows."""
         reported = f"as reported on {self.reported_on}, not measured here"
-        return reported if block[0].is_reported else "measured here"
+        return reported if self.lines[block[0]].is_reported else "measured here"

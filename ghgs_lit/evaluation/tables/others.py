@@ -12,76 +12,52 @@ A row with ``subject`` has the values of one subject and can be tested; a row wi
 """
 
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.records import Record, Setting, Variant
-from ghgs_lit.runs.results import mean
+from ghgs_lit.evaluation.tables.records import SETTING, Variant
+from ghgs_lit.runs.results import validated
 
-FORMAT, FORMAT_VERSION = "ghgs_lit.others", 1
-_TOP = {"format": str, "format_version": int, "method": str, "source": str, "rows": list}
-_NEEDED = {"data": str, "split": str, "targets": str, "protocol": str, "views": int, "metrics": dict}
-_OPTIONAL = {"subject": str, "seed": int, "subjects": int}
-_KINDS = {str: "a text", int: "a whole number", list: "a list", dict: "a mapping"}
+_Text = Annotated[str, Field(min_length=1)]
+_Count = Annotated[int, Field(ge=1)]
 
 
-def _check(where: str, value: Any, kind: type) -> None:
-    fits = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
-    if not fits or (kind is not int and not value):
-        raise InputError(f"{where}: expected {_KINDS[kind]}; found {value!r}")
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
 
 
-def _check_keys(where: str, found: Any, needed: Mapping[str, type], optional: Mapping[str, type]) -> None:
-    if not isinstance(found, dict):
-        raise InputError(f"{where}: expected a mapping; found {found!r}")
-    known = {**needed, **optional}
-    for key in found:
-        if key not in known:
-            raise InputError(f"{where}: expected the keys {', '.join(known)} only; found {key!r}")
-    for key, kind in known.items():
-        if key in found:
-            _check(f"{where}.{key}", found[key], kind)
-        elif key in needed:
-            raise InputError(f"{where}: expected the key {key!r}; found {', '.join(found) or 'none'}")
+class _Row(_Strict):
+    data: _Text
+    split: _Text
+    targets: _Text
+    protocol: _Text
+    views: _Count
+    seed: int = 0
+    subject: _Text | None = None
+    subjects: _Count | None = None
+    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
 
 
-def _validate(content: Any, where: str) -> None:
-    """Refuse content that the head of this module does not describe; the message names the key."""
-    _check_keys(where, content, _TOP, {})
-    for key, expected in (("format", FORMAT), ("format_version", FORMAT_VERSION)):
-        if content[key] != expected:
-            raise InputError(f"{where}.{key}: expected {expected!r}; found {content[key]!r}")
-    seen: dict[tuple, int] = {}
-    for index, row in enumerate(content["rows"]):
-        place = f"{where}.rows[{index}]"
-        _check_keys(place, row, _NEEDED, _OPTIONAL)
-        if row["views"] < 1 or row.get("subjects", 1) < 1:
-            raise InputError(f"{place}: expected views and subjects of at least 1; found {row!r}")
-        if "subject" in row and "subjects" in row:
-            raise InputError(f"{place}: expected subject (one) or subjects (a mean's number); found both")
-        for name, value in row["metrics"].items():
-            is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not is_number or not math.isfinite(value):
-                raise InputError(f"{place}.metrics.{name}: expected a finite number; found {value!r}")
-        key = (*_cell(row), row.get("subject"))
-        if key in seen:
-            raise InputError(f"{place}: expected each subject once a setting; found rows[{seen[key]}] again")
-        seen[key] = index
+class _Others(_Strict):
+    format: Literal["ghgs_lit.others"]
+    format_version: Literal[1]
+    method: _Text
+    source: _Text
+    rows: Annotated[list[_Row], Field(min_length=1)]
 
 
-def _cell(row: Mapping[str, Any]) -> tuple:
-    return (*(row[k] for k in ("data", "split", "targets", "protocol", "views")), row.get("seed", 0))
+def read_others(path: Path) -> pd.DataFrame:
+    """The lines of another method's results file, as :class:`Sweep` has them of ours.
 
-
-def read_others(path: Path) -> list[Record]:
-    """The records of another method's results file.
+    ``said`` is the file's ``source``; lines that are means have no ``subject`` and may have a ``count``.
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: it is not as the head of this module describes.
+        InputError: it is not as the head of this module describes; the message names the key.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
@@ -89,22 +65,17 @@ def read_others(path: Path) -> list[Record]:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: expected JSON; found {error}") from error
-    _validate(content, path.name)
-    groups: dict[tuple, list[dict]] = {}
-    for row in content["rows"]:
-        groups.setdefault(_cell(row), []).append(row)
-    records = []
-    for (data, split, targets, protocol, views, seed), rows in groups.items():
-        subjects = {row["subject"]: row["metrics"] for row in rows if "subject" in row}
-        if subjects and len(subjects) < len(rows):
-            raise InputError(
-                f"{path.name}: expected subjects or one mean for data={data}, views={views}; found both"
-            )
-        names = dict.fromkeys(name for row in rows for name in row["metrics"])
-        means = {name: mean(row["metrics"].get(name) for row in rows) for name in names}
-        count = len(subjects) or rows[0].get("subjects")
-        setting = Setting(data, split, targets, protocol)
-        about = {"source": content["source"]}
-        variant = Variant("other", content["method"])
-        records.append(Record(variant, setting, views, seed, means, str(path), count, subjects, None, about))
-    return records
+    others = validated(_Others, content, path.name)
+    rows = pd.DataFrame([row.model_dump() for row in others.rows])
+    cell = [*SETTING, "views", "seed"]
+    repeated = rows.duplicated([*cell, "subject"])
+    if repeated.any():
+        at = f"{path.name}.rows[{repeated.idxmax()}]"
+        raise InputError(f"{at}: expected each subject once a setting; found one again")
+    means = rows["subject"].isna()
+    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
+        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
+    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
+    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
+    variant = Variant("other", others.method)
+    return rows.assign(variant=variant, source=str(path), run=None, said=others.source).join(metrics)

@@ -1,4 +1,4 @@
-"""What runs measured, as records: the method, the setting, the values of each subject.
+"""What runs measured, as a DataFrame: the method, the setting, the values of each subject.
 
 A run is identified by its configuration, never by the name of its directory.
 """
@@ -10,17 +10,24 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
+from pydantic import BaseModel, ConfigDict, Field
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.ablation import ABLATIONS, switches_of
-from ghgs_lit.config.keys import lookup
-from ghgs_lit.errors import InputError
-from ghgs_lit.runs.results import METHOD, by_protocol, entry, mean, metric_names, read_results
+from ghgs_lit.config.keys import flatten, is_below, lookup
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.runs.listing import files_below
+from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
-#: The time of a prediction in the rows of results: in tables ``seconds`` are those of the training.
-_PREDICTION = {"seconds": "prediction_seconds"}
-
+SETTING = ["data", "split", "targets", "protocol"]
+"""What numbers in one column must have in common."""
+TRAINING = ("steps", "seconds", "peak_gb")
+"""Metrics of the training, which no subject has."""
+#: Keys of `ghgs evaluate` that change its numbers beside the model, the data and the metrics.
+_OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
+_ROW = ["method", "views", "targets", "subject"]
 # Keys that identify an encoder of conf/encoder; models change its other keys.
 _ENCODER_KEYS = ("patch_size", "width", "heads", "depth", "layers", "vit")
 
@@ -59,45 +66,6 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What numbers in one column must have in common."""
-
-    data: str
-    split: str
-    targets: str
-    protocol: str
-
-
-@dataclass(frozen=True)
-class Record:
-    """One run of one method with one number of input views.
-
-    Args:
-        variant: the row that it belongs to.
-        setting: data, split, targets and metrics.
-        views: number of input views.
-        seed: seed of the training.
-        means: means over subjects by metric.
-        source: the file that it was read from.
-        count: number of subjects, where it is known.
-        subjects: values of each subject (averaged over its targets) by metric; empty if only means are known.
-        config: the configuration of our model.
-        about: ``hash`` and ``git`` of our runs; ``source`` of other methods, in words.
-    """
-
-    variant: Variant
-    setting: Setting
-    views: int
-    seed: int
-    means: Mapping[str, float]
-    source: str
-    count: int | None = None
-    subjects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    config: Mapping[str, Any] | None = None
-    about: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Planned:
     """A training run, finished or not: which cells it fills, and whether it is done."""
 
@@ -109,10 +77,19 @@ class Planned:
 
 @dataclass
 class Sweep:
-    """Everything below the directories of a sweep."""
+    """Everything below the directories of a sweep.
 
-    records: list[Record] = field(default_factory=list)
+    Args:
+        rows: a line for each subject of each method of a run, number of views and kind of targets:
+            ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's
+            hash), ``git`` (in words), ``subject``, and the metrics, averaged over the subject's targets.
+        planned: the training runs, finished or not.
+        configs: the configuration of our model by ``source``.
+    """
+
+    rows: pd.DataFrame = field(default_factory=pd.DataFrame)
     planned: list[Planned] = field(default_factory=list)
+    configs: dict[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 @cache
@@ -143,7 +120,8 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     Raises:
         InputError: the configuration has no recalibration, by which the ablation is told.
     """
-    recalibration = entry(source, config, "recalibration", dict)
+    recalibration = config.get("recalibration")
+    require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")
     model = [str(lookup(config, "model.name") or "unnamed")]
     model += [f"compat {compat}"] * (compat not in (None, "none"))
@@ -161,70 +139,80 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
     )
 
 
-def _run_records(path: Path, by: Sequence[str]) -> list[Record]:
-    """The records of a ``metrics.json``."""
-    content = read_results(path)
-    source, place = content["provenance"], f"{path}: provenance"
-    config = entry(place, source, "config", dict)
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+
+class _Data(_Strict):
+    name: str
+    split: str
+
+
+class _Protocol(_Strict):
+    metrics: str
+
+
+class _Git(_Strict):
+    commit: str
+    changed: bool = False
+
+
+class _Training(_Strict):
+    steps: float | None = None
+    seconds: float | None = None
+    peak_bytes: float | None = None
+
+
+class _Provenance(_Strict):
+    """What tables read of the provenance of results."""
+
+    config: dict[str, Any]
+    config_hash: str | None = None
     # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint
     # does, but for what the command line changed.
-    trained = (
-        config if source.get("checkpoint_config") is None else entry(place, source, "checkpoint_config", dict)
-    )
-    if source.get("model_config") is not None:
-        trained = {**trained, **entry(place, source, "model_config", dict)}
-    seed = entry(place, trained if "seed" in trained else source, "seed", int)
-    measured = {name: config.get(name) for name in ("data", "metrics")}
-    about = {"hash": source.get("config_hash"), "git": _git(place, source)}
-    training = _training(place, source)
-    rows = [{_PREDICTION.get(key, key): value for key, value in row.items()} for row in content["rows"]]
-    names = metric_names(rows)
-    records = []
-    for (method, views, targets), subjects in by_protocol(rows).items():
-        values = {
-            subject: {n: v for n in names if (v := mean(row.get(n) for row in rows)) is not None}
-            for subject, rows in subjects.items()
-        }
-        means = {n: m for n in names if (m := mean(own.get(n) for own in values.values())) is not None}
-        is_model = method == METHOD
-        records.append(
-            Record(
-                model_variant(trained, str(path), by) if is_model else Variant("baseline", method),
-                Setting(
-                    entry(place, source, "data.name", str),
-                    entry(place, source, "data.split", str),
-                    targets,
-                    entry(place, source, "protocol.metrics", str),
-                ),
-                views,
-                seed,
-                means | training if is_model else means,
-                str(path),
-                len(subjects),
-                values,
-                {**trained, **measured} if is_model else None,
-                about,
-            )
-        )
-    return records
+    checkpoint_config: dict[str, Any] | None = None
+    changed_model: dict[str, Any] | None = Field(None, alias="model_config")
+    seed: int | None = None
+    data: _Data
+    protocol: _Protocol
+    git: _Git | None = None
+    training: _Training | None = None
 
 
-def _training(place: str, source: Mapping[str, Any]) -> dict[str, float]:
-    """What the training took: ``steps``, ``seconds`` and ``peak_gb``, as far as the results say."""
-    if source.get("training") is None:
-        return {}
-    said = entry(place, source, "training", dict)
-    taken = {key: entry(f"{place}.training", said, key, float) for key in ("steps", "seconds", "peak_bytes")}
-    peak = taken.pop("peak_bytes")
-    taken["peak_gb"] = None if peak is None else peak / 1e9
-    return {key: value for key, value in taken.items() if value is not None}
-
-
-def _git(place: str, source: Mapping[str, Any]) -> dict[str, Any] | None:
-    if source.get("git") is None:
-        return None
-    entry(place, source, "git.commit", str)
-    return source["git"]
+def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """The lines of a ``metrics.json``, and the configuration of its model as it was trained and measured."""
+    content = read_results(path)
+    source = validated(_Provenance, content["provenance"], f"{path}: provenance")
+    trained = (source.checkpoint_config or source.config) | (source.changed_model or {})
+    kept = (*_OF_EVALUATION, "data", "metrics")
+    config = trained | {key: source.config.get(key) for key in kept if key in {*source.config, *trained}}
+    seed = trained.get("seed", source.seed)
+    require(isinstance(seed, int), f"{path}: provenance.seed", "a whole number", seed)
+    rows = pd.DataFrame(content["rows"])
+    rows = rows.drop(columns=[key for key in KEYS if key in rows and key not in _ROW])
+    # In tables ``seconds`` are those of the training.
+    rows = rows.rename(columns={"seconds": "prediction_seconds"})
+    rows = rows.astype({name: float for name in rows if name not in _ROW})
+    rows = rows.groupby(_ROW, sort=False).mean().dropna(axis="columns", how="all").reset_index()
+    is_model = rows["method"] == METHOD
+    if (training := source.training) is not None:
+        peak = None if training.peak_bytes is None else training.peak_bytes / 1e9
+        for name, value in zip(TRAINING, (training.steps, training.seconds, peak), strict=True):
+            if value is not None:
+                rows.loc[is_model, name] = value
+    model = model_variant(config, str(path), by) if is_model.any() else None
+    git = source.git and source.git.commit[:9] + " with changes" * source.git.changed
+    facts = {
+        "variant": [model if m == METHOD else Variant("baseline", m) for m in rows.pop("method")],
+        "data": source.data.name,
+        "split": source.data.split,
+        "protocol": source.protocol.metrics,
+        "seed": seed,
+        "source": str(path),
+        "run": source.config_hash,
+        "git": git,
+    }
+    return rows.assign(**facts), config
 
 
 def _planned(path: Path, by: Sequence[str]) -> Planned | None:
@@ -233,9 +221,8 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
         config = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
         return None
-    if not isinstance(config, Mapping) or not all(k in config for k in ("trainer", "data")):
-        return None
-    if "recalibration" not in config:
+    needed = ("trainer", "data", "recalibration")
+    if not isinstance(config, Mapping) or not all(key in config for key in needed):
         return None
     data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
     return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
@@ -250,22 +237,21 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
 
     Raises:
         FileNotFoundError: a folder is missing.
-        InputError: there is no finished run, or a ``metrics.json`` is damaged.
+        InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``.
     """
-    sweep = Sweep()
-    for folder in folders:
-        if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
-        for path in sorted(folder.rglob("metrics.json")):
-            sweep.records += _run_records(path, by)
-        for path in sorted(folder.rglob("config.yaml")):
-            if path.parent.name != ".hydra" and (planned := _planned(path, by)) is not None:
-                sweep.planned.append(planned)
-    if not sweep.records:
+    runs = {str(path): _read_run(path, by) for path in files_below(folders, "metrics.json")}
+    planned = [p for path in files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
+    if not runs:
         names = ", ".join(map(str, folders))
-        begun = f"{len(sweep.planned)} runs without one" if sweep.planned else "none"
+        begun = f"{len(planned)} runs without one" if planned else "none"
         raise InputError(f"{names}: expected runs with a metrics.json below it; found {begun}")
-    return sweep
+    configs = {source: config for source, (_, config) in runs.items()}
+    known = {key for config in configs.values() for key in flatten(config)}
+    for key in by:
+        require(any(is_below(k, [key]) for k in known), "by", "keys of the runs' configurations", key)
+    rows = pd.concat([rows for rows, _ in runs.values()], ignore_index=True)
+    models = {s for s, v in zip(rows["source"], rows["variant"], strict=True) if v.kind == "model"}
+    return Sweep(rows, planned, {s: config for s, config in configs.items() if s in models})
 
 
 def person_of(subject: str, unit: re.Pattern[str] | None) -> str:

@@ -80,7 +80,7 @@ def test_a_further_question_measures_what_is_missing_and_a_setting_everything(co
     assert [name for name, *_ in measured] == ["model", "hull"]
     assert ghgs(*run, "peers.baselines=[hull,nearest_view]", "subjects=1") == 0
     assert [name for name, *_ in measured][2:] == ["nearest_view"]
-    assert ghgs(*run, "peers.baselines=hull", "subjects=1", "splats.sigma=0.4") == 0
+    assert ghgs(*run, "peers.baselines=hull", "subjects=1", "per_scene.steps=3") == 0
     assert [name for name, *_ in measured][3:] == ["model", "hull"]
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 
 from ghgs_lit.config import build, compose, resolve
-from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth, true_discs
+from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth
 from ghgs_lit.geometry.mattes import with_matte
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.heads.gaussian import RawGaussians
@@ -57,6 +57,7 @@ def test_discs_draw_the_surface_better_than_round_splats():
         cameras = cameras[:, 1:2]
         truth, inside, _ = painted_ellipsoid(cameras)
         batch = Batch(images, masks, inputs, depths=depths, targets=Targets(truth, inside, cameras))
-        splats, discs = splatted(batch, true_depth, RENDERER), true_discs(batch, RENDERER)
+        splats = RENDERER(splats_at(batch, batch.depths, batch.masks), cameras)
+        discs = splatted(batch, true_depth, RENDERER)
         found = [psnr(drawn.image[0], truth[0]).item() for drawn in (splats, discs)]
         assert found[1] > found[0] + 3

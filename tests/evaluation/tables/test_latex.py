@@ -11,7 +11,7 @@ import pytest
 from ghgs_lit.evaluation.tables import PREAMBLE, to_latex
 from ghgs_lit.evaluation.tables.latex import escape, prose
 from tests.helpers.latex import check_balance, read_tabular
-from tests.helpers.tables import SWITCHES, tables_of, write_run
+from tests.helpers.tables import SWITCHES, start_run, tables_of, write_run
 
 PAPER = json.loads((Path(__file__).parents[2] / "fixtures" / "paper_tables.json").read_text())
 DATA = {
@@ -64,12 +64,13 @@ def test_bold_deviation_marks_and_seeds_in_latex(tmp_path):
     shifts = {f"s{i:02d}": 0.01 * i - 0.095 for i in range(20)}
     for seed in (1, 2):
         write_run(tmp_path / f"f{seed}", "full", 20.0 + seed, seed, shifts=shifts, views=(4,))
-    write_run(tmp_path / "n", "neither", 19.0, 1, shifts=shifts, views=(4,))
+        write_run(tmp_path / f"n{seed}", "neither", 19.0 + seed, seed, shifts=shifts, views=(4,))
+    start_run(tmp_path / "n3", "neither", 3)
     (table,) = tables_of(tmp_path, views=(4,))
     latex = to_latex(table, "table:a")
     check_balance(latex)
     assert r"\textbf{25.50} $\pm$ 0.71" in latex
-    assert r"23.00$^{*}$ (1/2)" in latex
+    assert r"24.50 $\pm$ 0.71$^{*}$ [-1.00, -1.00] (2/3)" in latex
     assert "missing & missing" in latex
 
 

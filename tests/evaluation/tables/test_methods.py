@@ -79,7 +79,7 @@ def test_baselines_are_rows_that_do_not_compete(tmp_path):
     write_run(tmp_path / "2", "neither", 19.0)
     (table,) = tables_of(tmp_path, "table3", reported=False)
     rows, _ = body(to_markdown(table))
-    assert rows["Splats at the true depth"][0] == "34.00"
+    assert rows["Discs at the true depth"][0] == "34.00"
     assert rows["Ours (full)"][0] == "**24.00**"
 
 
@@ -89,7 +89,7 @@ def test_other_methods_join_the_table_that_they_fit(tmp_path):
     write_run(tmp_path / "runs" / "1", "full", 20.0, targets="midway")
     rows = [a_row(subject="a", psnr=24.0), a_row(subject="b", psnr=26.5)]
     rows.append(a_row(views=5, psnr=27.0, subjects=9))
-    others = read_others(others_file(tmp_path, rows))
+    others = [read_others(others_file(tmp_path, rows))]
     release, midway = tables_of(tmp_path / "runs", "table2", others=others, reported=False)
     rows, _ = body(to_markdown(release))
     assert rows["GHG"] == ["-"] * 3 + ["**25.25**", "0.8000", "-", "**27.00**", "0.8000", "-"]
@@ -103,30 +103,34 @@ def test_other_methods_join_the_table_that_they_fit(tmp_path):
 def test_the_example_of_the_documentation_is_read(tmp_path):
     """The documented file is valid, with subjects and with means."""
     shutil.copy(EXAMPLE, tmp_path)
-    by_subject, mean = read_others(tmp_path / EXAMPLE.name)
-    assert by_subject.subjects["p1000001"]["psnr"] == 26.85
-    assert by_subject.means["psnr"] == pytest.approx((27.31 + 26.85) / 2)
-    assert (mean.views, mean.count, mean.subjects) == (5, 6, {})
+    rows = read_others(tmp_path / EXAMPLE.name)
+    by_subject = rows.dropna(subset="subject").set_index("subject")
+    assert by_subject["psnr"]["p1000001"] == 26.85
+    assert by_subject["psnr"].mean() == pytest.approx((27.31 + 26.85) / 2)
+    (mean,) = rows[rows["subject"].isna()].to_dict("records")
+    assert (mean["views"], mean["count"]) == (5, 6)
 
 
 @pytest.mark.parametrize(
     ("rows", "changes", "said"),
     [
-        ([a_row()], {"format": "x"}, r"others\.json\.format: expected 'ghgs_lit\.others'; found 'x'"),
-        ([a_row()], {"format_version": 2}, "format_version: expected 1; found 2"),
-        ([a_row()], {"methd": "x"}, "found 'methd'"),
-        ([a_row()], {"source": ""}, "source: expected a text; found ''"),
-        ([], {}, "rows: expected a list"),
-        ([{**a_row(), "vews": 3}], {}, r"rows\[0\]: expected the keys .* only; found 'vews'"),
-        ([a_row(), {"data": "x"}], {}, r"rows\[1\]: expected the key 'split'"),
-        ([a_row(views="4")], {}, r"rows\[0\]\.views: expected a whole number; found '4'"),
-        ([a_row(views=0)], {}, "at least 1"),
-        ([a_row(psnr="25")], {}, r"metrics\.psnr: expected a finite number; found '25'"),
-        ([a_row(psnr=float("nan"))], {}, "expected a finite number; found nan"),
-        ([a_row(subject="a"), a_row(subject="a")], {}, r"rows\[1\]: .* found rows\[0\] again"),
+        ([a_row()], {"format": "x"}, r"others\.json\.format: expected .* 'ghgs_lit\.others'; found 'x'"),
+        ([a_row()], {"format_version": 2}, "format_version: expected to be 1; found 2"),
+        ([a_row()], {"methd": "x"}, r"others\.json\.methd: expected no such key"),
+        ([a_row()], {"source": ""}, "source: String should have at least 1 character; found ''"),
+        ([], {}, "rows: List should have at least 1 item"),
+        ([{**a_row(), "vews": 3}], {}, r"rows\[0\]\.vews: expected no such key"),
+        ([a_row(), {"data": "x"}], {}, r"rows\[1\]\.split: expected a value; found none"),
+        ([a_row(views="4")], {}, r"rows\[0\]\.views: expected to be a valid integer; found '4'"),
+        ([a_row(views=True)], {}, r"rows\[0\]\.views: expected to be a valid integer; found True"),
+        ([a_row(views=0)], {}, r"rows\[0\]\.views: expected to be greater than or equal to 1; found 0"),
+        ([a_row(psnr="25")], {}, r"metrics\.psnr: expected to be a valid number; found '25'"),
+        ([a_row(psnr=float("nan"))], {}, "expected to be a finite number; found nan"),
+        ([a_row(subject="a"), a_row(subject="a")], {}, r"rows\[1\]: .* found one again"),
+        ([a_row(), a_row()], {}, r"rows\[1\]: .* found one again"),
         ([a_row(subject="a"), a_row()], {}, "expected subjects or one mean .* found both"),
         ([a_row(subject="a", subjects=3)], {}, "found both"),
-        ([5], {}, r"rows\[0\]: expected a mapping; found 5"),
+        ([5], {}, r"rows\[0\]: expected to be a valid dictionary .* found 5"),
     ],
 )
 def test_a_file_that_is_wrong_says_where(tmp_path, rows, changes, said):
@@ -138,7 +142,7 @@ def test_a_file_that_is_wrong_says_where(tmp_path, rows, changes, said):
 def test_others_that_fit_nowhere_are_refused(tmp_path):
     """Results that no table can show are an error, not silence."""
     write_run(tmp_path / "runs", "full", 20.0)
-    others = read_others(others_file(tmp_path, [a_row(protocol="release")]))
+    others = [read_others(others_file(tmp_path, [a_row(protocol="release")]))]
     with pytest.raises(InputError, match=r"protocol=correct'\]; found .*protocol=release"):
         tables_of(tmp_path / "runs", "table2", others=others)
     with pytest.raises(InputError, match="expected layout=table1, table2 or table3; found ablation"):

@@ -3,12 +3,13 @@
 import csv
 import io
 import json
+import re
 
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown
-from ghgs_lit.evaluation.tables.text import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS, deviation
+from ghgs_lit.evaluation.tables import read_sweep, to_csv, to_markdown, to_terminal
+from ghgs_lit.evaluation.tables.notes import FOOTNOTE, ILLUSTRATION, NO_SEMANTICS
 from ghgs_lit.runs.results import read_results, summarize, write_results
 from tests.helpers.tables import body, start_run, tables_of, write_run
 
@@ -40,7 +41,6 @@ def test_several_seeds_give_a_deviation(tmp_path):
     rows, _ = body(to_markdown(table))
     assert rows["✓", "✓"][0] == "25.00 ± 1.00"
     assert "3 seeds" in table.caption
-    assert deviation([1.0]) is None
 
 
 def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
@@ -67,7 +67,9 @@ def test_runs_that_are_planned_or_going_are_said(tmp_path):
     (table,) = tables_of(tmp_path, views=(4,))
     rows, _ = body(to_markdown(table))
     assert rows["✓", "✓"][0] == "**25.50 ± 0.71 (2/3)**"
-    assert rows["✗", "✗"][0] == "24.00 (1/3)"
+    # No run of it with seed 3 is planned.
+    assert rows["✗", "✗"][0] == "24.00 (1/2)"
+    assert any("different seeds (✗ ✗: 1; ✓ ✓ (a): 1, 2)" in note for note in table.notes)
     assert any("synthetic paper neither seed 2" in note for note in table.notes)
     assert not any("seed 1" in note for note in table.notes)
 
@@ -127,8 +129,8 @@ def test_targets_are_tables_of_their_own_and_can_be_picked(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 18.0, targets="midway")
     write_run(tmp_path / "2", "full", 18.0, protocol="release")
-    settings = [tuple(t.records[0].setting.__dict__.values()) for t in tables_of(tmp_path)]
-    assert [s[2:] for s in settings] == [
+    settings = [tuple(t.rows[["targets", "protocol"]].iloc[0]) for t in tables_of(tmp_path)]
+    assert settings == [
         ("release", "correct"),
         ("midway", "correct"),
         ("release", "release"),
@@ -143,7 +145,9 @@ def test_two_runs_of_one_cell_are_refused_and_can_be_told_apart(tmp_path):
     """No run is averaged with another by accident; the message says how to separate them."""
     write_run(tmp_path / "0", "full", 20.0, optimizer={"lr": 0.1})
     write_run(tmp_path / "1", "full", 21.0, optimizer={"lr": 0.2})
-    expected = r"ablation=full, 3 views, seed 1; found .*0/metrics\.json .*by=\[optimizer\.lr\]"
+    expected = (
+        r"ablation=full, 3 views, seed 1; found .*0/metrics\.json and .*1/metrics.json .*by=\[optimizer\.lr\]"
+    )
     with pytest.raises(InputError, match=expected):
         tables_of(tmp_path)
     first, second = tables_of(tmp_path, by=["optimizer.lr"])
@@ -156,7 +160,7 @@ def test_the_same_numbers_twice_are_one_run(tmp_path):
     write_run(tmp_path / "0", "full", 20.0)
     write_run(tmp_path / "1", "full", 20.0, verb="evaluate")
     (table,) = tables_of(tmp_path)
-    assert all(list(cell.seeds) == [1] for line in table.lines for cell in line.cells.values())
+    assert list(table.measured["seeds"]) == [(1,)] * 9
 
 
 def test_csv_has_every_cell_in_full(tmp_path):
@@ -184,8 +188,11 @@ def test_results_that_are_none_are_refused(tmp_path):
     path.write_text("{")
     with pytest.raises(InputError, match=r"metrics\.json"):
         read_sweep([tmp_path])
+    path.write_text(json.dumps({"format_version": 2}))
+    with pytest.raises(InputError, match=r"format_version 3; found 2 .*evaluate"):
+        read_results(path)
     path.write_text(json.dumps({"format_version": 99}))
-    with pytest.raises(InputError, match="format_version 1 to 3; found 99"):
+    with pytest.raises(InputError, match="format_version 3; found 99"):
         read_results(path)
     with pytest.raises(InputError, match="at least one"):
         write_results(tmp_path, [], {})
@@ -211,3 +218,66 @@ def test_undefined_values_are_null_and_left_out_of_means(tmp_path):
     assert lines[0].startswith("method,subject,views,targets,target,inputs,psnr,psnr_box,depth_error_mm")
     assert lines[1].startswith("model,a,3,release,t,a b,20.0,,")
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_table_fits_a_narrow_terminal(tmp_path):
+    """Groups of columns stand below one another where they do not fit beside one another."""
+    for ablation, psnr in (("full", 20.0), ("neither", 18.0)):
+        for seed in (1, 2):
+            write_run(tmp_path / f"{ablation}{seed}", ablation, psnr + seed / 10, seed=seed)
+    start_run(tmp_path / "going", "neither", seed=3)
+    (table,) = tables_of(tmp_path)
+    wide, narrow = (re.sub(r"\033\[[\d;]*m", "", to_terminal(table, width)) for width in (200, 80))
+    assert max(map(len, narrow.splitlines())) <= 80 < max(map(len, wide.splitlines()))
+    assert wide.count("✗") == 4
+    assert narrow.count("✗") == 3 * 4
+    assert narrow.count("(2/3)") == wide.count("(2/3)") == 9
+    assert "23.15 ± 0.07" in narrow
+
+
+def test_a_row_can_be_told_by_the_checkpoint_that_was_measured(tmp_path):
+    """Keys of `ghgs evaluate` tell rows apart, too; keys that no run has are refused."""
+    for name, psnr, seed in (("a.ckpt", 20.0, 1), ("b.ckpt", 21.0, 1), ("c.ckpt", 22.0, 2)):
+        write_run(tmp_path / name, "full", psnr, seed, verb="evaluate", measured={"checkpoint": name})
+    with pytest.raises(
+        InputError, match=r"a.ckpt/metrics.json and .*b.ckpt/metrics.json .*by=\[checkpoint\]"
+    ):
+        tables_of(tmp_path)
+    (table,) = tables_of(tmp_path, "table2", by=["checkpoint"], reported=False)
+    rows, _ = body(to_markdown(table))
+    assert {name: row[0] for name, row in rows.items()} == {
+        "Ours (checkpoint=a.ckpt)": "23.00",
+        "Ours (checkpoint=b.ckpt)": "24.00",
+        "Ours (checkpoint=c.ckpt)": "**25.00**",
+    }
+    # Each has the one seed that it was trained with: no run is lacking.
+    assert not table.measured["lacking"].map(bool).any()
+    assert not any("(2/3)" in note for note in table.notes)
+    with pytest.raises(InputError, match="by: expected keys of the runs' configurations; found 'chekpoint'"):
+        tables_of(tmp_path, "table2", by=["chekpoint"])
+
+
+def test_all_runs_that_claim_one_cell_are_named(tmp_path):
+    """Not only the first two, and each with its partner."""
+    for seed in range(5):
+        write_run(tmp_path / f"{seed}a", "full", 20.0, seed=seed, optimizer={"lr": 0.1})
+        write_run(tmp_path / f"{seed}b", "full", 21.0, seed=seed, optimizer={"lr": 0.2})
+    with pytest.raises(InputError) as error:
+        tables_of(tmp_path)
+    said = str(error.value)
+    assert all(f"{seed}{letter}/metrics.json" in said for seed in range(3) for letter in "ab")
+    assert "and 2 more such pairs" in said
+    assert "by=[optimizer.lr] gives each a row" in said
+    assert "\n" not in said
+
+
+def test_a_table_of_numbers_of_views_that_nobody_measured_says_so(tmp_path):
+    """Every cell is missing, in every format."""
+    write_run(tmp_path / "0", "full", 20.0)
+    for layout in ("ablation", "table2"):
+        (table,) = tables_of(tmp_path, layout, views=(7,), reported=False)
+        rows, _ = body(to_markdown(table))
+        assert {cell for row in rows.values() for cell in row} == {"missing"}
+        assert "no subjects" in table.caption
+        assert "missing" in to_terminal(table, 80)
+        assert to_csv([table]).count("\n") == 1 + 3 * len(rows)

@@ -37,28 +37,12 @@ def test_rows_of_different_steps_are_said(tmp_path):
 def test_a_row_is_what_the_model_does(tmp_path):
     """A label that says something else than the model must not choose the row."""
     changed = {"neighborhood": "image_plane", "similarity": "log"}
-    path = write_run(tmp_path / "0", "full", 20.0, recalibration=changed)
-    content = json.loads(path.read_text())
-    content["format_version"] = 2  # its hash was of other keys
-    content["provenance"]["config"]["ablation"] = {"name": "full", "unprojection": True, "semantic": True}
-    path.write_text(json.dumps(content))
+    labels = {"name": "full", "unprojection": True, "semantic": True}
+    write_run(tmp_path / "0", "full", 20.0, recalibration=changed, ablation=labels)
     (table,) = tables_of(tmp_path, views=(4,))
     rows, _ = body(to_markdown(table))
     assert rows["✗", "✓"][0] == "24.00"
     assert rows["✓", "✓"][0] == "missing"
-
-
-def test_results_of_before_keep_their_rows(tmp_path):
-    """Earlier results say their ablation in a node of its own."""
-    path = write_run(tmp_path / "0", "full", 20.0)
-    content = json.loads(path.read_text())
-    content["format_version"] = 2  # its hash was of other keys
-    config = content["provenance"]["config"]
-    del config["recalibration"]
-    config["ablation"] = {"name": "no_semantic", "unprojection": True, "semantic": False}
-    path.write_text(json.dumps(content))
-    (table,) = tables_of(tmp_path, views=(4,))
-    assert body(to_markdown(table))[0]["✓", "✗"][0] == "24.00"
 
 
 def test_a_checkpoint_that_was_changed_is_another_row(tmp_path):
@@ -91,26 +75,35 @@ PROVENANCE, ROW = "provenance", ("rows", 0)
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        (edited(KeyError, PROVENANCE), "provenance: expected a mapping; found 'NoneType'"),
-        (edited([1], PROVENANCE), "provenance: expected a mapping; found 'list'"),
-        (edited("x", PROVENANCE, "config"), "provenance: config: expected a mapping; found 'x'"),
+        (edited(KeyError, PROVENANCE), "provenance: expected a value; found none"),
+        (edited([1], PROVENANCE), r"provenance: expected to be a valid dictionary; found \[1\]"),
+        (
+            edited("x", PROVENANCE, "config"),
+            "provenance.config: expected to be a valid dictionary; found 'x'",
+        ),
         (edited(KeyError, PROVENANCE, "config", "recalibration"), "recalibration: expected a mapping"),
         (
             edited("one", PROVENANCE, "config", "seed"),
-            "provenance: seed: expected a whole number; found 'one'",
+            "provenance.seed: expected a whole number; found 'one'",
         ),
-        (edited(KeyError, PROVENANCE, "data"), "provenance: data.name: expected a text"),
-        (edited(3, PROVENANCE, "data", "split"), "provenance: data.split: expected a text; found 3"),
-        (edited(None, PROVENANCE, "protocol"), "provenance: protocol.metrics: expected a text"),
-        (edited("dirty", PROVENANCE, "git"), "provenance: git.commit: expected a text"),
-        (edited(3, PROVENANCE, "training"), "provenance: training: expected a mapping; found 3"),
-        (edited(KeyError, "rows"), "rows: expected a list; found 'NoneType'"),
-        (edited({}, "rows"), "rows: expected a list; found 'dict'"),
-        (edited("x", *ROW), r"rows\[0\]: method: expected a text; found 'NoneType'"),
-        (edited("high", *ROW, "psnr"), r"rows\[0\]: psnr: expected a number or null; found 'high'"),
-        (edited("four", *ROW, "views"), r"rows\[0\]: views: expected a whole number; found 'four'"),
-        (edited(KeyError, *ROW, "subject"), r"rows\[0\]: subject: expected a text; found 'NoneType'"),
-        (edited(3, "summary"), "summary: expected a list; found 3"),
+        (edited(KeyError, PROVENANCE, "data"), "provenance.data: expected a value; found none"),
+        (
+            edited(3, PROVENANCE, "data", "split"),
+            "provenance.data.split: expected to be a valid string; found 3",
+        ),
+        (edited(None, PROVENANCE, "protocol"), "provenance.protocol: expected to be a valid dictionary"),
+        (edited("dirty", PROVENANCE, "git"), "provenance.git: expected to be a valid dictionary"),
+        (
+            edited(3, PROVENANCE, "training"),
+            "provenance.training: expected to be a valid dictionary .*found 3",
+        ),
+        (edited(KeyError, "rows"), "rows: expected a value; found none"),
+        (edited({}, "rows"), "rows: expected to be a valid list; found {}"),
+        (edited("x", *ROW), r"rows\[0\]: expected to be a valid dictionary"),
+        (edited("high", *ROW, "psnr"), r"rows\[0\]\.psnr: expected to be a valid number.*; found 'high'"),
+        (edited("four", *ROW, "views"), r"rows\[0\]\.views: expected to be a valid integer.*; found 'four'"),
+        (edited(KeyError, *ROW, "subject"), r"rows\[0\]\.subject: expected a value; found none"),
+        (edited(3, "summary"), "summary: expected to be a valid list; found 3"),
     ],
 )
 def test_edited_results_are_one_line(tmp_path, edit, said):

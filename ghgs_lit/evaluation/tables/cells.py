@@ -1,0 +1,186 @@
+"""The cells of a table from measurements: means, deviations, what is best, what differs beyond chance."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations, product
+from typing import Any
+
+import pandas as pd
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables.differences import differing, differing_text, telling_apart
+from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, decimals
+from ghgs_lit.evaluation.tables.records import TRAINING, person_of
+from ghgs_lit.evaluation.tables.reported import data_title
+from ghgs_lit.evaluation.tables.significance import Comparison, PairedTest, compare, holm
+
+Configs = Mapping[str, Mapping[str, Any]]
+
+
+def fill(
+    table: Table,
+    figures: Sequence[Mapping[str, Any]],
+    test: PairedTest,
+    unit: re.Pattern[str] | None,
+    configs: Configs,
+) -> None:
+    """Fill ``table.cells``.
+
+    Args:
+        table: its lines, columns and rows are known.
+        figures: the reported figures, as entries of ``table.cells``.
+        test: the test against the reference row.
+        unit: tells persons of subjects, as for :func:`person_of`.
+        configs: configurations by file, for messages.
+
+    Raises:
+        InputError: two runs claim one cell with different numbers.
+    """
+    values = _values(table)
+    _refuse_rivals(table, values, configs)
+    # The same numbers, measured or copied twice, are one run.
+    cell_and_seed = [*CELL, "seed"]
+    values = values[values["source"] == values.groupby(cell_and_seed)["source"].transform("first")]
+    seeds = values.groupby(cell_and_seed, sort=False)
+    seeds = seeds.agg(mean=("value", "mean"), count=("count", "first"), run=("run", "first")).reset_index()
+    cells = seeds.groupby(CELL).agg(
+        mean=("mean", "mean"),
+        deviation=("mean", "std"),
+        seeds=("seed", tuple),
+        count=("count", "first"),
+        runs=("run", " ".join),
+    )
+    reported = pd.DataFrame(figures, columns=[*CELL, "mean"]).set_index(CELL)
+    every = pd.MultiIndex.from_product([range(len(table.lines)), *_columns(table)], names=CELL)
+    table.cells = cells.reindex(every)
+    table.cells["mean"] = table.cells["mean"].fillna(reported["mean"])
+    table.cells["lacking"] = [_lacking(table, cell) for cell in table.cells.itertuples()]
+    table.cells["best"] = False
+    for column in product(*_columns(table)):
+        _mark_best(table, column)
+    table.cells["test"], table.cells["marked"] = None, False
+    if test.against != "none":
+        _test(table, _by_person(values, unit), test)
+
+
+def _columns(table: Table) -> tuple[range, list[str]]:
+    return range(len(table.groups)), table.metrics
+
+
+def _values(table: Table) -> pd.DataFrame:
+    """A line for each value: ``CELL``, ``seed``, ``source``, ``run``, ``subject``, ``count``, ``value``."""
+    lines = {line.variant: i for i, line in enumerate(table.lines) if not line.is_reported}
+    numbers = {(g.views, g.data): i for i, g in enumerate(table.groups)}
+    rows, facts = table.rows, ["line", "group", "seed", "source", "run", "subject"]
+    rows = rows.assign(
+        line=[lines[variant] for variant in rows["variant"]],
+        group=[
+            numbers.get((views, None), numbers.get((views, data_title(data)), -1))
+            for views, data in zip(rows["views"], rows["data"], strict=True)
+        ],
+    )
+    rows = rows[rows["group"] >= 0]
+    size = rows.groupby(["line", "group", "seed", "source"])["line"].transform("size")
+    rows = rows.assign(count=rows.get("count", size).fillna(size), run=rows["run"].fillna(rows["source"]))
+    rows = rows.reindex(columns=[*facts, "count", *table.metrics])
+    return rows.melt([*facts, "count"], var_name="metric").dropna(subset="value")
+
+
+def _refuse_rivals(table: Table, values: pd.DataFrame, configs: Configs) -> None:
+    """Refuse several runs for one cell; names them all, and the keys that tell them apart."""
+    means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
+    rivals: dict[tuple[str, ...], str] = {}
+    for (line, group, _, seed), part in means.groupby(level=[*CELL, "seed"], sort=False):
+        if part["value"].nunique() > 1:
+            variant, views = table.lines[line].variant, table.groups[group].views
+            what = f"ablation={variant.ablation}" if variant.switches else variant.name
+            rivals.setdefault(tuple(part["source"]), f"{what}, {views} views, seed {seed}")
+    if not rivals:
+        return
+    clashes, apart = [], {}
+    for sources, what in list(rivals.items())[:3]:
+        of_models = [configs[source] for source in sources if source in configs]
+        keys = differing(of_models)
+        apart |= dict.fromkeys(telling_apart(of_models, keys))
+        said = f" (they differ in {differing_text(keys)})" if keys else ""
+        clashes.append(f"one run for {what}; found {' and '.join(sources)}{said}")
+    more = f"; and {len(rivals) - 3} more such pairs" if len(rivals) > 3 else ""
+    rows = f"by=[{','.join(apart)}] gives each a row, " if apart else ""
+    raise InputError(f"runs: expected {'; '.join(clashes)}{more}: {rows}runs=[...] lists those to show")
+
+
+def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
+    """Seeds of planned runs of our row of a cell that has some seeds and not these."""
+    line, group, _ = cell.Index
+    line, group = table.lines[line], table.groups[group]
+    if not line.is_ours or not isinstance(cell.seeds, tuple):
+        return ()
+    planned = {
+        p.seed
+        for p in table.planned
+        if p.variant == line.variant and group.data in (None, data_title(p.data))
+    }
+    return tuple(sorted(planned - set(cell.seeds)))
+
+
+def _competing(table: Table, column: tuple) -> pd.Series:
+    """Means of a column by the numbers of the lines that compete."""
+    means = table.cells["mean"].xs(column, level=CELL[1:]).dropna()
+    return means[[table.lines[i].competes for i in means.index]]
+
+
+def _mark_best(table: Table, column: tuple) -> None:
+    """Mark the best means of a column, as printed; none where all are equal or no direction is better."""
+    means = _competing(table, column).round(decimals(column[1]))
+    if means.nunique() > 1 and arrow(column[1]):
+        best = means.min() if arrow(column[1]) == "↓" else means.max()
+        for line in means.index[means == best]:
+            table.cells.loc[(line, *column), "best"] = True
+
+
+def _by_person(values: pd.DataFrame, unit: re.Pattern[str] | None) -> pd.DataFrame:
+    """Values by cell and seed (index) and by person (columns); those of persons alone can be tested."""
+    values = values[values["subject"].notna() & ~values["metric"].isin(TRAINING)]
+    values = values.assign(person=[person_of(subject, unit) for subject in values["subject"]])
+    return values.groupby([*CELL, "seed", "person"])["value"].mean().unstack("person")
+
+
+def _test(table: Table, people: pd.DataFrame, test: PairedTest) -> None:
+    """Test each row against the reference of its column, corrected over all comparisons of the table.
+
+    Where the reference is the best of what was measured, every pair of rows of the column counts as a
+    comparison: chance chose among them.
+    """
+    tested: list[tuple[tuple | None, Comparison]] = []
+    for column in product(*_columns(table)):
+        means = _competing(table, column)
+        means = means[[(line, *column) in people.index.droplevel("seed") for line in means.index]]
+        reference, chosen = _reference(table, means, column[1], test.against)
+        if reference is None:
+            continue
+        for one, other in combinations(means.index, 2):
+            if reference in (one, other) or chosen:
+                row, against = (other, one) if one == reference else (one, other)
+                frames = [people.loc[(line, *column)] for line in (row, against)]
+                cell = (row, *column) if against == reference else None
+                tested.append((cell, compare(*frames, test.alpha)))
+    known = [i for i, (_, comparison) in enumerate(tested) if comparison.p is not None]
+    table.comparisons = len(known)
+    for i, p in zip(known, holm([tested[i][1].p for i in known]), strict=True):
+        tested[i] = (tested[i][0], replace(tested[i][1], corrected=p))
+    for cell, comparison in tested:
+        if cell is not None:
+            table.cells.at[cell, "test"] = comparison
+            p = comparison.corrected
+            table.cells.at[cell, "marked"] = p is not None and p < test.alpha
+
+
+def _reference(table: Table, means: pd.Series, metric: str, against: str) -> tuple[int | None, bool]:
+    """The row that the others of a column are tested against, and whether it was chosen by its figures."""
+    full = [i for i in means.index if table.lines[i].is_ours and table.lines[i].variant.ablation == "full"]
+    if against == "full" and len(full) == 1:
+        return full[0], False
+    if means.empty or not arrow(metric):
+        return None, False
+    return (means.idxmin() if arrow(metric) == "↓" else means.idxmax()), True

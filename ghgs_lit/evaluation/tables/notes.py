@@ -1,0 +1,172 @@
+"""The caption of a table and the notes below it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
+
+from ghgs_lit.evaluation.tables.differences import differing, differing_text
+from ghgs_lit.evaluation.tables.layouts import Table
+from ghgs_lit.evaluation.tables.records import Planned
+from ghgs_lit.evaluation.tables.reported import data_title, reported_source
+from ghgs_lit.evaluation.tables.significance import PairedTest, needed_errors
+
+FOOTNOTE = (
+    "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them, while its"
+    " text says that semantic consistency alone is not included. Without 3D unprojection there are no token"
+    " points: neighbours are then found on the image plane."
+)
+NO_SEMANTICS = "features carry no semantics: this encoder was never trained for semantics"
+ILLUSTRATION = "This is an illustration of the framework on a small model, not a result."
+MARK = "*"
+
+
+def write_caption(table: Table) -> str:
+    """Data, protocol, model and number of runs, in one line."""
+    first, names = table.rows.iloc[0], dict.fromkeys(table.rows["data"])
+    measured = table.measured
+    counts = sorted({int(count) for count in measured["count"].dropna()})
+    seeds = max(map(len, measured["seeds"]), default=0)
+    said = [
+        f"Data {' and '.join(f'`{name}`' for name in names)}",
+        f"{' or '.join(map(str, counts)) or 'no'} subjects of `{first['split']}`",
+        f"targets `{first['targets']}`",
+        f"metrics `{first['protocol']}`",
+    ]
+    if table.layout.rows == "ablation":
+        said += [f"model `{first['variant'].model}`", f"encoder `{first['variant'].encoder}`"]
+        said += [f"`{key}={value}`" for key, value in first["variant"].extra]
+    views = {group.views for group in table.groups}
+    if table.layout.heading != "views" and len(views) == 1:
+        said.append(f"{views.pop()} input views")
+    spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
+    return f"{', '.join(said)}; mean over subjects{spread}, best of the measured methods in bold."
+
+
+def write_notes(
+    table: Table, test: PairedTest, configs: Mapping[str, Mapping[str, Any]], illustration: bool = False
+) -> list[str]:
+    """The notes below the table; ``illustration`` adds that the numbers are no result."""
+    said = [f"**{ILLUSTRATION}**"] if illustration else []
+    if table.layout.rows == "ablation":
+        said.append(FOOTNOTE)
+        if not table.ours[0].variant.has_semantics:
+            said.append(f"(a) {NO_SEMANTICS}.")
+    if "flip" in table.metrics and "lpips" not in table.metrics:
+        said.append("FLIP replaces the paper's LPIPS, which at least one run could not compute.")
+    if table.reported_on:
+        said.append(
+            f"Reported: figures that {reported_source()}, prints for {table.reported_on}, measured by its"
+            " authors on their data, split and views. They were not measured here, and are not comparable"
+            " with figures on other data or protocols."
+        )
+    said += _about_others(table)
+    said += _about_test(table, test)
+    said += _about_steps(table)
+    said += _about_seeds(table)
+    return said + _about_runs(table, configs)
+
+
+def _of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
+    return rows[[variant.kind == kind for variant in rows["variant"]]]
+
+
+def _about_others(table: Table) -> list[str]:
+    """Where the numbers of other methods are from, and whether their number of subjects differs from ours."""
+    said = []
+    ours = set(_of(table.rows, "model").groupby(["source", "views"]).size())
+    for name, rows in _of(table.rows, "other").groupby("variant", sort=False):
+        untested = "" if rows["subject"].notna().all() else "; means only where untested"
+        means = rows["count"].dropna()
+        subjects = rows[rows["subject"].notna()].groupby(["data", "views", "seed"]).size()
+        counts = sorted({int(count) for count in (*means, *subjects)} - ours)
+        fewer = f"; of {' or '.join(map(str, counts))} subjects" if counts else ""
+        said.append(f"{name.name}: {rows['said'].iloc[0]}{untested}{fewer}.")
+    return said
+
+
+def _range(counts: list[int]) -> str:
+    return " to ".join(map(str, dict.fromkeys((min(counts), max(counts)))))
+
+
+def _about_test(table: Table, test: PairedTest) -> list[str]:
+    """Which test was made of how many seeds and subjects, or why nothing is marked."""
+    tests = [comparison for comparison in table.cells["test"] if comparison is not None]
+    if not tests:
+        return []
+    known = [comparison for comparison in tests if comparison.p is not None]
+    if not known:
+        if max(comparison.seeds for comparison in tests) < 2:
+            why = "rows have fewer than two seeds in common, and one seed cannot tell a method from its luck"
+        else:
+            why = "rows have fewer than two subjects in common"
+        return [f"No differences are marked: {why}."]
+    against = "its column's best row"
+    if test.against == "full":
+        full = [line for line in table.ours if line.variant.ablation == "full"]
+        against = "the row of the whole method" if len(full) == 1 else against
+    seeds, subjects = [c.seeds for c in known], [c.subjects for c in known]
+    fewest = min(max(seeds), max(subjects))
+    needed = needed_errors(test.alpha, fewest, table.comparisons)
+    return [
+        f"{MARK} differs beyond chance from {against}: two-sided t test over {_range(seeds)} seeds and"
+        f" {_range(subjects)} subjects together, Holm's correction over the {table.comparisons} comparisons"
+        f" of this table, p < {test.alpha:g}; in brackets the {100 * (1 - test.alpha):g} % interval of the"
+        f" difference. With {fewest} seeds or subjects a difference must be {needed:.3g} standard errors."
+    ]
+
+
+def _about_steps(table: Table) -> list[str]:
+    """That rows were not trained equally long, where they were not."""
+    if "steps" not in table.rows:
+        return []
+    rows = table.rows.dropna(subset="steps")
+    if rows["steps"].nunique() < 2:
+        return []
+    steps = rows.groupby("variant", sort=False)["steps"].agg(list)
+    stubs = {line.variant: " ".join(line.stub) for line in table.lines}
+    rows = [f"{stubs[variant]}: {_range([round(n) for n in each])}" for variant, each in steps.items()]
+    return [f"Rows were trained for different numbers of steps ({'; '.join(rows)})."]
+
+
+def _about_seeds(table: Table) -> list[str]:
+    """That our rows are means over different seeds, where they are."""
+    seeds = _of(table.rows, "model").groupby("variant", sort=False)["seed"].unique().map(sorted)
+    if len({tuple(each) for each in seeds}) < 2:
+        return []
+    rows = [
+        f"{' '.join(line.stub)}: {', '.join(map(str, seeds[line.variant]))}"
+        for line in table.ours
+        if line.variant in seeds
+    ]
+    return [f"Rows are of different seeds ({'; '.join(rows)})."]
+
+
+def _run_name(planned: Planned) -> str:
+    variant = planned.variant
+    return f"{data_title(planned.data)} {variant.model} {variant.ablation} seed {planned.seed}"
+
+
+def _about_runs(table: Table, configs: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Runs that are unfinished, that differ in settings, or that are of different states of the code."""
+    said = []
+    if table.measured["lacking"].map(bool).any():
+        said.append("(2/3): from 2 of 3 seeds; the others have no results yet.")
+    unfinished = list(dict.fromkeys(_run_name(p) for p in table.planned if not p.done))
+    if unfinished:
+        more = f" and {len(unfinished) - 4} more" if len(unfinished) > 4 else ""
+        said.append(f"No results yet (in progress or cut off): {'; '.join(unfinished[:4])}{more}.")
+    groups: dict[tuple, list] = {}
+    for source, variant, data in (
+        _of(table.rows, "model")[["source", "variant", "data"]].drop_duplicates().values
+    ):
+        row = (variant.model, variant.encoder, variant.switches, data)
+        groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(configs[source])
+    keys = {key: values for group in groups.values() for key, values in differing(group).items()}
+    keys.pop("checkpoint", None)
+    if keys:
+        said.append(f"Runs side by side differ also in {differing_text(keys)}.")
+    states = sorted(table.rows["git"].dropna().unique()) if "git" in table.rows else []
+    if len(states) > 1:
+        said.append(f"The runs are of {len(states)} states of the code: {', '.join(states)}.")
+    return said
