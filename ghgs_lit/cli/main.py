@@ -18,12 +18,12 @@ from ghgs_lit.cli.messages import (
     BAD_INPUT,
     BadUsage,
     check_deletions,
-    check_flags,
-    did_you_mean,
+    flags_first,
     one_line,
     raised_by_hydra,
 )
 from ghgs_lit.config import check_groups, conf_dir, resolve
+from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.kernels.allocation import keep_freed_memory
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
@@ -37,7 +37,7 @@ VERBS = {
         "ghgs prepare task=render data=scans data.source=scans data.root=rendered",
     ),
     "train": (
-        "train a model and evaluate it",
+        "train a model (model=hull; the paper's method: model=paper) and evaluate it",
         "ghgs train model=hull data=synthetic trainer.max_time=00:00:10:00",
     ),
     "pretext": (
@@ -107,14 +107,14 @@ class Verb:
         sys.argv = list(self.argv)
         try:
             # Before the verb's module is imported, which takes seconds.
-            resolve(cfg)
+            resolve(cfg, self.name)
             check_groups(self.name, cfg)
             return importlib.import_module(module_of(self.name)).run(cfg)
         except BAD_INPUT as error:
             # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
             if self.wants_trace or HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
-            print(f"ghgs {self.name}: {one_line(error)}", file=sys.stderr)
+            print(f"ghgs {self.name}: {one_line(error, self.name)}", file=sys.stderr)
             raise SystemExit(1) from error
 
 
@@ -149,14 +149,27 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     return arguments
 
 
+def _help(verb: str, arguments: list[str]) -> int:
+    """``ghgs <verb> --help [group]``."""
+    from ghgs_lit.cli.help import print_group, print_verb
+
+    names = [argument for argument in arguments if argument not in ("-h", "--help")]
+    for name in names:
+        print_group(verb, name)
+    if not names:
+        print_verb(verb, *VERBS[verb])
+    return 0
+
+
 def _run(verb: str, argv: list[str]) -> int:
     # With this variable Hydra raises errors, which are handled below, instead of printing them.
     wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = [argv[0], *_for_hydra(verb, argv[2:])]
     task = Verb(verb, tuple(argv), wants_trace)
     try:
-        check_flags(sys.argv[1:])
+        if "--help" in argv or "-h" in argv:
+            return _help(verb, argv[2:])
+        sys.argv = [argv[0], *flags_first(_for_hydra(verb, argv[2:]))]
         check_deletions(sys.argv[1:])
         with interruptible():
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
@@ -171,7 +184,7 @@ def _run(verb: str, argv: list[str]) -> int:
     except Exception as error:
         if wants_trace or not (isinstance(error, BAD_INPUT) or raised_by_hydra(error)):
             raise
-        print(f"ghgs {verb}: {one_line(error)}", file=sys.stderr)
+        print(f"ghgs {verb}: {one_line(error, verb)}", file=sys.stderr)
         return 1
     except Interrupted as stop:
         if not stop.explained:

@@ -1,23 +1,21 @@
 """Errors as one line: ``<path or key>: expected ...; found ...``."""
 
-import argparse
-import difflib
 import os
 import re
 import sys
 import traceback
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ghgs_lit.config import conf_dir
-from ghgs_lit.config.keys import is_below
-from ghgs_lit.config.schema import KINDS
+from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config.keys import flatten, is_below
+from ghgs_lit.config.options import did_you_mean
+from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
 #: Errors that are bad input, not bugs: files that cannot be read or written are, too.
@@ -25,21 +23,26 @@ BAD_INPUT = (InputError, OSError, HydraException, OmegaConfBaseException)
 
 _EXTRAS = {"joblib": "cluster", "submitit": "cluster", "ray": "ray", "optuna": "optuna"}
 
+#: Hydra's flags, and whether a value follows.
+_FLAGS = {
+    **dict.fromkeys(("-h", "--help", "--hydra-help", "--version", "-r", "--run", "-m", "--multirun"), False),
+    **dict.fromkeys(("--resolve", "-sc", "--shell-completion"), False),
+    **dict.fromkeys(("-c", "--cfg", "-i", "--info", "-p", "--package", "-cp", "--config-path"), True),
+    **dict.fromkeys(("-cn", "--config-name", "-cd", "--config-dir", "--experimental-rerun"), True),
+}
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`` (did you mean ...?)`` with the closest of ``known``, or nothing."""
-    close = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {close[0]}?)" if close else ""
+#: Nodes of Lightning's classes, whose keys have values of their own where none is given.
+_LIGHTNING = ("trainer", "callbacks", "logger")
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: Exception, verb: str) -> str:
     """The message of one of ``BAD_INPUT`` or of an error inside Hydra, on one line."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
         text = f"{error.override}: expected key=value or group=option; found {error}"
     elif isinstance(error, HydraException):
-        text = _composition(error)
+        text = _composition(error, verb)
     elif isinstance(error, OSError):
         text = _system(error)
     elif isinstance(error, OmegaConfBaseException):
@@ -63,34 +66,30 @@ def _missing_option(error: MissingConfigException) -> str:
     return f"{group}: expected {expected}; found {option!r}{hint}"
 
 
-def _composition(error: HydraException) -> str:
+def _composition(error: HydraException, verb: str) -> str:
     """A key that does not exist, with the closest one; other errors of Hydra with their cause."""
     named = re.match(r"Could not override '([^']+)'", str(error))
     if named is None:
         return f"{' '.join(sys.argv[1:])}: expected overrides that fit; found {error} {error.__cause__ or ''}"
-    key = named[1]
+    key, keys = named[1], list(flatten(OmegaConf.to_container(compose(verb), resolve=False)))
     # A key without its group counts as close, too: lr for optimizer.lr.
-    keys = [known for known in KINDS if "*" not in known]
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
-    hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*keys, *_groups()))
-    hint = "" if key in KINDS else hint  # a key of another verb
+    groups = [str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()]
+    hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*keys, *groups))
+    if any(key in options.model_fields for options in VERBS.values()):
+        hint = ""  # a key of another verb
     return f"{key}: expected a key or group of this verb; found none of that name{hint}; +{key}=... adds it"
-
-
-def _groups() -> list[str]:
-    """The names of the groups in ``conf``."""
-    return [str(path.relative_to(conf_dir())) for path in conf_dir().rglob("*") if path.is_dir()]
 
 
 def _system(error: OSError) -> str:
     """A file that cannot be read or written. Where the system names none it is the run's directory."""
     if error.errno is None:  # raised by this package, with a message of its own
         return str(error)
-    place = error.filename2 or error.filename
-    if place is None:
-        place = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else Path.cwd()
+    path = error.filename2 or error.filename
+    if path is None:
+        path = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else Path.cwd()
     return (
-        f"{os.fsdecode(place)}: expected a file that can be read or written; found {error.strerror or error}"
+        f"{os.fsdecode(path)}: expected a file that can be read or written; found {error.strerror or error}"
     )
 
 
@@ -101,35 +100,31 @@ def raised_by_hydra(error: Exception) -> bool:
 
 
 class BadUsage(Exception):
-    """Hydra's parser refuses the flags of a command line."""
+    """A flag that Hydra does not have."""
 
 
-def check_flags(arguments: Sequence[str]) -> None:
-    """Refuse what Hydra's parser of ``arguments`` would refuse with its whole usage.
+def flags_first(arguments: Sequence[str]) -> list[str]:
+    """``arguments`` with Hydra's flags before all overrides, between which Hydra allows none.
 
     Raises:
-        BadUsage: the reason, as one line.
+        BadUsage: a flag does not exist.
     """
-
-    def refuse(reason: str) -> NoReturn:
-        unknown = re.match(r"unrecognized arguments: (.*)", reason)
-        if unknown is None:
-            raise BadUsage(f"expected flags as --hydra-help lists them; found {reason}")
-        if unknown[1].startswith("-"):
-            flag = unknown[1].split()[0].split("=")[0]
-            raise BadUsage(f"{flag}: expected a flag of --hydra-help; found none of that name")
-        raise BadUsage(
-            "expected flags such as -m and --config-dir before or after all key=value arguments, not"
-            f" between them; found a flag before {unknown[1]!r}"
-        )
-
-    parser: argparse.ArgumentParser = get_args_parser()
-    parser.error = refuse
-    parser.parse_args(list(arguments))
-
-
-#: Nodes of Lightning's classes, whose keys have values of their own where none is given.
-_LIGHTNING = ("trainer", "callbacks", "logger")
+    flags, overrides = [], []
+    rest: Iterator[str] = iter(arguments)
+    for argument in rest:
+        name, _, value = argument.partition("=")
+        if not argument.startswith("-"):
+            overrides.append(argument)
+        elif name not in _FLAGS:
+            raise BadUsage(f"{name}: expected a flag of --hydra-help; found none of that name")
+        elif _FLAGS[name] and not value:
+            following = next(rest, None)
+            if following is None:
+                raise BadUsage(f"{name}: expected a value after it, as --hydra-help says; found none")
+            flags += [name, following]
+        else:
+            flags.append(argument)
+    return flags + overrides
 
 
 def check_deletions(arguments: Sequence[str]) -> None:

@@ -10,7 +10,6 @@ from rich.text import Text
 from tabulate import tabulate
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
@@ -25,7 +24,7 @@ def _listed(value: Any) -> tuple | None:
 def _options(config: dict[str, Any]) -> t.TableOptions:
     evaluation = config["evaluation"]
     try:
-        unit = re.compile(config["test"].pop("unit") or "(.+)")
+        unit = re.compile(config["test"]["unit"] or "(.+)")
     except re.error as error:
         raise InputError(f"test.unit: expected a regular expression; found {error}") from None
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
@@ -35,7 +34,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
         targets=_listed(evaluation["targets"]),
         metrics=_listed(config["columns"]),
         reported=config["reported"],
-        test=from_config(t.PairedTest, "test", config["test"]),
+        test=t.PairedTest.read(config["test"], "test"),
         unit=unit,
         illustration=config["illustration"],
     )

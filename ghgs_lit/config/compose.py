@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.config.schema import check
+from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
 
@@ -46,6 +47,11 @@ def check_groups(verb: str, cfg: DictConfig) -> None:
             raise InputError(f"{name}: expected a key or group of ghgs {verb}; found none")
 
 
+def is_group(name: str) -> bool:
+    """Whether a key of a configuration is the node of a config group."""
+    return (conf_dir() / name).is_dir() or name == "rounds"
+
+
 def _has_node(group: str, option: str | None) -> bool:
     """Whether an option fills the node of its group; those of the whole configuration may set others only."""
     path = conf_dir() / group / f"{option}.yaml"
@@ -54,8 +60,12 @@ def _has_node(group: str, option: str | None) -> bool:
     return not path.read_text().startswith("# @package _global_") or group in OmegaConf.load(path)
 
 
-def resolve(cfg: DictConfig) -> dict[str, Any]:
+def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
     """The configuration as plain data, interpolations resolved.
+
+    Args:
+        cfg: a composed configuration.
+        verb: whose own keys are checked beside the groups; None: groups alone.
 
     Raises:
         InputError: a value is missing, or of the wrong type or range.
@@ -65,4 +75,6 @@ def resolve(cfg: DictConfig) -> dict[str, Any]:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     data = OmegaConf.to_container(cfg, resolve=True)
     check(data)
+    if verb is not None:
+        VERBS[verb].read({name: value for name, value in data.items() if not is_group(name)}, "")
     return data

@@ -149,7 +149,7 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
     if first["type"] == "extra_forbidden":
         name, known = first["loc"][-1], list(cls.model_fields)
         text = f"expected one of {', '.join(sorted(known))}; found {name!r}{did_you_mean(name, known)}"
-        return InputError(f"{dotted} key: {text}".strip())
+        return InputError(f"{dotted} key: {text}" if dotted else f"{name}: {text}")
     if first["type"] == "missing" and first["loc"][-1] in cls.model_fields:
         return InputError(f"{dotted}: expected a value; found none")
     wanted = str(own) if own is not None else expected(field) if field is not None else first["msg"]

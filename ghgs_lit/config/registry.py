@@ -35,6 +35,8 @@ KINDS: dict[str, dict[str | None, str]] = {
     "loss": {"weighted": "ghgs_lit.losses.Losses"},
     "metrics": {"images": "ghgs_lit.metrics.ImageMetrics"},
     "optimizer": {"adamw": "ghgs_lit.training.Optimization"},
+    "calibration": {None: "ghgs_lit.config.verbs.Calibration"},
+    "evaluation": {None: "ghgs_lit.config.verbs.EvaluationOptions"},
     "trainer": {"lightning": "lightning.pytorch.Trainer"},
     "data": {
         "humman": "ghgs_lit.data.datamodules.HuMManDataModule",

@@ -54,7 +54,6 @@ def test_bad_verb_is_bad_usage(monkeypatch, capsys, argv):
         (("train", "encoder=vggt_huge"), "vggt_huge"),
         (("train", "seed="), "seed"),
         (("train", "views=[4"), "'[4'"),
-        (("train", "ablation.unprojection=false"), "expected recalibration.neighborhood=image_plane"),
     ],
 )
 def test_configuration_errors_take_one_line_and_name_the_key(monkeypatch, capsys, argv, expected):

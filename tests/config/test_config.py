@@ -12,7 +12,7 @@ from ghgs_lit.config import build, conf_dir
 from ghgs_lit.config.ablation import ablation_of, switches_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from tests.helpers.configs import composed
+from tests.helpers.configs import composed, verb_with
 
 CONF = conf_dir()
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir() and path.name != "hydra")
@@ -45,7 +45,7 @@ def test_every_member_composes_and_its_model_is_built(group, name):
     """A shipped option that does not compose, or builds no model, would fail only for its first user."""
     # Depths without bounds belong to the release's model alone.
     fitting = ["compat=release"] if (group, name) == ("bounds", "none") else []
-    cfg = composed("train", f"{group}={name}", *fitting)
+    cfg = composed(verb_with(group), f"{group}={name}", *fitting)
     with torch.device("meta"):
         model = GHGS.from_config(cfg)
     assert sum(p.numel() for p in model.parameters()) > 0
@@ -61,12 +61,12 @@ OUTSIDE_THE_MODEL = [
 @pytest.mark.parametrize(("group", "name"), OUTSIDE_THE_MODEL, ids=[f"{g}={n}" for g, n in OUTSIDE_THE_MODEL])
 def test_every_object_outside_the_model_is_built(group, name, tmp_path):
     """A shipped option with a misspelt argument would fail only for its first user."""
-    cfg = composed("train", f"{group}={name}")
+    cfg = composed(verb_with(group), f"{group}={name}")
     node = cfg.get(group)
     if node is None:
         return
     extra = {
-        "data": {"views": cfg.views, "targets": cfg.targets, "seed": 0, "root": str(tmp_path)},
+        "data": {"views": cfg.views, "targets": cfg.get("targets"), "seed": 0, "root": str(tmp_path)},
         "logger": {"save_dir": str(tmp_path)},
         # A Trainer for a GPU refuses to be made where there is none.
         "trainer": {"accelerator": "cpu"},

@@ -9,7 +9,7 @@ from ghgs_lit.config.describe import meanings, options_of
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, class_of
-from tests.helpers.configs import composed
+from tests.helpers.configs import composed, verb_with
 
 TYPED = [
     (group, kind)
@@ -22,7 +22,7 @@ TYPED = [
 def shipped(group):
     """The nodes of a group in everything that ships, as plain data."""
     files = sorted((conf_dir() / group).glob("*.yaml"))
-    configurations = [composed("train", f"{group}={path.stem}") for path in files]
+    configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
     configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent")]
     configurations += [composed("train", *over) for over in (["compat=release"], ["experiment=shipped"])]
     configurations += [compose(verb) for verb in VERBS]

@@ -13,7 +13,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_node, register
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from tests.helpers.configs import composed
+from tests.helpers.configs import composed, verb_with
 from tests.helpers.weights import config
 
 
@@ -55,7 +55,8 @@ def test_no_function_or_class_is_a_kind_by_its_path(group):
 @pytest.mark.parametrize("key", ["_target_", "_partial_", "_args_", "_convert_", "_recursive_"])
 def test_the_words_of_hydras_instantiate_mean_nothing(group, key, tmp_path):
     """At every node, and nested; what a file says is data."""
-    node = composed("train", "model=recurrent", "logger=wandb").get(group)
+    verb = verb_with(group)
+    node = composed(verb, *["model=recurrent", "logger=wandb"] * (verb == "train")).get(group)
     if group in NAMED:
         name = next(iter(node))
         node = node[name]

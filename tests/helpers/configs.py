@@ -13,3 +13,8 @@ def composed(verb: str, *overrides: str) -> DictConfig:
     found = compose(verb, overrides)
     OmegaConf.set_readonly(found, True)
     return found
+
+
+def verb_with(group: str) -> str:
+    """A verb that has a config group."""
+    return "predict" if group == "calibration" else "train"

@@ -14,25 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from ghgs_lit.errors import choice, require
-
-
-@dataclass(frozen=True)
-class PairedTest:
-    """What is tested.
-
-    Args:
-        against: the reference row: ``full``, that of the whole method where there is exactly one; ``best``,
-            the best of each column; ``none``: nothing is tested.
-        alpha: level of significance.
-    """
-
-    against: str = "full"
-    alpha: float = 0.05
-
-    def __post_init__(self) -> None:
-        choice("test.against", self.against, ("full", "best", "none"))
-        require(0 < self.alpha < 1, "test.alpha", "a number between 0 and 1", self.alpha)
+from ghgs_lit.config.verbs import PairedTest
 
 
 @dataclass(frozen=True)

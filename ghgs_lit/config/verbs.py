@@ -1,0 +1,448 @@
+"""The keys of each verb beside its groups: what ``conf/<verb>.yaml`` sets itself."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ghgs_lit.config.describe import Words
+from ghgs_lit.config.options import (
+    Count,
+    Index,
+    Options,
+    Path,
+    Positive,
+    Seed,
+    Share,
+    Side,
+    Size,
+    Text,
+    Workers,
+)
+
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["inherit", "float32", "bfloat16", "float16", "auto"]
+Views = Annotated[int, Field(ge=2)]
+Axis = Literal["y", "-y", "z"]
+Texts = Text | tuple[Text, ...]
+#: One entry of ``token_budgets``.
+Budget = Literal["all", "window"] | Index
+
+
+class Verb(Options):
+    """Keys of every verb."""
+
+    print_config: bool = False
+    """Print the whole configuration; config.yaml in the run's directory always has it."""
+
+
+class Measured(Verb):
+    """Keys of verbs that run a model."""
+
+    device: Device = "auto"
+    """auto: CUDA where there is one."""
+    precision: Precision = "inherit"
+    """Of the model's matrix products; inherit: of its weights and inputs."""
+    seed: Seed = 1
+    """Of the data's random choices and of random weights."""
+
+
+class Run(Verb):
+    """Keys of verbs that train."""
+
+    seed: Seed = 1
+    """Of weights, of samples and of their order."""
+    resume: Path | None = None
+    """A checkpoint to go on from."""
+    overwrite: bool = False
+    """Delete the run that is in the directory already."""
+
+
+class Train(Run):
+    """Train a model, then measure it."""
+
+    token_budgets: tuple[Budget, ...] | None = None
+    """What the encoder sees in a training step, drawn from this list: all, window (around the subject), or a
+    number (patches around the subject that stay). One checkpoint then serves all presets of skip."""
+    init_from: Path | None = None
+    """A checkpoint whose weights to start from."""
+    init_strict: bool = False
+    """Whether all weights of init_from must fit."""
+    allow_random_encoder: bool = False
+    """Whether an encoder that does not learn may be random, to try things out."""
+    dry_run: bool = False
+    """Print what would be run, how long it takes and where it goes, and run nothing."""
+
+
+class Calibration(Options):
+    """What the file of the cameras does not say, or says wrongly; null: as its format has it."""
+
+    group = "calibration"
+    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml"] = "auto"
+    """Format of the file."""
+    extrinsics: Literal["world_to_camera", "camera_to_world"] | None = None
+    """What the matrices map."""
+    axes: Literal["opencv", "opengl"] | None = None
+    """Axes of a camera."""
+    intrinsics: Literal["pixels", "normalized", "normalized_principal"] | None = None
+    """Unit of focal lengths and principal point; normalized: shares of width and height."""
+    pixel_centers: Literal["half", "integer"] | None = None
+    """Where the first pixel's centre lies: at 0.5 or at 0."""
+    resized: Positive | None = None
+    """By what the photographs were resized after the calibration."""
+    unit: Positive | None = None
+    """Metres of one unit of length."""
+    exif: Literal["auto", "stored", "shown"] = "auto"
+    """Which pixels of a turned photograph the calibration is for."""
+    names: Annotated[dict | None, Words("a mapping of photographs to cameras or null")] = None
+    """Camera of a photograph with another name: {photograph: camera}."""
+
+
+class Photographs(Options):
+    """Photographs of one's own and their cameras."""
+
+    images: Path | None = None
+    """Folder of photographs named after their cameras; of such folders: one for each instant."""
+    cameras: Path | None = None
+    """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of Pose2Sim."""
+    masks: Path | None = None
+    """Folder of masks; null: backgrounds, segment, <name>_mask.png, those of the calibration, or alpha."""
+    backgrounds: Path | None = None
+    """Folder of photographs without the subject."""
+    segment: Text | None = None
+    """rembg: masks by that package."""
+
+
+class Turntable(Options):
+    """Pictures around the subject."""
+
+    frames: int = Field(24, ge=0, le=2000)
+    """Number of pictures (0: none); more than 2000 fill a disk before anybody looks."""
+    fps: Count = 12
+    """Pictures per second of a video."""
+
+
+class Predict(Photographs, Measured):
+    """Photographs to a splat and to what else ``formats`` lists."""
+
+    checkpoint: Path | None = "shipped"
+    """The one that comes with the package, or a file of ``ghgs train`` or ``ghgs import``."""
+    check_cameras: bool = True
+    """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
+    size: Size | None = None
+    """Side or [height, width] of what the model sees, in pixels; null: as it was trained."""
+    refine_masks: int = Field(0, ge=0, le=64)
+    """Pixels of size that masks may be off by, such as 4: photographs say where outlines are; 0: none."""
+    refine_cameras: int = Field(0, ge=0, le=100)
+    """Rounds, at most, that correct the cameras until the photographs agree, such as 4; 0: none."""
+    refine: int = Field(0, ge=0, le=10000)
+    """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
+    out: Path | None = None
+    """Folder for the results; null: that of this run."""
+    subject: Text | Index = 0
+    """Without images: name of the subject, or its number in the split."""
+    split: Literal["train", "val"] = "val"
+    """Without images: where the subject is."""
+    formats: Texts = ("ply", "html", "turntable", "depth", "points", "inputs")
+    """What is written: ply, html, turntable, depth, points, inputs, splat; with the extra formats:
+    compressed_ply, spz, sog, glb; with the extra video: mp4; or all."""
+    up: Axis | None = None
+    """Axis that points up in all files; null: they are in the world of the cameras."""
+    smooth: bool = False
+    """Gaussians in files are as large as the photographs' pixels: no gaps on larger screens."""
+    turntable: Turntable = Turntable()
+    """Pictures around the subject."""
+
+
+class View(Predict):
+    """A page in the browser with Gaussians, cameras, photographs, point cloud and visual hull."""
+
+    path: Path | None = None
+    """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
+    checkpoint: Path | None = None
+    """Without path: a checkpoint, as for ``ghgs predict``."""
+    formats: Texts = ("ply", "inputs")
+    """What is written, as for ``ghgs predict``."""
+    host: Text = "127.0.0.1"
+    """Address to listen at: this machine only; 0.0.0.0 opens the page to the network."""
+    port: int = Field(8080, ge=0, le=65535)
+    """The next free one is taken where it is in use."""
+    seconds: Positive | None = None
+    """The page is closed after so long; null: never."""
+
+
+class Doctor(Photographs):
+    """Find out what is wrong."""
+
+    print_config: bool = False
+    """Print the whole configuration; config.yaml in the run's directory always has it."""
+    task: Literal["cameras", "machine", "selfcheck"] = "cameras"
+    """cameras: whether photographs, masks and calibration fit together, and what would fit. machine: what
+    there is, what is missing for which feature; operations and memory of a configuration, by stage.
+    selfcheck: whether ``device`` computes as the CPU does in float64: a table for a bug report."""
+    device: Device = "auto"
+    """Of task=machine and selfcheck."""
+    share: Share = 0.15
+    """Of task=machine and selfcheck: part of the frame that the subject covers."""
+    gpu_memory: Positive | None = None
+    """Of task=machine: GB of a GPU that is not here; null: what is free on ``device``."""
+    seed: Seed = 1
+    """Of random weights."""
+    token_budgets: tuple[Budget, ...] | None = None
+    """As for ``ghgs train``."""
+
+
+class PerScene(Options):
+    """3D Gaussian splatting on each subject's inputs."""
+
+    steps: Count = 200
+    """Steps of optimisation."""
+    start: Literal["photo_depth", "hull"] = "photo_depth"
+    """Where it starts."""
+
+
+class Evaluate(Measured):
+    """Measure a checkpoint, baselines, or both on the same targets."""
+
+    checkpoint: Path | None = None
+    """A checkpoint; null: baselines alone."""
+    refine_cameras: int = Field(0, ge=0, le=100)
+    """Rounds, at most, that correct the inputs' cameras before each prediction; 0: none."""
+    refine: int = Field(0, ge=0, le=10000)
+    """Steps of optimisation towards the inputs after each prediction; 0: none."""
+    baselines: Texts = ()
+    """Of black, nearest_view, body_depth, hull, photo_depth, true_depth, per_scene, untrained; or all."""
+    per_scene: PerScene = PerScene()
+    """3D Gaussian splatting on each subject's inputs."""
+
+
+class Peers(Options):
+    """The methods beside the model with task=peers."""
+
+    baselines: Texts = ("nearest_view", "hull", "photo_depth", "per_scene", "true_depth")
+    """Names as in ``ghgs evaluate baselines=``."""
+    views: tuple[Views, ...] = (3, 4, 5)
+    """Numbers of input views."""
+    targets: tuple[Text, ...] = ("release", "midway")
+    """Names of files of conf/targets."""
+
+
+class Timing(Options):
+    """How times are taken."""
+
+    warmup: Index = 1
+    """Rounds that do not count."""
+    repeats: Count = 9
+    """Rounds that count; each runs all presets, and each begins with another one."""
+    count_flops: bool = True
+    """False: one forward pass less for each batch and preset."""
+
+
+class Base(Options):
+    """Where the other axes stay."""
+
+    share: Share = 0.15
+    """Part of the frame that the subject covers."""
+    views: Views = 4
+    """Number of input views."""
+    size: Side = 140
+    """Side of the photographs, pixels."""
+    batch: Count = 1
+    """Elements of a batch."""
+
+
+class Scaling(Options):
+    """How cost grows: one axis is changed at a time; an empty list leaves it out."""
+
+    share: tuple[Share, ...] = (0.05, 0.1, 0.2, 0.4, 0.6)
+    """Parts of the frame that the subject covers."""
+    views: tuple[Views, ...] = (2, 3, 4, 6, 8)
+    """Numbers of input views."""
+    size: tuple[Side, ...] = (140, 280, 518, 1022)
+    """Sides of the photographs in pixels; multiples of the encoder's patch."""
+    batch: tuple[Count, ...] = (1, 2, 4)
+    """Numbers of elements of a batch."""
+    threads: tuple[Count, ...] = (1, 2)
+    """Threads of PyTorch."""
+    base: Base = Base()
+    """Where the other axes stay."""
+
+
+class Benchmark(Measured):
+    """Run time against error."""
+
+    task: Literal["presets", "peers", "scaling"] = "presets"
+    """presets: every preset of conf/skip. peers: the model beside other methods. scaling: how cost grows."""
+    checkpoint: Path | None = None
+    """null: random weights, of which only run times and differences mean something; with task=peers those
+    that come with the package."""
+    vs: Path | None = None
+    """A second checkpoint, measured in the same rounds."""
+    presets: tuple[Text, ...] = ("none", "exact", "balanced", "fast")
+    """Names of files of conf/skip; task=presets always measures none, too, which the others are compared
+    with."""
+    knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
+    """Lists of values by key, such as {recalibration.k: [4, 8]}: each preset is measured with every
+    combination."""
+    split: Literal["train", "val", "bench"] = "val"
+    """bench: frozen people of data=synthetic."""
+    subjects: Count | None = 4
+    """Number of subjects, the first of the split; null: all."""
+    peers: Peers = Peers()
+    """The methods beside the model with task=peers."""
+    per_scene: PerScene = PerScene()
+    """3D Gaussian splatting on each subject's inputs."""
+    timing: Timing = Timing()
+    """How times are taken."""
+    scaling: Scaling = Scaling()
+    """How cost grows."""
+    threads: Count | None = None
+    """Threads of PyTorch; null: as many as it chooses."""
+
+
+class Export(Verb):
+    """A checkpoint to published names, or to a small one for prediction."""
+
+    checkpoint: Path
+    """A checkpoint of ``ghgs train`` or ``ghgs import``."""
+    vggt: Path | None = None
+    """File for the encoder, .safetensors or .pt; null: not written."""
+    release: Path | None = None
+    """File for all other stages, .pth; null: not written."""
+    inference: Path | None = None
+    """File with weights and configuration alone, a checkpoint for ``ghgs predict``; null: not written."""
+    dtype: Literal["float16", "bfloat16", "float32"] = "float16"
+    """Of the weights in it."""
+
+
+class Import(Verb):
+    """Published weights to a checkpoint; the groups describe the model that takes them."""
+
+    vggt: Path | None = None
+    """facebook/VGGT-1B, or its file (.safetensors or .pt)."""
+    release: Path | None = None
+    """The authors' checkpoint; null: heads start afresh."""
+    out: Path
+    """File of the checkpoint."""
+    depth_head_start: Literal["fresh", "vggt"] = "fresh"
+    """vggt: VGGT's depth head but its last projection (where there is no release)."""
+    dtype: Literal["float32", "bfloat16", "float16"] = "float32"
+    """Of the encoder in the checkpoint; the heads are float32."""
+    seed: Seed = 1
+    """Of random weights."""
+
+
+class Miniature(Options):
+    """A small data set of built-in people in the published layout of data=..."""
+
+    people: dict[str, Index] = Field({"train": 4, "val": 2})
+    """Number of people of each phase."""
+    size: Side = 256
+    """Longer side of the photographs, pixels."""
+
+
+class Check(Options):
+    """What task=check expects of data."""
+
+    min_iou: Share = 0.5
+    """Least IoU of a body's silhouette and its mask; below it a camera counts as wrong."""
+    min_agreement: Share = 0.9
+    """Without bodies: least share of a mask that the subject's other masks and cameras allow."""
+
+
+class Prepare(Verb):
+    """Make data, or check it."""
+
+    task: Literal["render", "miniature", "check"] = "render"
+    """render: render what is missing. check: read every photograph and camera once, with tables and a
+    contact sheet. miniature: write a small data set of built-in people in the published layout."""
+    miniature: Miniature = Miniature()
+    """A small data set of built-in people."""
+    check: Check = Check()
+    """What task=check expects of data."""
+    seed: Seed = 0
+    """Of miniatures, and of the samples that task=check draws."""
+
+
+class Stress(Verb):
+    """Every stage on adversarial inputs, against float64, forward and backward."""
+
+    quick: bool = False
+    """Some thousand cases within a minute."""
+    stages: tuple[Text, ...] | None = None
+    """Names of stages, as a run prints them; null: all."""
+    families: tuple[Text, ...] | None = None
+    """Names of families of inputs, as stress.md lists them; null: all."""
+    dtypes: tuple[Literal["float64", "float32", "bfloat16", "float16"], ...] | None = None
+    """null: all."""
+    dump: Path | None = None
+    """A training step that was not finite, <run>/faults/step_<n>.pt: run it again, and nothing else."""
+    workers: Workers | None = None
+    """Processes; null: one for each processor, 0: this one."""
+
+
+class PairedTest(Options):
+    """The test between rows, over seeds and subjects together."""
+
+    against: Literal["full", "best", "none"] = "full"
+    """full: the row of the whole method | best: the best row of each column | none: no test."""
+    alpha: float = Field(0.05, gt=0, lt=1)
+    """Significance level."""
+    unit: Text | None = None
+    """Where subjects are frames of people: a regular expression whose group is the person's name."""
+
+
+class Table(Verb):
+    """The runs below a directory as one of the paper's tables."""
+
+    runs: Annotated[
+        Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")
+    ]
+    """The directory of a sweep, or a list of directories; sweep=... is the same key."""
+    list: bool = False
+    """No table, but all runs with their state, their best figure and their overrides."""
+    layout: Text = "ablation"
+    """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF methods |
+    table4: the paper's ablation."""
+    columns: Texts | None = None
+    """Metrics, such as [psnr_box, ssim_box]; null: psnr, ssim, lpips (flip where a run has no lpips)."""
+    by: Texts = ()
+    """Configuration keys whose values get rows of their own, such as [optimizer.lr]."""
+    others: Texts = ()
+    """JSON files with results of other methods (docs/tables.md), for table1, table2 and table3."""
+    reported: bool = True
+    """Also print the paper's own numbers (not with layout=ablation)."""
+    test: PairedTest = PairedTest()
+    """The test between rows."""
+    illustration: bool = False
+    """Add a line: this table illustrates the framework and is not a result."""
+
+
+class EvaluationOptions(Options):
+    """Every number of views with every target protocol, after training and in ``ghgs evaluate``."""
+
+    group = "evaluation"
+    views: Views | tuple[Views, ...] | None = None
+    """Numbers of input views (the paper's: 3, 4 and 5); of tables, null: those of the layout."""
+    targets: Texts | None = ("release", "midway")
+    """Names of files in conf/targets, each with its own values (the paper's: release). The one that targets=
+    selects has the values of this configuration. Of tables, null: all that were measured."""
+    split: Text = "val"
+    """val: unseen in training | train | bench: frozen people of data=synthetic."""
+    pictures: Index = 4
+    """Number of subjects of each protocol that are drawn into pictures/."""
+
+
+VERBS: dict[str, type[Options]] = {
+    "benchmark": Benchmark,
+    "doctor": Doctor,
+    "evaluate": Evaluate,
+    "export": Export,
+    "import": Import,
+    "predict": Predict,
+    "prepare": Prepare,
+    "pretext": Run,
+    "stress": Stress,
+    "table": Table,
+    "train": Train,
+    "view": View,
+}

@@ -1,0 +1,76 @@
+"""The keys of a verb: its YAML and its options say the same, and wrong values are named."""
+
+import pytest
+
+from ghgs_lit.cli.main import VERBS as DESCRIBED
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.config.compose import is_group
+from ghgs_lit.config.describe import meanings, options_of
+from ghgs_lit.config.verbs import VERBS
+from ghgs_lit.errors import InputError
+
+#: What the user must say.
+GIVEN = {"export": ["checkpoint=a.ckpt"], "import": ["out=b.ckpt"], "table": ["runs=c"]}
+
+
+def every_class(cls):
+    yield cls
+    for field in cls.model_fields.values():
+        if (nested := options_of(field.annotation)) is not None:
+            yield from every_class(nested)
+
+
+def test_every_verb_has_options():
+    assert set(VERBS) == set(DESCRIBED)
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_yaml_and_options_of_a_verb_agree(verb):
+    """A default in two places that differ would be wrong in one of them."""
+    data = resolve(compose(verb, GIVEN.get(verb, [])), verb)
+    options = VERBS[verb]
+    own = {name: value for name, value in data.items() if not is_group(name)}
+    assert set(own) == set(options.model_fields)
+    read = options.read(own, "")
+    for name, field in options.model_fields.items():
+        if name not in {text.split("=")[0] for text in GIVEN.get(verb, [])}:
+            assert getattr(read, name) == field.get_default(call_default_factory=True), name
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_every_key_of_a_verb_has_a_meaning(verb):
+    """``--help`` shows it."""
+    for cls in every_class(VERBS[verb]):
+        assert set(cls.model_fields) <= set(meanings(cls)), cls
+
+
+@pytest.mark.parametrize(
+    ("verb", "override", "message"),
+    [
+        ("train", "seed=true", "seed: expected an integer >= 0 and <= 4294967295; found True"),
+        ("train", f"seed={10**400}", "seed: expected an integer >= 0 and <= 4294967295; found 1000"),
+        ("train", "seed=-1", "seed: expected an integer >= 0 and <= 4294967295; found -1"),
+        ("train", "seed=null", "seed: expected an integer >= 0 and <= 4294967295; found None"),
+        ("train", "+sed=3", "sed: expected one of allow_random_encoder"),
+        (
+            "train",
+            "token_budgets=[some]",
+            "token_budgets: expected a list (each one of all, window or an integer",
+        ),
+        ("predict", "size=9000", "size: expected an integer >= 1 and <= 8192 or a list of 2 values"),
+        ("predict", "refine=1e9", "refine: expected an integer >= 0 and <= 10000; found 1000000000.0"),
+        ("predict", "turntable.frames=1000000", "turntable.frames: expected an integer >= 0 and <= 2000"),
+        ("predict", "device=tpu", "device: expected one of auto, cpu, cuda; found 'tpu'"),
+        ("predict", "calibration.format=x", "calibration.format: expected one of auto, ghgs"),
+        ("predict", "calibration.unit=0", "calibration.unit: expected a number > 0 or null; found 0"),
+        ("view", "port=70000", "port: expected an integer >= 0 and <= 65535; found 70000"),
+        ("evaluate", "evaluation.views=[1]", "evaluation.views: expected an integer >= 2 or a list"),
+        ("benchmark", "timing.repeats=0", "timing.repeats: expected an integer >= 1; found 0"),
+        ("table", "runs=[]", "runs: expected a text or a list of paths; found []"),
+    ],
+)
+def test_a_wrong_value_is_named(verb, override, message):
+    overrides = [text for text in GIVEN.get(verb, []) if text.split("=")[0] != override.split("=")[0]]
+    with pytest.raises(InputError) as caught:
+        resolve(compose(verb, [*overrides, override]), verb)
+    assert message in str(caught.value)
