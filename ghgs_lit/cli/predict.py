@@ -26,7 +26,7 @@ from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.prediction.capture.doctor import diagnose
+from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.predict import predict, trained_size
 from ghgs_lit.prediction.export import output_options, write_prediction
 from ghgs_lit.prediction.export.video import write_mp4
