@@ -19,7 +19,7 @@ from ghgs_lit.prediction.capture.calibration import (
     calibrate,
     quarter_turned,
 )
-from ghgs_lit.prediction.capture.capture import Capture, Photograph
+from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
@@ -36,7 +36,7 @@ _CONVENTION = tuple(f.name for f in fields(Convention))
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """``folder.read(instant) -> Capture`` for each of ``folder.instants``.
+    """``folder.photographs(instant)`` for each of ``folder.instants``.
 
     Args:
         images: folder of photographs named after their cameras; or of such folders, one for each instant.
@@ -67,9 +67,9 @@ class CaptureFolder:
         choice("calibration.exif", self._said("exif", "auto"), EXIF)
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
-            there = path is None or Path(path).expanduser().is_dir()
-            require(there, name, "a folder", str(path))
-        _ = self.paths  # what is missing is missed here
+            is_folder = path is None or Path(path).expanduser().is_dir()
+            require(is_folder, name, "a folder", str(path))
+        _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
 
     def _said(self, key: str, default: Any) -> Any:
         value = self.calibration.get(key)
@@ -97,26 +97,26 @@ class CaptureFolder:
         """Names of the instants, in their order."""
         return list(self.paths)
 
-    def read(self, instant: str) -> Capture:
-        """The photographs of one instant.
+    def photographs(self, instant: str) -> tuple[Photograph, ...]:
+        """The photographs of one instant, two or more.
 
         Raises:
             InputError: a photograph or mask is missing or wrong.
         """
         views = zip(self.paths[instant], self.decode(instant), strict=True)
-        return Capture(instant, tuple(self.photograph(name, *view, self.convention) for name, view in views))
+        return tuple(self.photograph(name, *view, self.convention) for name, view in views)
 
     def decode(self, instant: str) -> list[tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied."""
-        found = []
+        views = []
         for name, path in self.paths[instant].items():
             camera, pixels = self.file.cameras[name], read_pixels(path)
             matte = self._matte(name, camera, path, pixels)
             problem = implausible(matte > 127)
             if problem is not None:
                 raise InputError(f"{path}: {problem}")
-            found.append((camera, pixels, matte))
-        return found
+            views.append((camera, pixels, matte))
+        return views
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
@@ -138,9 +138,9 @@ class CaptureFolder:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
         images = Path(self.images).expanduser()
         if self.masks is not None:
-            found = mask_path(path, images, Path(self.masks).expanduser())
-            require(found is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
-            return matte_of_file(found, pixels)
+            mask = mask_path(path, images, Path(self.masks).expanduser())
+            require(mask is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
+            return matte_of_file(mask, pixels)
         if self.backgrounds is not None:
             background = image_named(Path(self.backgrounds).expanduser(), name)
             expected = f"a photograph {name} without the subject"
