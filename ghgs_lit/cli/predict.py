@@ -25,13 +25,14 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_atomically
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.predict import TimedPrediction, predict, predict_batch, trained_size
 from ghgs_lit.prediction.export import OutputOptions, output_options, write_prediction
-from ghgs_lit.prediction.export.video import write_mp4
+from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.prediction.refinement import Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians
@@ -120,7 +121,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
     if pictures:
-        write_mp4(pictures, directory / "instants.mp4", options.fps)
+        video = mp4_bytes(pictures, options.fps)
+        write_atomically(directory / "instants.mp4", lambda temporary: temporary.write_bytes(video))
     if several:
         count, total = len(folder.instants), time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())

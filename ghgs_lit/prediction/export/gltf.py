@@ -4,13 +4,10 @@ The vertices are in the world of the files; glTF's up is +y, so a node turns the
 without the extension show coloured points.
 """
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
 from ghgs_lit.errors import require
-from ghgs_lit.files import write_atomically
 from ghgs_lit.prediction.export.ply import SH_CONSTANT
 from ghgs_lit.prediction.export.world import AXES, turn
 from ghgs_lit.types import Gaussians
@@ -24,13 +21,12 @@ _KERNEL = {
 }
 
 
-def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
-    """Write the Gaussians of one subject (RGB colours).
+def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
+    """The content of a file of the Gaussians of one subject (RGB colours).
 
     Args:
         gaussians: in the world of the files.
         up: the unit vector [3] of that world that points up.
-        path: the file to write.
 
     Raises:
         InputError: there are none: glTF has no empty lists.
@@ -79,5 +75,4 @@ def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
     )
     model.extensionsUsed, model.buffers = [EXTENSION], [gltf.Buffer(byteLength=len(blob))]
     model.set_binary_blob(blob)
-    content = b"".join(model.save_to_bytes())
-    write_atomically(path, lambda temporary: temporary.write_bytes(content))
+    return b"".join(model.save_to_bytes())

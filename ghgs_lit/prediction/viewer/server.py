@@ -10,7 +10,7 @@ import numpy as np
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.prediction.export.scene import smoothed
+from ghgs_lit.prediction.export.subject import smoothed
 from ghgs_lit.prediction.viewer.content import Content
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import pixel_size

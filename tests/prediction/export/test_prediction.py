@@ -180,7 +180,7 @@ def test_options_are_read():
 
 
 def test_a_missing_package_is_named_before_any_work(monkeypatch):
-    monkeypatch.setattr("ghgs_lit.prediction.export.scene.find_spec", lambda name: None)
+    monkeypatch.setattr("ghgs_lit.prediction.export.prediction.find_spec", lambda name: None)
     with pytest.raises(
         InputError, match=r"gaussforge for spz \(pip install 'ghgs-lit\[formats\]'\); found none"
     ):

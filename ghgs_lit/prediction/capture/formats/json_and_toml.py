@@ -12,6 +12,7 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, by_name
 from ghgs_lit.prediction.capture.formats.fields import OPENCV, camera_from_fields, is_camera, size_from_fields
+from ghgs_lit.prediction.export.maps import camera_entry, cameras_json
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
@@ -84,15 +85,9 @@ def _own(name: str, place: str, camera: Mapping[str, Any]) -> StoredCamera:
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
     """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
-    content = {
-        name: {
-            "intrinsics": camera.intrinsics.tolist(),
-            "extrinsics": camera.extrinsics.tolist(),
-            "width": size[1],
-            "height": size[0],
-            "distortion": camera.distortion.tolist(),
-            "fisheye": camera.fisheye,
-        }
+    entries = {
+        name: camera_entry(camera.intrinsics, camera.extrinsics, size)
+        | {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
         for name, (camera, size) in cameras.items()
     }
-    write_text_atomically(path, json.dumps({"cameras": content}, indent=1) + "\n")
+    write_text_atomically(path, cameras_json(entries) + "\n")

@@ -1,18 +1,15 @@
-"""What is written of one subject: its prediction, photographs and cameras, in the frame of the files."""
+"""One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
@@ -21,22 +18,13 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import pixel_size, turntable, up_direction
 
-#: The package that a format needs, and the extra that installs it.
-PACKAGES = {
-    "compressed_ply": ("gaussforge", "formats"),
-    "spz": ("gaussforge", "formats"),
-    "sog": ("gaussforge", "formats"),
-    "glb": ("pygltflib", "formats"),
-    "mp4": ("imageio_ffmpeg", "video"),
-}
-
 
 @dataclass(frozen=True)
 class OutputOptions:
     """What is written, and how.
 
     Args:
-        formats: names of :data:`ghgs_lit.prediction.export.prediction.WRITERS`.
+        formats: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`.
         up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
         smooth: the files of Gaussians hold what a renderer adds in pixels of the photographs.
         frames: pictures of the turntable.
@@ -72,7 +60,7 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
 
 
 @dataclass(frozen=True)
-class Scene:
+class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
 
     ``images`` are premultiplied by ``mattes``, which are the masks where there are none.
@@ -95,6 +83,11 @@ class Scene:
     up: Float[Tensor, "3"]
     renderer: Renderer
     options: OutputOptions
+
+    @property
+    def file_names(self) -> list[str]:
+        """The names of the views as parts of the names of files."""
+        return [file_name(view) for view in self.views]
 
     @cached_property
     def stored(self) -> Gaussians:
@@ -119,8 +112,10 @@ class Scene:
         return [to_uint8(image) for image in images]
 
 
-def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions) -> Scene:
-    """The scene of a batch of one subject.
+def exported_subject(
+    batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
+) -> ExportedSubject:
+    """The subject of a batch of one, in the frame that ``options`` choose.
 
     Raises:
         InputError: several subjects.
@@ -139,7 +134,7 @@ def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: 
         up = end
     depth, valid = prediction.depth[0].detach(), prediction.depth_valid[0] & batch.masks[0]
     valid = valid & depth.isfinite() & (depth > 0)
-    return Scene(
+    return ExportedSubject(
         name=batch.subjects[0] if batch.subjects else "subject",
         views=batch.views[0] if batch.views else tuple(map(str, range(batch.images.shape[1]))),
         gaussians=gaussians,
@@ -161,28 +156,3 @@ def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: 
 def file_name(view: str) -> str:
     """The name of a photograph as a part of a file's name."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
-
-
-def options_of(config: Mapping[str, Any], known: tuple[str, ...]) -> OutputOptions:
-    """The options of a verb's configuration: ``formats``, ``up`` and ``turntable``.
-
-    Args:
-        config: plain data.
-        known: the formats that there are; ``all`` stands for them.
-
-    Raises:
-        InputError: an unknown format, a value out of range, or a package that is not installed.
-    """
-    formats = config["formats"]
-    formats = [formats] if isinstance(formats, str) else formats
-    formats = known if "all" in formats else tuple(dict.fromkeys(formats))
-    for name in formats:
-        choice("formats", name, ("all", *known))
-        package, extra = PACKAGES.get(name, (None, None))
-        if package is not None and find_spec(package) is None:
-            hint = f"pip install 'ghgs-lit[{extra}]'"
-            raise InputError(f"formats: expected the package {package} for {name} ({hint}); found none")
-    table = config["turntable"]
-    frames = table["frames"]
-    require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
-    return OutputOptions(formats, config["up"], config["smooth"], frames, table["fps"])
