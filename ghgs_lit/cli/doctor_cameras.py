@@ -6,7 +6,7 @@ from rich.table import Table
 
 from ghgs_lit.cli.photographs import capture_folder
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.camera_report import Diagnosis, Hypothesis, diagnose
 from ghgs_lit.prediction.capture.drawing import camera_sheet
@@ -26,6 +26,11 @@ def run(cfg: DictConfig) -> None:
     """
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
+    inputs = {path.resolve() for path in folder.input_files}
+    for path in (directory / "cameras.png", directory / "cameras.json"):
+        require(
+            path.resolve() not in inputs, str(path), "a folder (hydra.run.dir) without inputs", "an input"
+        )
     diagnosis = diagnose(folder)
     _show(diagnosis)
     best = diagnosis.ranking[0]

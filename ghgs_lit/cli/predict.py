@@ -31,7 +31,13 @@ from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.predict import TimedPrediction, predict, predict_batch, trained_size
-from ghgs_lit.prediction.export import OutputOptions, output_options, write_prediction
+from ghgs_lit.prediction.export import (
+    OutputOptions,
+    output_files,
+    output_options,
+    require_free,
+    write_prediction,
+)
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.prediction.refinement import Refinement
 from ghgs_lit.rendering import Renderer
@@ -95,6 +101,10 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     """Predict each instant of a folder of photographs; several get a folder each, and one video."""
     folder, options = capture_folder(config), output_options(config)
+    several, inputs = len(folder.instants) > 1, folder.input_files
+    directories = {name: directory / name if several else directory for name in folder.instants}
+    for name, path in directories.items():
+        require_free(path, output_files(options, list(folder.paths[name])), inputs)
     if config["check_cameras"]:
         diagnosis = diagnose(folder)
         require_consistent(diagnosis)
@@ -106,15 +116,13 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     expected = f"sides divisible by the patch size {multiple}"
     require(not any(side % multiple for side in size), "size", expected, size)
     totals: dict[str, float] = {}
-    several = len(folder.instants) > 1
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
     begin = time.perf_counter()
     for capture, waited in captures_of(folder):
         result = predict(capture, model, size, config["refine_cameras"], config["refine_masks"])
         result.seconds["read"] = waited
-        place = directory / capture.name if several else directory
-        gaussians, seconds = write_result(place, result, model, renderer, config, options)
+        gaussians, seconds = write_result(directories[capture.name], result, model, renderer, config, options)
         if several and "mp4" in options.formats:
             camera = camera or fixed_camera(capture).to(device)
             pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))

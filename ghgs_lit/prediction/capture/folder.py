@@ -97,6 +97,16 @@ class CaptureFolder:
         """Names of the instants, in their order."""
         return list(self.paths)
 
+    @property
+    def input_files(self) -> list[Path]:
+        """The files that may be read, such as photographs with what lies beside them, and the calibration."""
+        photographs = (path for paths in self.paths.values() for path in paths.values())
+        folders = {path.parent for path in photographs}
+        given = (self.cameras, self.masks, self.backgrounds)
+        given = [Path(path).expanduser() for path in given if path is not None]
+        files = [path for folder in folders for path in folder.iterdir()]
+        return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
+
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
         """The photographs of one instant, two or more.
 

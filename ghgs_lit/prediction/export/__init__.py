@@ -1,6 +1,12 @@
 """Predictions as files for other programs: one table of formats, one function that writes all."""
 
-from ghgs_lit.prediction.export.prediction import FORMATS, output_options, write_prediction
+from ghgs_lit.prediction.export.prediction import (
+    FORMATS,
+    output_files,
+    output_options,
+    require_free,
+    write_prediction,
+)
 from ghgs_lit.prediction.export.subject import OutputOptions
 
-__all__ = ["FORMATS", "OutputOptions", "output_options", "write_prediction"]
+__all__ = ["FORMATS", "OutputOptions", "output_files", "output_options", "require_free", "write_prediction"]

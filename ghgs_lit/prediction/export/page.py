@@ -10,13 +10,14 @@ from importlib.resources import files
 
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.prediction.export.compact import to_records
 from ghgs_lit.types import Cameras, Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
 
 
-def page(gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tensor, name: str) -> str:
+def page(
+    gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tensor, center: Tensor, name: str
+) -> str:
     """The text of the page, which begins at the first camera, and has a button for each.
 
     Args:
@@ -24,13 +25,14 @@ def page(gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tenso
         cameras: of the photographs [V].
         views: their names.
         up: the unit vector [3] that points up.
+        center: the point [3] that it turns about.
         name: of the subject, for the title.
     """
     scene = {
         "size": [cameras.width, cameras.height],
         "up": up.tolist(),
-        "target": look_at_point(cameras).tolist(),
-        "pixel": pixel_size(cameras),
+        "target": center.tolist(),
+        "pixel": pixel_size(cameras, center),
         "low_pass": gaussians.low_pass,
         "antialiased": gaussians.antialiased,
         "cameras": [

@@ -1,9 +1,11 @@
 """Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
 
 Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit quaternions
-``(w, x, y, z)``, colour as the constant term of spherical harmonics.
+``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment of the header has the
+constants of the image that the Gaussians were made for; other programs ignore it.
 """
 
+import re
 from io import BytesIO
 from pathlib import Path
 
@@ -17,6 +19,8 @@ from ghgs_lit.types import Gaussians
 
 SH_CONSTANT = 0.5 / np.sqrt(np.pi)
 """Value of the constant spherical harmonic: colour = 0.5 + SH_CONSTANT * f_dc."""
+_CONSTANTS = "ghgs_lit low_pass={low_pass!r} antialiased={antialiased}"
+_CONSTANTS_PATTERN = re.compile(r"ghgs_lit low_pass=(\S+) antialiased=(True|False)")
 _OPACITY_LIMIT = 1e-6  # a logit of exactly 0 or 1 is infinite
 _SMALLEST_SCALE = 1e-9  # metres
 _GROUPS = {
@@ -61,23 +65,31 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
         for column, name in enumerate(names):
             vertices[name] = values[group][:, column].numpy()
     content = BytesIO()
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
+    constants = _CONSTANTS.format(low_pass=float(gaussians.low_pass), antialiased=bool(gaussians.antialiased))
+    elements = [PlyElement.describe(vertices, "vertex")]
+    PlyData(elements, byte_order="<", comments=[constants]).write(content)
     return content.getvalue()
 
 
 def read_ply(path: Path) -> Gaussians:
     """Read such a file as the Gaussians of one subject, without colours that depend on the direction.
 
+    A file without this package's comment is taken for one that was made for 3D Gaussian Splatting's own
+    renderer: a low-pass of 0.3 px^2, not antialiased.
+
     Raises:
         InputError: not such a file.
     """
     try:
-        vertices = PlyData.read(path)["vertex"]
+        content = PlyData.read(path)
+        vertices = content["vertex"]
         columns = {
             group: torch.from_numpy(np.stack([np.asarray(vertices[n], np.float32) for n in names], -1))
             for group, names in _GROUPS.items()
             if group != "normals"
         }
+        matches = filter(None, map(_CONSTANTS_PATTERN.fullmatch, content.comments))
+        constants = [{"low_pass": float(m[1]), "antialiased": m[2] == "True"} for m in matches]
     except (PlyParseError, KeyError, ValueError) as error:
         raise InputError(f"{path}: expected a 3D Gaussian Splatting PLY; found {error}") from error
     return Gaussians(
@@ -87,4 +99,5 @@ def read_ply(path: Path) -> Gaussians:
         opacities=columns["opacities"][:, 0].sigmoid(),
         colors=columns["colors"] * SH_CONSTANT + 0.5,
         splits=(len(columns["means"]),),
+        **(constants[0] if constants else {}),
     )

@@ -66,19 +66,22 @@ def _converted(name: str) -> Format:
 
 
 def _contents_of_converted(subject: ExportedSubject, name: str) -> Iterable[bytes]:
-    return [converted(ply_bytes(subject.stored), name)]
+    return [converted(ply_bytes(subject.for_other_renderers), name)]
 
 
 def _html(subject: ExportedSubject) -> Iterable[bytes]:
-    text = page(subject.gaussians, subject.cameras, subject.views, subject.up, subject.name)
+    text = page(subject.gaussians, subject.cameras, subject.views, subject.up, subject.center, subject.name)
     return [text.encode()]
 
+
+#: The file that lists the others.
+REPORT = "report.json"
 
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), lambda s: [ply_bytes(s.stored)]),
     **{name: _converted(name) for name in CONVERTED},
-    "splat": Format(("gaussians.splat",), lambda s: [to_records(s.stored).tobytes()]),
-    "glb": Format(("gaussians.glb",), lambda s: [glb_bytes(s.stored, s.up)], "pygltflib"),
+    "splat": Format(("gaussians.splat",), lambda s: [to_records(s.for_other_renderers).tobytes()]),
+    "glb": Format(("gaussians.glb",), lambda s: [glb_bytes(s.for_other_renderers, s.up)], "pygltflib"),
     "html": Format(("viewer.html",), _html),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: map(png, s.turntable)),
     "mp4": Format(
@@ -114,6 +117,51 @@ def output_options(config: Mapping[str, Any]) -> OutputOptions:
     return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])
 
 
+def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
+    """The names below the directory of all files that :func:`write_prediction` writes of these views."""
+    names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
+    return [*names, "sheet.png", REPORT]
+
+
+def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
+    """Refuse to replace an input, or a file that :func:`write_prediction` did not write.
+
+    Args:
+        directory: of the outputs.
+        names: of these, below it.
+        inputs: files that are read.
+
+    Raises:
+        InputError: names the first such file.
+    """
+    read = {path.resolve() for path in inputs}
+    written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
+    for name in names:
+        path = directory / name
+        if path.resolve() in read:
+            raise InputError(
+                f"{path}: expected another folder (out=...) than that of an input; found the input"
+            )
+        if path.exists() and name not in written:
+            expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
+            raise InputError(f"{path}: expected {expected}; found another file")
+
+
+def _report_before(directory: Path) -> dict[str, Any]:
+    """The report of an earlier prediction in a directory; empty where there is none."""
+    try:
+        report = json.loads((directory / REPORT).read_text())
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) and isinstance(report.get("files"), dict) else {}
+
+
+def _written_before(directory: Path) -> list[str]:
+    """The files that earlier predictions wrote into a directory."""
+    report = _report_before(directory)
+    return [*report.get("files", ()), *report.get("earlier_files", ())]
+
+
 @torch.no_grad()
 def write_prediction(
     directory: Path,
@@ -128,7 +176,7 @@ def write_prediction(
     Lengths in the files are in the unit of the batch's cameras.
 
     Args:
-        directory: files of these names are replaced, others stay.
+        directory: files that an earlier prediction wrote are replaced, others stay.
         batch: photographs, masks and cameras of the subject; the sheet compares renders with targets, too.
         prediction: of this batch.
         renderer: draws the turntable, and the input views for the report.
@@ -139,9 +187,15 @@ def write_prediction(
         What was written, ``report.json`` last.
 
     Raises:
-        InputError: several subjects.
+        InputError: several subjects, or a file of another origin is in the way.
     """
     subject = exported_subject(batch, prediction, renderer, options)
+    names = output_files(options, subject.views)
+    require_free(directory, names)
+    earlier = [n for n in _written_before(directory) if n not in names and (directory / n).exists()]
+    # Before the files: those of a run that is cut off are known as ours, too.
+    known = {"files": dict.fromkeys(names[:-1]), "earlier_files": earlier}
+    write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
     paths, seconds = [], {}
 
     def write(name: str, content: bytes) -> None:
@@ -159,7 +213,9 @@ def write_prediction(
     facts = dict(facts or {})
     report = {**_report(subject), **facts, "seconds": {**facts.get("seconds", {}), **seconds}}
     report["files"] = {str(path.relative_to(directory)): path.stat().st_size for path in paths}
-    path = directory / "report.json"
+    if earlier:
+        report["earlier_files"] = earlier
+    path = directory / REPORT
     write_text_atomically(path, json.dumps(plain(report), indent=1, allow_nan=False))
     return [*paths, path]
 

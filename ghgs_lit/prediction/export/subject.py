@@ -16,7 +16,18 @@ from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
-from ghgs_lit.visualization.turntable import pixel_size, turntable, up_direction
+from ghgs_lit.visualization.turntable import (
+    center_of,
+    pixel_size,
+    subject_points,
+    turntable,
+    up_direction,
+)
+
+#: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
+VIEWER_LOW_PASS = 0.3
+#: The least standard deviation of a Gaussian in pixels.
+_SMALLEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -59,6 +70,21 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
     )
 
 
+def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
+    """Gaussians that 3D Gaussian Splatting's own renderer draws as ours draws the given ones.
+
+    It adds 0.3 px^2 whatever Gaussians were made for, and takes no opacity for it. Variances lose what it
+    adds too much at the photographs' size, whose pixels are ``pixel`` metres wide; Gaussians that ours draws
+    smaller than 0.3 px^2 become points.
+    """
+    if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
+        return gaussians
+    drawn = smoothed(gaussians, pixel)
+    variances = drawn.scales.square() - VIEWER_LOW_PASS * pixel**2
+    scales = variances.clamp(min=(_SMALLEST * pixel) ** 2).sqrt()
+    return dataclasses.replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
+
+
 @dataclass(frozen=True)
 class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
@@ -91,7 +117,7 @@ class ExportedSubject:
 
     @cached_property
     def stored(self) -> Gaussians:
-        """The Gaussians as their files hold them.
+        """The Gaussians as the PLY holds them, which says what image they were made for.
 
         A renderer adds ``low_pass`` square pixels of its own screen to a Gaussian that was made for the
         photographs' pixels; with ``smooth`` the file has these already (as the 3D smoothing of
@@ -99,12 +125,34 @@ class ExportedSubject:
         """
         if not self.options.smooth:
             return self.gaussians
-        return smoothed(self.gaussians, pixel_size(self.cameras))
+        return smoothed(self.gaussians, self.pixel)
+
+    @cached_property
+    def for_other_renderers(self) -> Gaussians:
+        """The Gaussians as files hold them that cannot say what image they were made for."""
+        if self.options.smooth:
+            return self.stored
+        return for_other_renderers(self.gaussians, self.pixel)
+
+    @cached_property
+    def body(self) -> Float[Tensor, "n 3"]:
+        """The points that pictures of the whole subject show (:func:`subject_points`)."""
+        return subject_points(self.gaussians)
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The point that the page and the turntable turn about."""
+        return center_of(self.body, self.cameras)
+
+    @property
+    def pixel(self) -> float:
+        """The side of a photograph's pixel at the subject, in the unit of the cameras."""
+        return pixel_size(self.cameras, self.center)
 
     @cached_property
     def turntable(self) -> list[np.ndarray]:
         """Pictures [h, w, 3] uint8 from all around."""
-        orbit = turntable(self.cameras, self.options.frames)
+        orbit = turntable(self.cameras, self.options.frames, self.body)
         images = (
             self.renderer(self.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
             for frame in range(self.options.frames)

@@ -22,7 +22,7 @@ from ghgs_lit.prediction.export.world import AXES
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import colorize, to_uint8
-from ghgs_lit.visualization.turntable import up_direction
+from ghgs_lit.visualization.turntable import center_of, subject_points, up_direction
 
 _HULL_POINTS = 50_000
 
@@ -39,6 +39,11 @@ class Content:
     def cameras(self) -> Cameras:
         """The cameras [V] of the photographs."""
         return self.batch.cameras[0]
+
+    @cached_property
+    def center(self) -> Float[Tensor, "3"]:
+        """The middle of the subject."""
+        return center_of(subject_points(self.gaussians), self.cameras)
 
     @cached_property
     def order(self) -> Tensor:
