@@ -1,7 +1,8 @@
-"""Calibrations as files store them, and what they mean in the conventions of :mod:`ghgs_lit.types`.
+"""Calibrations as files store them, and their meaning in the conventions of :mod:`ghgs_lit.types`.
 
-A file says less than one needs: whether its poses map the world to the camera, and with which axes, is known
-from its format, or it must be said. A :class:`Convention` is such a meaning; the camera doctor tries others.
+Most files do not say whether poses map the world to the camera, or with which axes: the format tells it, or
+the user. A :class:`Convention` is such a meaning; :mod:`ghgs_lit.prediction.capture.camera_report` tries
+others.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,7 +27,7 @@ _ROUNDING = 1.5
 
 @dataclass(frozen=True)
 class Convention:
-    """What the numbers of a calibration mean.
+    """Meaning of the numbers of a calibration.
 
     Attributes:
         extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
@@ -60,7 +61,7 @@ class StoredCamera:
     """One camera as a file stores it.
 
     Attributes:
-        name: by which photographs are found.
+        name: that of its photographs.
         place: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
@@ -106,7 +107,7 @@ class Calibration:
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
-    """What a stored camera means for a photograph.
+    """The camera of a photograph that a stored camera means.
 
     Args:
         camera: as stored.
@@ -155,7 +156,7 @@ def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) 
     """The camera of an image that was turned, as ``numpy.rot90`` turns it.
 
     Args:
-        calibration: of the image before; without distortion, which turns not.
+        calibration: of the image before, without distortion.
         turns: quarter turns counterclockwise.
         size: (height, width) of the image before.
     """

@@ -1,4 +1,4 @@
-"""What is wrong with the cameras of a capture, found by trying what else their numbers could mean.
+"""Report on the cameras of a capture: other meanings of their numbers, tried one after another.
 
 Each :class:`Hypothesis` is another meaning; they are ranked by how well masks and cameras agree
 (:mod:`ghgs_lit.geometry.silhouettes`).
@@ -49,7 +49,7 @@ class StoredView:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What a calibration could mean, and how well masks and cameras agree then.
+    """A meaning of a calibration, and how well masks and cameras agree with it.
 
     Attributes:
         says: in words.
@@ -102,7 +102,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is right or wrong with a calibration.
+    """The report on a calibration.
 
     Attributes:
         consistent: whether masks and cameras agree as they are.
@@ -230,7 +230,7 @@ def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
 
 
 def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
-    """What one camera alone may have wrong, and the view without it."""
+    """Usual mistakes of a single camera in words, each with the view after mending it."""
     given = view.convention
     for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
         convention = replace(given, extrinsics=extrinsics, axes=axes)
@@ -261,7 +261,7 @@ def _masks_are_swapped(one: StoredView, other: StoredView) -> bool:
 
 
 def _contrast(view: StoredView, mask: np.ndarray) -> float:
-    """Mean gradient of the photograph on the outline of a mask, of which it has most on its own."""
+    """Mean gradient of the photograph on the outline of a mask, which is largest for its right mask."""
     grey = view.pixels.image.astype(np.float64).mean(-1)
     gradient = np.hypot(*np.gradient(grey))
     outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
@@ -277,7 +277,7 @@ def _twins(views: Sequence[StoredView]) -> tuple[str, ...]:
 
 
 def _size_line(size: float) -> str:
-    """How large the subject is, and which unit would make it a person."""
+    """A line about the subject's size, with the unit in which it is a person's."""
     if PERSON[0] <= size <= PERSON[1]:
         return f"the subject is {size:.3g} units tall: a person in metres"
     unit = next((n for n, u in _UNITS.items() if PERSON[0] <= size * u <= PERSON[1]), None)

@@ -43,7 +43,7 @@ class Capture:
         return cls(instants[0], folder.photographs(instants[0]))
 
     def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
-        """What a model sees: crops around the subject on a black background, a batch of one element.
+        """Crops around the subject on a black background, as a model sees them: a batch of one element.
 
         Cameras are in the user's world, in float64, which a world far from its origin needs.
 

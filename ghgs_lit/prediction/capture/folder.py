@@ -82,7 +82,7 @@ class CaptureFolder:
 
     @functools.cached_property
     def convention(self) -> Convention:
-        """What the stored numbers mean: as the format has it, but for what the user says."""
+        """Meaning of the stored numbers: the format's, unless the user says otherwise."""
         said = {name: self._said(name, getattr(self.file.convention, name)) for name in _CONVENTION}
         return Convention(**said)
 
@@ -174,7 +174,7 @@ _segmenter = functools.cache(segmenter)
 
 
 def _key(calibration: Calibration) -> tuple:
-    """What undistortion depends on, hashable: many instants share it."""
+    """Everything that undistortion depends on, as a key of a cache: many instants share it."""
     return tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
 
 

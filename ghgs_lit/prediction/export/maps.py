@@ -74,7 +74,7 @@ def points_ply(subject: ExportedSubject) -> bytes:
 
 
 def input_files(subject: ExportedSubject) -> Iterator[bytes]:
-    """What the model saw of each view, a PNG with its matte or mask as alpha, then the cameras.
+    """PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras.
 
     Both are what ``ghgs predict images=inputs cameras=cameras.json`` reads.
     """

@@ -32,7 +32,7 @@ _SMALLEST = 1e-3
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written, and how.
+    """Choices for the files of a prediction.
 
     Args:
         formats: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`.

@@ -1,4 +1,4 @@
-"""What a page shows: read from the directory of a prediction, or from a PLY."""
+"""Contents of a page, read from the directory of a prediction or from a PLY."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -177,12 +177,12 @@ class Viewer:
         go.on_click(lambda _: self.go_to(views.index(self.view.value)))
 
         def show() -> None:
-            found = self._comparison
+            values = self._comparison
             self._show_frustums()
-            self.image.image = found[self._shown]
+            self.image.image = values[self._shown]
             self.text.content = (
                 f"{self._shown} of {self.view.value}; in the subject's box:"
-                f" FLIP {found['flip']:.4f}, PSNR {found['psnr']:.2f} dB"
+                f" FLIP {values['flip']:.4f}, PSNR {values['psnr']:.2f} dB"
             )
 
         @self.view.on_update
