@@ -62,7 +62,7 @@ class StoredCamera:
 
     Attributes:
         name: that of its photographs.
-        place: file and key, for messages.
+        origin: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
         size: (height, width) in pixels of the images that were calibrated, where the file says it.
@@ -73,7 +73,7 @@ class StoredCamera:
     """
 
     name: str
-    place: str
+    origin: str
     intrinsics: np.ndarray
     pose: np.ndarray
     size: tuple[int, int] | None = None
@@ -82,12 +82,14 @@ class StoredCamera:
     mask: Path | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "intrinsics", check_intrinsics(f"{self.place}: intrinsics", self.intrinsics))
-        object.__setattr__(self, "pose", check_extrinsics(f"{self.place}: rotation", self.pose))
+        object.__setattr__(
+            self, "intrinsics", check_intrinsics(f"{self.origin}: intrinsics", self.intrinsics)
+        )
+        object.__setattr__(self, "pose", check_extrinsics(f"{self.origin}: rotation", self.pose))
         counts = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
         expected = f"{', '.join(map(str, counts))} distortion coefficients"
-        require(len(self.distortion) in counts, self.place, expected, len(self.distortion))
-        require(bool(np.isfinite(self.distortion).all()), self.place, "finite distortion", "NaN or infinity")
+        require(len(self.distortion) in counts, self.origin, expected, len(self.distortion))
+        require(bool(np.isfinite(self.distortion).all()), self.origin, "finite distortion", "NaN or infinity")
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     if size != photograph:
         if not same_ratio(size, photograph):
             raise InputError(
-                f"{camera.place}: expected a photograph of {height}x{width} (height x width) or scaled "
+                f"{camera.origin}: expected a photograph of {height}x{width} (height x width) or scaled "
                 f"from it, as it was calibrated; found {photograph[0]}x{photograph[1]}"
             )
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
