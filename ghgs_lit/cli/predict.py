@@ -32,6 +32,7 @@ from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.predict import TimedPrediction, predict, predict_batch, trained_size
 from ghgs_lit.prediction.export import (
+    REPORT,
     OutputOptions,
     output_files,
     output_options,
@@ -103,8 +104,12 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     folder, options = capture_folder(config), output_options(config)
     several, inputs = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
+    is_again = any((path / REPORT).exists() for path in directories.values())
     for name, path in directories.items():
         require_free(path, output_files(options, list(folder.paths[name])), inputs)
+    video = directory / "instants.mp4"
+    expected = "no file, or one beside the instants of an earlier prediction"
+    require(is_again or not (several and video.exists()), str(video), expected, "another file")
     if config["check_cameras"]:
         diagnosis = diagnose(folder)
         require_consistent(diagnosis)
@@ -129,8 +134,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
     if pictures:
-        video = mp4_bytes(pictures, options.fps)
-        write_atomically(directory / "instants.mp4", lambda temporary: temporary.write_bytes(video))
+        content = mp4_bytes(pictures, options.fps)
+        write_atomically(video, lambda temporary: temporary.write_bytes(content))
     if several:
         count, total = len(folder.instants), time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())

@@ -2,6 +2,7 @@
 
 from ghgs_lit.prediction.export.prediction import (
     FORMATS,
+    REPORT,
     output_files,
     output_options,
     require_free,
@@ -9,4 +10,12 @@ from ghgs_lit.prediction.export.prediction import (
 )
 from ghgs_lit.prediction.export.subject import OutputOptions
 
-__all__ = ["FORMATS", "OutputOptions", "output_files", "output_options", "require_free", "write_prediction"]
+__all__ = [
+    "FORMATS",
+    "REPORT",
+    "OutputOptions",
+    "output_files",
+    "output_options",
+    "require_free",
+    "write_prediction",
+]

@@ -3,9 +3,13 @@
 They store few bits: ``docs/outputs.md`` has their sizes and what is lost.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
+from torch import Tensor
 
+from ghgs_lit.prediction.export.ply import stored_values
 from ghgs_lit.types import Gaussians
 
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
@@ -39,16 +43,21 @@ def to_records(gaussians: Gaussians) -> np.ndarray:
 
     Large and opaque ones come first, so that a part of a ``.splat`` file is a picture, too.
     """
-    size = gaussians.scales.double().prod(-1) * gaussians.opacities
-    order = size.argsort(descending=True, stable=True)
-    means, scales, quaternions, opacities, colors = (
-        getattr(gaussians, name)[order].detach().float().cpu()
-        for name in ("means", "scales", "quaternions", "opacities", "colors")
-    )
-    records = np.empty(len(order), RECORD)
-    records["mean"], records["scale"] = means.numpy(), scales.numpy()
-    rgba = torch.cat([colors, opacities[:, None]], dim=-1).clamp(0, 1) * 255
-    records["color"] = rgba.round().byte().numpy()
-    rotation = torch.nn.functional.normalize(quaternions, dim=-1) * 128 + 128
-    records["rotation"] = rotation.round().clamp(0, 255).byte().numpy()
+    values = {name: value[visible_first(gaussians).cpu()] for name, value in stored_values(gaussians).items()}
+    records = np.empty(len(gaussians), RECORD)
+    records["mean"], records["scale"] = values["means"].numpy(), values["scales"].numpy()
+    records["color"] = rgba(values).numpy()
+    records["rotation"] = (values["quaternions"] * 128 + 128).round().clamp(0, 255).byte().numpy()
     return records
+
+
+def visible_first(gaussians: Gaussians) -> Tensor:
+    """Indices [N] of the Gaussians, large and opaque ones first."""
+    size = gaussians.scales.double().prod(-1) * gaussians.opacities
+    return size.argsort(descending=True, stable=True)
+
+
+def rgba(values: Mapping[str, Tensor]) -> Tensor:
+    """Colours and opacities [N, 4] uint8 of :func:`ghgs_lit.prediction.export.ply.stored_values`."""
+    colors = torch.cat([values["colors"], values["opacities"][:, None]], dim=-1)
+    return (colors.clamp(0, 1) * 255).round().byte()

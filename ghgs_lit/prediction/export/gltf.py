@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from ghgs_lit.errors import require
-from ghgs_lit.prediction.export.ply import SH_CONSTANT
+from ghgs_lit.prediction.export.compact import rgba
+from ghgs_lit.prediction.export.ply import SH_CONSTANT, stored_values
 from ghgs_lit.prediction.export.world import AXES, turn
 from ghgs_lit.types import Gaussians
 
@@ -35,18 +36,14 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
 
     require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)
 
-    means, scales, quaternions, opacities, colors = (
-        getattr(gaussians, name).detach().float().cpu()
-        for name in ("means", "scales", "quaternions", "opacities", "colors")
-    )
-    rgba = torch.cat([colors, opacities[:, None]], dim=-1).clamp(0, 1) * 255
+    stored = stored_values(gaussians)
     columns = {
-        "POSITION": means,
-        "COLOR_0": rgba.round().byte(),
-        f"{EXTENSION}:ROTATION": torch.nn.functional.normalize(quaternions, dim=-1)[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": scales,
-        f"{EXTENSION}:OPACITY": opacities.clamp(0, 1),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (colors - 0.5) / SH_CONSTANT,
+        "POSITION": stored["means"],
+        "COLOR_0": rgba(stored),
+        f"{EXTENSION}:ROTATION": stored["quaternions"][:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": stored["scales"],
+        f"{EXTENSION}:OPACITY": stored["opacities"].clamp(0, 1),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (stored["colors"] - 0.5) / SH_CONSTANT,
     }
     model, blob = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[0])]), b""
     for name, values in columns.items():

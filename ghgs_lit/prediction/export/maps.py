@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from plyfile import PlyData, PlyElement
 
 from ghgs_lit.geometry.mattes import unmultiplied
+from ghgs_lit.prediction.export.ply import vertices_ply
 from ghgs_lit.prediction.export.subject import ExportedSubject
 from ghgs_lit.visualization.pictures import to_uint8
 
@@ -62,15 +62,10 @@ def depth_files(subject: ExportedSubject) -> Iterator[bytes]:
 
 def points_ply(subject: ExportedSubject) -> bytes:
     """The unprojected pixels of the subject with their colours."""
-    names = [(axis, "<f4") for axis in "xyz"] + [(color, "u1") for color in ("red", "green", "blue")]
-    vertices = np.empty(len(subject.points), dtype=names)
     positions = subject.points.float().cpu().numpy()
     colors = (subject.colors.float().clamp(0, 1) * 255).round().byte().cpu().numpy()
-    for i in range(3):
-        vertices[names[i][0]], vertices[names[3 + i][0]] = positions[:, i], colors[:, i]
-    content = BytesIO()
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
-    return content.getvalue()
+    columns = dict(zip("xyz", positions.T, strict=True))
+    return vertices_ply(columns | dict(zip(("red", "green", "blue"), colors.T, strict=True)))
 
 
 def input_files(subject: ExportedSubject) -> Iterator[bytes]:

@@ -6,12 +6,14 @@ constants of the image that the Gaussians were made for; other programs ignore i
 """
 
 import re
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
@@ -48,26 +50,36 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
     channels = gaussians.colors.shape[1]
     require(channels == 3, "write_ply", "colours of 3 channels", channels)
-    fields = ("means", "quaternions", "scales", "opacities", "colors")
-    means, quaternions, scales, opacities, colors = (
-        getattr(gaussians, name).detach().to("cpu", torch.float64) for name in fields
-    )
-    values = {
-        "means": means,
-        "normals": torch.zeros_like(means),
-        "colors": (colors - 0.5) / SH_CONSTANT,
-        "opacities": torch.logit(opacities.clamp(_OPACITY_LIMIT, 1 - _OPACITY_LIMIT))[:, None],
-        "scales": scales.clamp(min=_SMALLEST_SCALE).log(),
-        "quaternions": torch.nn.functional.normalize(quaternions, dim=-1),
+    values = stored_values(gaussians, torch.float64)
+    opacities = values["opacities"].clamp(_OPACITY_LIMIT, 1 - _OPACITY_LIMIT)
+    values |= {
+        "normals": torch.zeros_like(values["means"]),
+        "colors": (values["colors"] - 0.5) / SH_CONSTANT,
+        "opacities": torch.logit(opacities)[:, None],
+        "scales": values["scales"].clamp(min=_SMALLEST_SCALE).log(),
     }
-    vertices = np.empty(len(gaussians), dtype=[(name, "<f4") for names in _GROUPS.values() for name in names])
-    for group, names in _GROUPS.items():
-        for column, name in enumerate(names):
-            vertices[name] = values[group][:, column].numpy()
+    columns = {
+        name: values[group][:, i].numpy().astype("<f4")
+        for group, names in _GROUPS.items()
+        for i, name in enumerate(names)
+    }
+    low_pass, antialiased = float(gaussians.low_pass), bool(gaussians.antialiased)
+    return vertices_ply(columns, [_CONSTANTS.format(low_pass=low_pass, antialiased=antialiased)])
+
+
+def stored_values(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """Means, scales, unit quaternions, opacities and colours on the CPU, by the names of their fields."""
+    names = ("means", "scales", "quaternions", "opacities", "colors")
+    values = {name: getattr(gaussians, name).detach().to("cpu", dtype) for name in names}
+    return values | {"quaternions": torch.nn.functional.normalize(values["quaternions"], dim=-1)}
+
+
+def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> bytes:
+    """The content of a binary PLY with a vertex for each row of the columns [N]."""
+    vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
     content = BytesIO()
-    constants = _CONSTANTS.format(low_pass=float(gaussians.low_pass), antialiased=bool(gaussians.antialiased))
-    elements = [PlyElement.describe(vertices, "vertex")]
-    PlyData(elements, byte_order="<", comments=[constants]).write(content)
+    elements = [PlyElement.describe(np.asarray(vertices), "vertex")]
+    PlyData(elements, byte_order="<", comments=list(comments)).write(content)
     return content.getvalue()
 
 

@@ -17,6 +17,7 @@ from ghgs_lit.metrics import flip_map, psnr
 from ghgs_lit.metrics.functional import box_of, mean_over
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
+from ghgs_lit.prediction.export.compact import visible_first
 from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.prediction.export.world import AXES
 from ghgs_lit.rendering import render
@@ -47,9 +48,8 @@ class Content:
 
     @cached_property
     def order(self) -> Tensor:
-        """Indices of the Gaussians, those that are seen most first: by opacity and size."""
-        g = self.gaussians
-        return (g.opacities.double() * g.scales.double().prod(-1)).argsort(descending=True, stable=True)
+        """Indices of the Gaussians, large and opaque ones first."""
+        return visible_first(self.gaussians)
 
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,8 @@
 """OpenCV's matrices under the names that programs give them, and the YAML that has them.
 
-YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair. Files differ in
-the spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses map
-the world to the camera, pixel centres are at integers.
+YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair. Files differ
+in the spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses
+map the world to the camera, pixel centres are at integers.
 """
 
 import re
@@ -83,7 +83,7 @@ def read_easymocap(path: Path) -> CameraFile:
         fields |= _read_yaml(file)
     named = _by_name(fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
-    cameras = cameras_from_fields(folder, named, "camera matrices K_<name>", sorted(fields))
+    cameras = [camera_from_fields(name, f"{folder}: {name}", camera) for name, camera in named.items()]
     return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
 
 
