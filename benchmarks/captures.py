@@ -30,7 +30,8 @@ from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.prediction.capture.capture import Capture, Photograph
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.predict import trained_size
 from ghgs_lit.prediction.refinement import CameraRefinement
 from ghgs_lit.types import Batch

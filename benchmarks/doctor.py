@@ -16,7 +16,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from ghgs_lit import Capture
-from ghgs_lit.prediction.capture.doctor import Diagnosis, diagnose
+from ghgs_lit.prediction.capture.camera_report import Diagnosis, diagnose
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from tests.helpers.mistakes import ALL, ONE
 

@@ -4,8 +4,8 @@
 
 Reads the runs of a sweep over ``ablation`` measured on ``evaluation.split=bench``
 (docs/evidence/ablation.md), sorts the frozen people into thirds by what the paper's argument speaks of, and
-compares the whole method with each of the other rows: PSNR inside the box, the test of tables over seeds and the people of a third together,
-without correction. Sorted by
+compares the whole method with each of the other rows: PSNR inside the box, the test of tables over seeds and
+the people of a third together, without correction. Sorted by
 
 - limbs: the share of the skin that lies within 5 cm of another part of the body that is not its neighbour,
 - texture: the contrast of the photographs within the subject, finer than 4 pixels,

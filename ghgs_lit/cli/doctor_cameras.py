@@ -6,9 +6,9 @@ from rich.table import Table
 
 from ghgs_lit.cli.photographs import capture_folder
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import calibrate
-from ghgs_lit.prediction.capture.doctor import Diagnosis, Ranked, diagnose, silhouettes_of
+from ghgs_lit.prediction.capture.camera_report import Diagnosis, Hypothesis, diagnose
 from ghgs_lit.prediction.capture.drawing import camera_sheet
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
@@ -26,6 +26,11 @@ def run(cfg: DictConfig) -> None:
     """
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
+    inputs = {path.resolve() for path in folder.input_files}
+    for path in (directory / "cameras.png", directory / "cameras.json"):
+        require(
+            path.resolve() not in inputs, str(path), "a folder (hydra.run.dir) without inputs", "an input"
+        )
     diagnosis = diagnose(folder)
     _show(diagnosis)
     best = diagnosis.ranking[0]
@@ -37,8 +42,7 @@ def run(cfg: DictConfig) -> None:
         # A calibration that needs no option any more.
         path = directory / "cameras.json"
         views = {
-            v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size)
-            for v in best.hypothesis.views
+            v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in best.views
         }
         write_json(path, views)
         announce(path)
@@ -51,15 +55,15 @@ def run(cfg: DictConfig) -> None:
 def _show(diagnosis: Diagnosis) -> None:
     """The meanings that were tried, the best first, and what follows."""
     table = Table("meaning", "worst agreement", *diagnosis.ranking[0].shares)
-    for ranked in diagnosis.ranking[:_LISTED]:
-        shares = (f"{share:.0%}" for share in ranked.shares.values())
-        table.add_row(ranked.hypothesis.says, f"{ranked.score:.0%}", *shares)
+    for hypothesis in diagnosis.ranking[:_LISTED]:
+        shares = (f"{share:.0%}" for share in hypothesis.shares.values())
+        table.add_row(hypothesis.says, f"{hypothesis.score:.0%}", *shares)
     rich.print(table)
     print("\n".join(diagnosis.lines), flush=True)
 
 
-def _sheet(folder: CaptureFolder, ranked: Ranked):
+def _sheet(folder: CaptureFolder, hypothesis: Hypothesis):
     """The picture of a meaning."""
-    views = ranked.hypothesis.views
+    views = hypothesis.views
     images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
-    return camera_sheet([v.name for v in views], images, silhouettes_of(folder, views))
+    return camera_sheet([v.name for v in views], images, hypothesis.silhouettes(folder))

@@ -65,6 +65,14 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
     return renderer
 
 
+def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
+    """The model of ``config["checkpoint"]`` on a device, in evaluation mode and the configured precision."""
+    model = GHGS.from_config(config, empty=STAGES)
+    model.load(config["checkpoint"], device=device)
+    model.precision = config["precision"]
+    return model.to(device).eval()
+
+
 def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     """Refuse photographs that ``model`` cannot take, before any of them is made or read.
 

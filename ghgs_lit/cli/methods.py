@@ -5,10 +5,10 @@ from typing import Any
 
 import torch
 
-from ghgs_lit.cli.inputs import MODEL_NODES, build_renderer
+from ghgs_lit.cli.inputs import MODEL_NODES, build_renderer, load_model
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import Method, ModelMethod
-from ghgs_lit.model import GHGS, STAGES
+from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -21,11 +21,8 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
             ``refine_cameras`` may be missing: none.
         device: where it runs.
     """
-    path, renderer = config["checkpoint"], build_renderer(config, device)
-    model = GHGS.from_config(config, empty=STAGES)
-    model.load(path, device=device)
-    model.precision = config["precision"]
-    checkpoint = read_checkpoint(path)
+    renderer, model = build_renderer(config, device), load_model(config, device)
+    checkpoint = read_checkpoint(config["checkpoint"])
     facts: dict[str, Any] = {
         "checkpoint_config": checkpoint["config"],
         "model_config": {node: config[node] for node in MODEL_NODES if node in config},
@@ -33,9 +30,8 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
     }
     if "global_step" in checkpoint:
         facts["training"] = {"steps": checkpoint["global_step"]}
-    refinement = Refinement(config["refine"], renderer) if config.get("refine") else None
-    model = model.to(device).eval()
-    rounds = config.get("refine_cameras")
+    steps, rounds = config.get("refine"), config.get("refine_cameras")
+    refinement = Refinement(steps, renderer) if steps else None
     cameras = CameraRefinement(rounds, model, renderer) if rounds else None
     return ModelMethod(model, renderer, refinement, cameras), facts
 

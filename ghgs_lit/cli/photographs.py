@@ -6,8 +6,8 @@ from typing import Any
 import torch
 
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.prediction.capture.camera_report import Diagnosis
 from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.doctor import Diagnosis
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.types import Cameras
 

@@ -383,6 +383,7 @@ class Stress(Verb):
 class PairedTest(Options):
     """The test between rows, over seeds and subjects together."""
 
+    group = "test"
     against: Literal["full", "best", "none"] = "full"
     """full: the row of the whole method | best: the best row of each column | none: no test."""
     alpha: float = Field(0.05, gt=0, lt=1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ghgs_lit.data.contact import Tile
-from ghgs_lit.data.silhouettes import Silhouette
+from ghgs_lit.geometry.silhouettes import Silhouette
 
 #: Name of the subject, position and view.
 Photograph = tuple[str, int, int]

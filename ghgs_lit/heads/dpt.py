@@ -251,7 +251,7 @@ class DPTHead(nn.Module):
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
-        """What must be computed for a window of the result, from fine to coarse.
+        """Windows of each level that a window of the result depends on, from fine to coarse.
 
         Args:
             result: the window.

@@ -29,8 +29,8 @@ def surface_axes(
 
     Args:
         maps: depths of the images.
-        cameras: theirs.
-        image, pixel: which pixels (``b * V + v``, row-major index).
+        cameras: of the images.
+        image, pixel: numbers of the images (``b * V + v``) and row-major indices of their pixels.
     """
     height, width = maps.depth.shape[-2:]
     depth = at_least_float32(maps.depth)
@@ -44,13 +44,13 @@ def surface_axes(
     footprint = own / fx
 
     def neighbor(step: int) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
-        """How much deeper a neighbour is where it lies on the same surface, and how far it does, 0 to 1."""
+        """Depth of a neighbour less the pixel's (0 off its surface), and whether it is on it, 0 to 1."""
         deeper = around[place + step] - own
         near = ((_OTHER - deeper.abs() / footprint) / (_OTHER - _SAME)).clamp(0, 1)
         return near * torch.where(near > 0, deeper, 0), near
 
     def slope(step: int) -> Float[Tensor, " N"]:
-        """By which share depth grows from one pixel to the next."""
+        """Relative change of depth from one pixel to the next."""
         (after, near_after), (before, near_before) = neighbor(step), neighbor(-step)
         return (after - before) / ((1 + near_after * near_before) * own + after + before)
 

@@ -140,7 +140,7 @@ def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Wi
 
 
 def reach(*modules: nn.Module) -> int:
-    """How many cells on each side the result of these layers, one after another, depends on."""
+    """Number of cells on each side that the result of these layers, one after another, depends on."""
     return sum(
         layer.kernel_size[0] // 2
         for module in modules

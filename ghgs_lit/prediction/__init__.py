@@ -1,1 +1,1 @@
-"""From photographs to files and pages: what a capture is, what corrects it, what is written of it."""
+"""From photographs to files and pages: captures, their refinement, and the files of predictions."""

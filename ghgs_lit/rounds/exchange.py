@@ -1,4 +1,4 @@
-"""What Gaussians of pixels beside one another tell each other in a round."""
+"""Exchange of features among Gaussians of neighbouring pixels, once a round."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ REACH = 5
 
 
 class Windows(NamedTuple):
-    """Where Gaussians lie in maps that hold the subject of each image and little else.
+    """Positions of Gaussians in maps cropped to the subject of each image.
 
     ``place`` counts through the pixels of all maps, whose number, height and width are ``shape``.
     """
@@ -25,7 +25,7 @@ class Windows(NamedTuple):
 
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Windows":
-        """As large as the largest subject; each starts at the first row and column of its own."""
+        """Maps of the size of the largest subject; each begins at its subject's first row and column."""
         filled = [extent for extent in batch.extents if extent.count]
         height = max((extent.bottom - extent.top for extent in filled), default=1)
         width = max((extent.right - extent.left for extent in filled), default=1)

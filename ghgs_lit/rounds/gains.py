@@ -17,17 +17,17 @@ from ghgs_lit.rendering import render
 from ghgs_lit.rounds.observation import looked_up
 from ghgs_lit.types import Batch, Gaussians
 
-#: Metres from the rendered surface at which a view counts a Gaussian as the surface that it shows, by 1 / e.
+#: Distance in metres from a view's rendered surface at which a Gaussian's weight in that view is 1 / e.
 _NEAR = 0.02
 #: Colours closer than this to black or white, which say little of a gain, count less.
 _DARK = 0.05
 #: Deviation of a logarithm of colours from the gains at which a Gaussian counts half: wrong depths, shadows.
 _OUTLIER = 0.15
-#: Logarithms of gains well below this are taken for an error of the estimate.
+#: Logarithms of gains well below this are taken for errors of the estimate, and shrunk to 0.
 _LEAST = 0.02
-#: Weight of no difference beside that of one Gaussian: decides where views share nothing.
+#: Weight of gains of 1, in Gaussians: views that share nothing get these.
 _PRIOR = 1.0
-#: Every which Gaussian is asked: a third is enough, and a third of the time.
+#: One Gaussian in so many is compared: a third of them is enough, and takes a third of the time.
 _EVERY = 3
 #: Steps of reweighting.
 _STEPS = 5
@@ -67,7 +67,7 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
 
 
 def _thinned(gaussians: Gaussians) -> Gaussians:
-    """Every so many of each element."""
+    """One in :data:`_EVERY` of the Gaussians of each element."""
     device, splits = gaussians.means.device, gaussians.splits
     ends = list(itertools.accumulate(splits))
     kept = [torch.arange(end - n, end, _EVERY, device=device) for n, end in zip(splits, ends, strict=True)]
@@ -95,7 +95,7 @@ def _compared(
 def _solved(
     counts: Float[Tensor, "B V V 3"], differences: Float[Tensor, "B V V 3"]
 ) -> Float[Tensor, "B V 3"]:
-    """Gains whose differences, to a view (last V) from another one, explain the sums of differences."""
+    """Logarithms of gains that best fit the sums of differences, of the last V to the first."""
     counts, differences = counts.movedim(-1, 1), differences.movedim(-1, 1)
     both = counts + counts.mT
     identity = torch.eye(both.shape[-1], dtype=both.dtype, device=both.device)

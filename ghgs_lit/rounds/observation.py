@@ -1,4 +1,4 @@
-"""What the photographs say about Gaussians where they are now, without a gradient."""
+"""Values of the photographs and the render at each Gaussian's present position, without a gradient."""
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +20,7 @@ CHANNELS = 11
 
 @torch.no_grad()
 def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
-    """What each input view shows of each Gaussian of its element: :data:`CHANNELS` values.
+    """:data:`CHANNELS` values of each input view at each Gaussian of its element.
 
     The first view is that of the Gaussian's own image; the others follow in their order, from the last to the
     first again.

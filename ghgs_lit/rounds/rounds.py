@@ -48,7 +48,7 @@ class Search:
 
 @dataclass(frozen=True)
 class State:
-    """What a round starts from, and what it gives; the first state is what the stages found."""
+    """Input and output of a round; the first state is the prediction of the stages before."""
 
     raw: RawGaussians
     gaussians: Gaussians
@@ -122,7 +122,7 @@ class Rounds(nn.Module):
         """The state before the first round and after each.
 
         Args:
-            state: what the stages found; its depths have bounds.
+            state: the prediction of the stages before; its depths have bounds.
             activate: of the Gaussian head.
             batch: photographs, masks and cameras are read.
         """

@@ -1,17 +1,46 @@
-"""Cameras on a circle around the subject of given cameras."""
+"""Cameras on a circle around the subject of given cameras, and where that subject is."""
 
 import math
 
 import torch
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import look_at_point
-from ghgs_lit.types import Cameras
+from ghgs_lit.geometry.projection import look_at_point, project
+from ghgs_lit.types import Cameras, Gaussians
+
+#: Opacity of Gaussians that make up the subject.
+_OPAQUE = 0.5
+#: Part of them beyond each face of the subject's box: floaters.
+_OUTSIDE = 1e-3
+#: Part of a picture's height and width that the subject takes at most.
+_SHARE = 0.95
 
 
-def pixel_size(cameras: Cameras) -> float:
-    """The side of a photograph's pixel at the subject, mean of ``cameras`` [V]."""
-    away = look_at_point(cameras) - cameras.centers
+def subject_points(gaussians: Gaussians) -> Tensor:
+    """Centres [n, 3] of the opaque Gaussians of one subject without the outermost; float64.
+
+    Of all Gaussians where none is opaque.
+    """
+    opaque = gaussians.opacities >= _OPAQUE
+    points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
+    if not len(points):
+        return points
+    ordered, last = points.sort(0).values, len(points) - 1
+    low, high = ordered[round(_OUTSIDE * last)], ordered[round((1 - _OUTSIDE) * last)]
+    return points[((points >= low) & (points <= high)).all(1)]
+
+
+def center_of(points: Tensor, cameras: Cameras) -> Tensor:
+    """The middle [3] of the box around points [n, 3], float64; of no points where the optical axes meet."""
+    return (points.amin(0) + points.amax(0)) / 2 if len(points) else look_at_point(cameras)
+
+
+def pixel_size(cameras: Cameras, center: Tensor | None = None) -> float:
+    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V].
+
+    None: where the optical axes meet.
+    """
+    away = (look_at_point(cameras) if center is None else center) - cameras.centers
     depths = (away * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())
 
@@ -35,16 +64,18 @@ def up_direction(cameras: Cameras) -> Tensor:
     return up
 
 
-def turntable(cameras: Cameras, frames: int) -> Cameras:
+def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Cameras:
     """Cameras on one turn around the subject, at the mean distance and height of the given ones.
 
-    They begin at the side of the first camera and have its intrinsics.
+    They begin at the side of the first camera and have its lens. With ``points`` they turn about the middle
+    of their box, look straight at it, and have a wider lens where the first camera's would cut them off.
 
     Args:
         cameras: the given cameras [V].
         frames: the number of cameras.
+        points: of the subject [n, 3], n may be 0; None: they turn about where the optical axes meet.
     """
-    center = look_at_point(cameras)
+    center = look_at_point(cameras) if points is None else center_of(points, cameras)
     up = up_direction(cameras)
     offsets = cameras.centers.double() - center
     heights = offsets @ up
@@ -62,4 +93,24 @@ def turntable(cameras: Cameras, frames: int) -> Cameras:
     extrinsics[:, :3, :3] = rotation
     extrinsics[:, :3, 3] = -(rotation @ positions[..., None])[..., 0]
     intrinsics = cameras.intrinsics[:1].expand(frames, 3, 3)
+    if points is not None and frames:
+        intrinsics = _fitted(intrinsics, extrinsics, points, cameras.height, cameras.width)
     return Cameras(intrinsics, extrinsics.to(cameras.extrinsics.dtype), cameras.height, cameras.width)
+
+
+def _fitted(intrinsics: Tensor, extrinsics: Tensor, points: Tensor, height: int, width: int) -> Tensor:
+    """Intrinsics [n, 3, 3] with the principal point in the middle that show points [m, 3] in all views."""
+    middle = intrinsics.new_tensor([width / 2, height / 2])
+    intrinsics = intrinsics.clone()
+    intrinsics[:, :2, 2] = middle
+    if not len(points):
+        return intrinsics
+    shape = (len(intrinsics), len(points))
+    pixels, depth = project(
+        points.expand(*shape, 3),
+        intrinsics.double()[:, None].expand(*shape, 3, 3),
+        extrinsics[:, None].expand(*shape, 4, 4),
+    )
+    reach = ((pixels - middle).abs() / middle)[depth > 0].amax()
+    intrinsics[:, :2, :2] *= (_SHARE / reach).clamp(max=1).to(intrinsics)
+    return intrinsics

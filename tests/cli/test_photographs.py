@@ -139,3 +139,25 @@ def test_the_example_runs(here, checkpoint, monkeypatch, capsys):
     runpy.run_path(str(EXAMPLES / "photographs_to_splat.py"), run_name="__main__")
     assert "splat.ply: " in capsys.readouterr().out
     assert inside_the_figure(here / "splat.ply") > 0.95
+
+
+def test_inputs_are_never_replaced(here, checkpoint, capsys):
+    """Neither a calibration of the name of an output nor photographs, though an earlier run wrote them."""
+    cameras = Figure().write(here / "cap")
+    before = cameras.read_bytes()
+    common = (f"checkpoint={checkpoint}", "turntable.frames=0", "device=cpu")
+    assert ghgs("predict", "images=cap", f"cameras={cameras}", "out=cap", *common) == 1
+    assert "cameras.json: expected another folder (out=...)" in capsys.readouterr().err
+    assert cameras.read_bytes() == before
+    run = ("images=cap", f"cameras={cameras}", "out=first", *common, "formats=[inputs]")
+    assert ghgs("predict", *run) == 0
+    assert ghgs("predict", *run) == 0
+    again = ("images=first/inputs", "cameras=first/cameras.json", "out=first", *common, "formats=[inputs]")
+    assert ghgs("predict", *again) == 1
+    assert "found the input" in capsys.readouterr().err
+    assert ghgs("doctor", "task=cameras", "images=cap", f"cameras={cameras}", "hydra.run.dir=cap") == 1
+    assert "cameras.json: expected a folder (hydra.run.dir) without inputs" in capsys.readouterr().err
+    (here / "other").mkdir()
+    (here / "other" / "config.yaml").write_text("of: another program")
+    assert ghgs("predict", "images=cap", f"cameras={cameras}", "out=other", *common) == 1
+    assert "config.yaml: expected no file, or the configuration of an earlier run" in capsys.readouterr().err

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import pandas as pd
 
 from ghgs_lit.config.ablation import ABLATIONS
+from ghgs_lit.config.verbs import PairedTest
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
 from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep, Variant
 from ghgs_lit.evaluation.tables.reported import data_title, reported_data, reported_table
-from ghgs_lit.evaluation.tables.significance import PairedTest
 
 NO_FIGURE = "-"
 """Where there is no figure, as the paper prints it."""

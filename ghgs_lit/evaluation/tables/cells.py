@@ -8,12 +8,13 @@ from typing import Any
 
 import pandas as pd
 
+from ghgs_lit.config.verbs import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.differences import differing, differing_text, telling_apart
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, decimals
 from ghgs_lit.evaluation.tables.records import TRAINING, person_of
 from ghgs_lit.evaluation.tables.reported import data_title
-from ghgs_lit.evaluation.tables.significance import Comparison, PairedTest, compare, holm
+from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm
 
 Configs = Mapping[str, Mapping[str, Any]]
 

@@ -5,11 +5,12 @@ from typing import Any
 
 import pandas as pd
 
+from ghgs_lit.config.verbs import PairedTest
 from ghgs_lit.evaluation.tables.differences import differing, differing_text
 from ghgs_lit.evaluation.tables.layouts import Table
 from ghgs_lit.evaluation.tables.records import Planned
 from ghgs_lit.evaluation.tables.reported import data_title, reported_source
-from ghgs_lit.evaluation.tables.significance import PairedTest, needed_errors
+from ghgs_lit.evaluation.tables.significance import needed_errors
 
 FOOTNOTE = (
     "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them, while its"

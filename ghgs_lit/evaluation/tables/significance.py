@@ -14,8 +14,6 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from ghgs_lit.config.verbs import PairedTest
-
 
 @dataclass(frozen=True)
 class Comparison:

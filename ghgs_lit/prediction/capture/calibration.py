@@ -1,7 +1,8 @@
-"""Calibrations as files store them, and what they mean in the conventions of :mod:`ghgs_lit.types`.
+"""Calibrations as files store them, and their meaning in the conventions of :mod:`ghgs_lit.types`.
 
-A file says less than one needs: whether its poses map the world to the camera, and with which axes, is known
-from its format, or it must be said. A :class:`Convention` is such a meaning; the camera doctor tries others.
+Most files do not say whether poses map the world to the camera, or with which axes: the format tells it, or
+the user. A :class:`Convention` is such a meaning; :mod:`ghgs_lit.prediction.capture.camera_report` tries
+others.
 """
 
 from dataclasses import dataclass, field, replace
@@ -26,7 +27,7 @@ _ROUNDING = 1.5
 
 @dataclass(frozen=True)
 class Convention:
-    """What the numbers of a calibration mean.
+    """Meaning of the numbers of a calibration.
 
     Attributes:
         extrinsics: what the poses map: ``world_to_camera`` | ``camera_to_world``.
@@ -60,8 +61,8 @@ class StoredCamera:
     """One camera as a file stores it.
 
     Attributes:
-        name: by which photographs are found.
-        place: file and key, for messages.
+        name: that of its photographs.
+        origin: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
         size: (height, width) in pixels of the images that were calibrated, where the file says it.
@@ -72,7 +73,7 @@ class StoredCamera:
     """
 
     name: str
-    place: str
+    origin: str
     intrinsics: np.ndarray
     pose: np.ndarray
     size: tuple[int, int] | None = None
@@ -81,12 +82,14 @@ class StoredCamera:
     mask: Path | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "intrinsics", check_intrinsics(f"{self.place}: intrinsics", self.intrinsics))
-        object.__setattr__(self, "pose", check_extrinsics(f"{self.place}: rotation", self.pose))
+        object.__setattr__(
+            self, "intrinsics", check_intrinsics(f"{self.origin}: intrinsics", self.intrinsics)
+        )
+        object.__setattr__(self, "pose", check_extrinsics(f"{self.origin}: rotation", self.pose))
         counts = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
         expected = f"{', '.join(map(str, counts))} distortion coefficients"
-        require(len(self.distortion) in counts, self.place, expected, len(self.distortion))
-        require(bool(np.isfinite(self.distortion).all()), self.place, "finite distortion", "NaN or infinity")
+        require(len(self.distortion) in counts, self.origin, expected, len(self.distortion))
+        require(bool(np.isfinite(self.distortion).all()), self.origin, "finite distortion", "NaN or infinity")
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ class Calibration:
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
-    """What a stored camera means for a photograph.
+    """The camera of a photograph that a stored camera means.
 
     Args:
         camera: as stored.
@@ -128,7 +131,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     if size != photograph:
         if not same_ratio(size, photograph):
             raise InputError(
-                f"{camera.place}: expected a photograph of {height}x{width} (height x width) or scaled "
+                f"{camera.origin}: expected a photograph of {height}x{width} (height x width) or scaled "
                 f"from it, as it was calibrated; found {photograph[0]}x{photograph[1]}"
             )
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
@@ -155,7 +158,7 @@ def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) 
     """The camera of an image that was turned, as ``numpy.rot90`` turns it.
 
     Args:
-        calibration: of the image before; without distortion, which turns not.
+        calibration: of the image before, without distortion.
         turns: quarter turns counterclockwise.
         size: (height, width) of the image before.
     """

@@ -1,46 +1,16 @@
 """A user's photographs of one instant, and the batch that a model sees of them."""
 
-import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from ghgs_lit.data.matting import refined_matte
-from ghgs_lit.data.resampling import area_image
 from ghgs_lit.errors import require
+from ghgs_lit.prediction.capture.crops import Photograph, crop_to_subject
+from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.types import Batch, Cameras
-
-#: How much of a crop's height or width the subject takes, as in the photographs of training data.
-_SHARE = 0.8
-#: Mattes are found in photographs of at most this times the size of their crops.
-_FINER = 2
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """One photograph without lens distortion, upright.
-
-    Attributes:
-        name: of its camera.
-        image: [h, w, 3] uint8, RGB.
-        matte: [h, w] uint8, 255 times the share of each pixel that shows the subject.
-        intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
-        extrinsics: [4, 4] float64, world to camera, OpenCV axes, in the user's unit.
-    """
-
-    name: str
-    image: np.ndarray
-    matte: np.ndarray
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
-
-    @property
-    def mask(self) -> np.ndarray:
-        """[h, w] bool, true where the subject fills half of a pixel or more."""
-        return self.matte > 127
 
 
 @dataclass(frozen=True)
@@ -67,108 +37,31 @@ class Capture:
         Raises:
             InputError: a file is missing or wrong, or the folder holds several instants.
         """
-        from ghgs_lit.prediction.capture.folder import CaptureFolder
-
         folder = CaptureFolder(images, cameras, **options)
-        found = folder.instants
-        require(len(found) == 1, str(images), "one instant (CaptureFolder reads several)", len(found))
-        return folder.read(found[0])
+        instants = folder.instants
+        require(len(instants) == 1, str(images), "one instant (CaptureFolder reads several)", len(instants))
+        return cls(instants[0], folder.photographs(instants[0]))
 
     def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
-        """What a model sees: crops around the subject on a black background, a batch of one element.
+        """Crops around the subject on a black background, as a model sees them: a batch of one element.
 
         Cameras are in the user's world, in float64, which a world far from its origin needs.
 
         Args:
             size: (height, width) of the crops in pixels.
             refine_masks: by how many pixels of a crop the outlines of masks may be wrong; mattes are then
-                found in the photographs (:func:`refined_matte`). 0: masks are right.
+                searched in the photographs (:func:`refined_matte`). 0: masks are right.
         """
         crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
-        images, mattes = (
-            torch.from_numpy(np.stack([getattr(crop, name) for crop in crops])) for name in ("image", "matte")
-        )
-        cameras = (
+        images, mattes, intrinsics, extrinsics = (
             torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
-            for name in ("intrinsics", "extrinsics")
+            for name in ("image", "matte", "intrinsics", "extrinsics")
         )
         return Batch(
-            images=images.permute(0, 3, 1, 2)[None].float() / 255,
-            masks=mattes[None] > 127,
-            cameras=Cameras(*cameras, *size),
-            alpha=mattes[None].float() / 255,
+            images=images.movedim(-1, 2).float() / 255,
+            masks=mattes > 127,
+            cameras=Cameras(intrinsics, extrinsics, *size),
+            alpha=mattes.float() / 255,
             subjects=(self.name,),
             views=(tuple(crop.name for crop in crops),),
         )
-
-
-def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks: int = 0) -> Photograph:
-    """The subject in the middle of an image of ``size`` (height, width); its camera is that of the crop.
-
-    Beyond the photograph and beside the subject the crop is black. A large photograph's sharp mask becomes a
-    soft matte. Where the subject is cut by the photograph's border the crop ends there, too: black beside it
-    would say that the subject ends. ``refine_masks`` is that of :meth:`Capture.batch`.
-    """
-    rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
-    extents = [(int(found[0]), int(found[-1]) + 1) for found in (rows, columns)]
-    scale = max((end - first) / (_SHARE * side) for (first, end), side in zip(extents, size, strict=True))
-    spans = [
-        _span(first, end, max(round(scale * side), 1), whole)
-        for (first, end), side, whole in zip(extents, size, photograph.mask.shape, strict=True)
-    ]
-    (top, bottom), (left, right) = spans
-    factors = np.array([size[1] / (right - left), size[0] / (bottom - top)])
-    intrinsics = photograph.intrinsics.copy()
-    intrinsics[:2, 2] -= [left, top]
-    intrinsics[:2] *= factors[:, None]
-    image, matte = _cut(photograph.image, spans), _cut(photograph.matte, spans)
-    # Before it is made smaller: the background has no part in the pixels of the rim.
-    if refine_masks:
-        image, matte = _refined(photograph.name, image, matte, size, refine_masks)
-    else:
-        image = _on_black(image, matte)
-    return replace(
-        photograph, image=area_image(image, *size), matte=area_image(matte, *size), intrinsics=intrinsics
-    )
-
-
-def _refined(
-    name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`refined_matte` of a cut, which is made smaller first where it is much larger than the crop."""
-    sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
-    image, matte = area_image(image, *sides), area_image(matte, *sides)
-    subject, found = refined_matte(image, matte, pixels * sides[0] / size[0])
-    share = (found > 127).sum() / max((matte > 127).sum(), 1)
-    if 0.5 <= share <= 2:
-        return subject, found
-    warnings.warn(
-        f"refine_masks: expected colours of {name} that tell the subject from what is behind it; found"
-        f" {share:.2g} times the mask's area, so that the mask stays as it is",
-        stacklevel=4,
-    )
-    return _on_black(image, matte), matte
-
-
-def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """The image multiplied by its matte."""
-    return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
-
-
-def _span(first: int, end: int, length: int, whole: int) -> tuple[int, int]:
-    """``length`` pixels around those from ``first`` to ``end`` of ``whole``; see :func:`crop_to_subject`."""
-    if first == 0 and end == whole:
-        return 0, whole
-    start = (first + end - length) // 2
-    if first == 0:
-        start = 0
-    elif end == whole:
-        start = whole - length
-    return start, start + length
-
-
-def _cut(image: np.ndarray, spans: list[tuple[int, int]]) -> np.ndarray:
-    """The pixels of ``spans``, 0 beyond the image."""
-    inside = tuple(slice(max(a, 0), min(b, side)) for (a, b), side in zip(spans, image.shape, strict=False))
-    pads = [(max(-a, 0), max(b - side, 0)) for (a, b), side in zip(spans, image.shape, strict=False)]
-    return np.pad(image[inside], pads + [(0, 0)] * (image.ndim - 2))

@@ -6,8 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 from scipy import ndimage
 
-from ghgs_lit.data.silhouettes import Silhouette, subject_place
-from ghgs_lit.prediction.capture.consistency import hull_outline
+from ghgs_lit.geometry.silhouettes import Silhouette, hull_in_view, subject_sphere
 from ghgs_lit.visualization.pictures import row, stack
 
 # Cells of the hull along the longer side of a photograph, and steps of an epipolar line.
@@ -32,10 +31,10 @@ def camera_sheet(
     Returns:
         [H, W, 3] uint8.
     """
-    focus, radius = subject_place(views)
+    focus, radius = subject_sphere(views)
     small = [_smaller(view) for view in views]
     tiles = [
-        _outlined(image, view.mask, _enlarged(hull_outline(small, i), view.mask.shape))
+        _outlined(image, view.mask, _enlarged(hull_in_view(small, i), view.mask.shape))
         for i, (image, view) in enumerate(zip(images, views, strict=True))
     ]
     rows = [row(tiles, [f"{name}: mask green, hull of the others red" for name in names])]
@@ -85,20 +84,18 @@ def _dots(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _lines(
     image: np.ndarray,
-    own: Silhouette,
+    view: Silhouette,
     other: Silhouette,
     points: np.ndarray,
     focus: np.ndarray,
     radius: float,
 ) -> np.ndarray:
-    """The lines of ``own``'s ``points`` on a photograph, as far from ``own`` as the subject is."""
+    """The lines of a view's ``points`` on the photograph of another, as far from it as the subject is."""
     picture = Image.fromarray(image)
     draw = ImageDraw.Draw(picture)
-    middle = (own.extrinsics[:3, :3] @ focus + own.extrinsics[:3, 3])[2]
-    depths = middle + radius * np.linspace(-1, 1, _STEPS)
-    depths = depths[depths > 0]
-    for ray, color in zip(own.rays(points), _COLORS, strict=True):
-        local = (own.center + ray * depths[:, None]) @ other.extrinsics[:3, :3].T + other.extrinsics[:3, 3]
+    depths = view.depths_around(focus, radius, _STEPS)
+    for ray, color in zip(view.rays(points), _COLORS, strict=True):
+        local = (view.center + ray * depths[:, None]) @ other.extrinsics[:3, :3].T + other.extrinsics[:3, 3]
         local = local[local[:, 2] > 0]
         pixels = local @ other.intrinsics.T
         line = (pixels[:, :2] / pixels[:, 2:]).clip(-1e4, 1e4)

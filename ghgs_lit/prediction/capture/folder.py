@@ -19,7 +19,7 @@ from ghgs_lit.prediction.capture.calibration import (
     calibrate,
     quarter_turned,
 )
-from ghgs_lit.prediction.capture.capture import Capture, Photograph
+from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
@@ -36,7 +36,7 @@ _CONVENTION = tuple(f.name for f in fields(Convention))
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """``folder.read(instant) -> Capture`` for each of ``folder.instants``.
+    """``folder.photographs(instant)`` for each of ``folder.instants``.
 
     Args:
         images: folder of photographs named after their cameras; or of such folders, one for each instant.
@@ -67,9 +67,9 @@ class CaptureFolder:
         choice("calibration.exif", self._said("exif", "auto"), EXIF)
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
-            there = path is None or Path(path).expanduser().is_dir()
-            require(there, name, "a folder", str(path))
-        _ = self.paths  # what is missing is missed here
+            is_folder = path is None or Path(path).expanduser().is_dir()
+            require(is_folder, name, "a folder", str(path))
+        _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
 
     def _said(self, key: str, default: Any) -> Any:
         value = self.calibration.get(key)
@@ -82,7 +82,7 @@ class CaptureFolder:
 
     @functools.cached_property
     def convention(self) -> Convention:
-        """What the stored numbers mean: as the format has it, but for what the user says."""
+        """Meaning of the stored numbers: the format's, unless the user says otherwise."""
         said = {name: self._said(name, getattr(self.file.convention, name)) for name in _CONVENTION}
         return Convention(**said)
 
@@ -97,26 +97,36 @@ class CaptureFolder:
         """Names of the instants, in their order."""
         return list(self.paths)
 
-    def read(self, instant: str) -> Capture:
-        """The photographs of one instant.
+    @property
+    def input_files(self) -> list[Path]:
+        """The files that may be read, such as photographs with what lies beside them, and the calibration."""
+        photographs = (path for paths in self.paths.values() for path in paths.values())
+        folders = {path.parent for path in photographs}
+        given = (self.cameras, self.masks, self.backgrounds)
+        given = [Path(path).expanduser() for path in given if path is not None]
+        files = [path for folder in folders for path in folder.iterdir()]
+        return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
+
+    def photographs(self, instant: str) -> tuple[Photograph, ...]:
+        """The photographs of one instant, two or more.
 
         Raises:
             InputError: a photograph or mask is missing or wrong.
         """
         views = zip(self.paths[instant], self.decode(instant), strict=True)
-        return Capture(instant, tuple(self.photograph(name, *view, self.convention) for name, view in views))
+        return tuple(self.photograph(name, *view, self.convention) for name, view in views)
 
     def decode(self, instant: str) -> list[tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied."""
-        found = []
+        views = []
         for name, path in self.paths[instant].items():
             camera, pixels = self.file.cameras[name], read_pixels(path)
             matte = self._matte(name, camera, path, pixels)
             problem = implausible(matte > 127)
             if problem is not None:
                 raise InputError(f"{path}: {problem}")
-            found.append((camera, pixels, matte))
-        return found
+            views.append((camera, pixels, matte))
+        return views
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
@@ -138,9 +148,9 @@ class CaptureFolder:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
         images = Path(self.images).expanduser()
         if self.masks is not None:
-            found = mask_path(path, images, Path(self.masks).expanduser())
-            require(found is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
-            return matte_of_file(found, pixels)
+            mask = mask_path(path, images, Path(self.masks).expanduser())
+            require(mask is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
+            return matte_of_file(mask, pixels)
         if self.backgrounds is not None:
             background = image_named(Path(self.backgrounds).expanduser(), name)
             expected = f"a photograph {name} without the subject"
@@ -164,7 +174,7 @@ _segmenter = functools.cache(segmenter)
 
 
 def _key(calibration: Calibration) -> tuple:
-    """What undistortion depends on, hashable: many instants share it."""
+    """Everything that undistortion depends on, as a key of a cache: many instants share it."""
     return tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
 
 

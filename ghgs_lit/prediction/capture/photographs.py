@@ -88,15 +88,15 @@ def images_in(folder: Path) -> dict[str, Path]:
     Raises:
         InputError: two of them have one name.
     """
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
         if not is_image or path.stem.endswith(MASK_ENDING):
             continue
-        twin = found.get(path.stem)
+        twin = paths.get(path.stem)
         require(twin is None, str(path), "one file for each photograph", str(twin))
-        found[path.stem] = path
-    return found
+        paths[path.stem] = path
+    return paths
 
 
 def image_named(folder: Path, *names: str) -> Path | None:
@@ -124,12 +124,12 @@ def find_instants(
     Raises:
         InputError: there are none, or photographs and cameras do not fit together.
     """
-    there = "a file" if folder.exists() else "no such folder"
-    require(folder.is_dir(), str(folder), "a folder of photographs", there)
-    if own := images_in(folder):
-        return {folder.resolve().name: _by_camera(folder, own, cameras, names)}
+    problem = "a file" if folder.exists() else "no such folder"
+    require(folder.is_dir(), str(folder), "a folder of photographs", problem)
+    if photographs := images_in(folder):
+        return {folder.resolve().name: _by_camera(folder, photographs, cameras, names)}
     below = {path.name: images_in(path) for path in sorted(folder.iterdir()) if path.is_dir()}
-    folders = {name: found for name, found in below.items() if found}
+    folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
     if all(names.get(name, name) in cameras for name in folders):
         return _by_instant(folder, _by_camera(folder, folders, cameras, names))
@@ -150,16 +150,24 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
 
 
 def _by_camera(
-    folder: Path, found: Mapping[str, Any], cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
+    folder: Path,
+    values: Mapping[str, Any],
+    cameras: Mapping[str, StoredCamera],
+    names: Mapping[str, str],
 ) -> dict[str, Any]:
-    """What was found under each photograph's name, by camera."""
-    unknown = [name for name in found if names.get(name, name) not in cameras]
+    """Values by camera, given by the name of a photograph or of a camera's folder."""
+    unknown = [name for name in values if names.get(name, name) not in cameras]
     if unknown:
         raise InputError(
             f"{folder}: expected photographs named after cameras ({', '.join(cameras)}), or"
             f" calibration.names={{photograph: camera}}; found {', '.join(unknown)}"
         )
-    require(len(found) >= 2, str(folder), "2 photographs or more", len(found))
-    by_camera = {names.get(name, name): value for name, value in found.items()}
-    require(len(by_camera) == len(found), "calibration.names", "one photograph for each camera", dict(names))
+    require(len(values) >= 2, str(folder), "2 photographs or more", len(values))
+    by_camera = {names.get(name, name): value for name, value in values.items()}
+    require(
+        len(by_camera) == len(values),
+        "calibration.names",
+        "one photograph for each camera",
+        dict(names),
+    )
     return by_camera

@@ -1,8 +1,9 @@
-"""Photographs in, Gaussians out, in the user's world."""
+"""Gaussians of a capture in the user's world, and of any batch after its cameras are corrected."""
 
+import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,14 +23,14 @@ from ghgs_lit.weights.reading import SHIPPED, file_of
 
 
 @dataclass(frozen=True)
-class CapturePrediction:
-    """What a model makes of a capture, in the user's world and unit.
+class TimedPrediction:
+    """A prediction with the batch that the model saw.
 
     Attributes:
-        batch: what the model saw: crops around the subject, with their cameras, corrected ones where asked.
-        prediction: of this batch.
+        batch: photographs (of a capture: crops around the subject), masks and cameras, corrected where asked.
+        prediction: of this batch, in the world and unit of its cameras.
         seconds: run time by stage.
-        moved: pixels that correcting moved the subject by in each crop; nothing where cameras stay.
+        moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
         changed: which share of the subject refining changed in each crop; nothing where masks stay.
     """
 
@@ -51,7 +52,7 @@ def predict(
     size: int | tuple[int, int] | None = None,
     refine_cameras: int = 0,
     refine_masks: int = 0,
-) -> CapturePrediction:
+) -> TimedPrediction:
     """The Gaussians of a capture.
 
     Args:
@@ -62,7 +63,7 @@ def predict(
             (checkpoints only).
         refine_cameras: rounds, at most, that correct the cameras until the photographs agree
             (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
-        refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then found in the
+        refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then searched in the
             photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
 
     Raises:
@@ -73,28 +74,52 @@ def predict(
         size = size or trained_size(read_checkpoint(path)["config"])
         model = _model(path, path.stat().st_mtime_ns)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
-    seconds, moved = {}, ()
+    seconds: dict[str, float] = {}
     batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
     batch = batch.to(next(model.parameters()).device)
-    start = time.perf_counter()
+
+    def in_frame(batch: Batch) -> Prediction:
+        # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
+        frame = Frame.of(batch)
+        return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
+
+    result = predict_batch(batch, model, Renderer(), refine_cameras, in_frame)
+    return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed)
+
+
+def predict_batch(
+    batch: Batch,
+    model: GHGS,
+    renderer: Renderer,
+    refine_cameras: int = 0,
+    forward: Callable[[Batch], Prediction] | None = None,
+) -> TimedPrediction:
+    """The Gaussians of a batch of one subject, which keeps its targets.
+
+    Args:
+        batch: photographs, masks and cameras.
+        model: on the device of the batch.
+        renderer: draws what :class:`CameraRefinement` compares.
+        refine_cameras: its rounds, at most; 0: none.
+        forward: the prediction of a batch without targets; None: the model's.
+    """
+    moved, seconds, start = (), {}, time.perf_counter()
     if refine_cameras:
-        taken, batch = batch, CameraRefinement(refine_cameras, model, Renderer())(batch)
-        moved = tuple(pixels_moved(taken, batch)[0])
+        given, batch = batch, CameraRefinement(refine_cameras, model, renderer)(batch)
+        moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
-    start = time.perf_counter()
-    # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
-    frame = Frame.of(batch)
-    prediction = frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
+        start = time.perf_counter()
+    prediction = (forward or model)(dataclasses.replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
-    return CapturePrediction(batch, prediction, seconds, moved, changed)
+    return TimedPrediction(batch, prediction, seconds, moved)
 
 
 def _crops(
     capture: Capture, size: tuple[int, int], refine_masks: int, seconds: dict[str, float]
 ) -> tuple[Batch, tuple[float, ...]]:
-    """What the model sees, and by how much refining changed each matte; notes the run time of both."""
+    """The batch that the model sees, and by how much refining changed each matte; notes the run times."""
     start = time.perf_counter()
     given = capture.batch(size)
     seconds["crop"] = time.perf_counter() - start

@@ -1,30 +1,63 @@
-"""Gaussians in the compact formats of 3DGS viewers, which the package gaussforge makes from the PLY.
+"""Gaussians in the compact formats of 3DGS viewers.
 
 They store few bits: ``docs/evidence/outputs.md`` has their sizes and what is lost.
 """
 
-from pathlib import Path
+from collections.abc import Mapping
 
-from ghgs_lit.files import write_atomically
+import numpy as np
+import torch
+from torch import Tensor
 
-FORMATS = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
-"""What gaussforge, and the suffix of files, calls each format."""
+from ghgs_lit.prediction.export.ply import stored_values
+from ghgs_lit.types import Gaussians
+
+CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
+"""Formats that the package gaussforge makes from a PLY; what it, and the suffix of files, calls each."""
+
+RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+"""One Gaussian of ``.splat``, which has no header: position and standard deviations, colour and opacity, and
+the rotation (w, x, y, z), of which 128 is zero."""
 
 
-def write_compact(ply: bytes, path: Path, name: str) -> None:
-    """Write a PLY of Gaussians in another format.
+def converted(ply: bytes, name: str) -> bytes:
+    """The content of a file of another format.
 
     Args:
-        ply: the content of a file of :func:`ghgs_lit.prediction.export.ply.write_ply`.
-        path: the file to write.
-        name: one of ``FORMATS``.
+        ply: of a file of :func:`ghgs_lit.prediction.export.ply.write_ply`.
+        name: one of ``CONVERTED``.
 
     Raises:
         RuntimeError: gaussforge refuses.
     """
     from gaussforge import GaussForge
 
-    answer = GaussForge().convert(ply, "ply", FORMATS[name])
+    answer = GaussForge().convert(ply, "ply", CONVERTED[name])
     if answer.get("error"):
-        raise RuntimeError(f"{path}: gaussforge: {answer['error']}")
-    write_atomically(path, lambda temporary: temporary.write_bytes(answer["data"]))
+        raise RuntimeError(f"{name}: gaussforge: {answer['error']}")
+    return answer["data"]
+
+
+def to_records(gaussians: Gaussians) -> np.ndarray:
+    """The records [N] of dtype ``RECORD`` of the Gaussians of one subject with RGB colours.
+
+    Large and opaque ones come first, so that a part of a ``.splat`` file is a picture, too.
+    """
+    values = {name: value[visible_first(gaussians).cpu()] for name, value in stored_values(gaussians).items()}
+    records = np.empty(len(gaussians), RECORD)
+    records["mean"], records["scale"] = values["means"].numpy(), values["scales"].numpy()
+    records["color"] = rgba(values).numpy()
+    records["rotation"] = (values["quaternions"] * 128 + 128).round().clamp(0, 255).byte().numpy()
+    return records
+
+
+def visible_first(gaussians: Gaussians) -> Tensor:
+    """Indices [N] of the Gaussians, large and opaque ones first."""
+    size = gaussians.scales.double().prod(-1) * gaussians.opacities
+    return size.argsort(descending=True, stable=True)
+
+
+def rgba(values: Mapping[str, Tensor]) -> Tensor:
+    """Colours and opacities [N, 4] uint8 of :func:`ghgs_lit.prediction.export.ply.stored_values`."""
+    colors = torch.cat([values["colors"], values["opacities"][:, None]], dim=-1)
+    return (colors.clamp(0, 1) * 255).round().byte()

@@ -4,14 +4,12 @@ The vertices are in the world of the files; glTF's up is +y, so a node turns the
 without the extension show coloured points.
 """
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
 from ghgs_lit.errors import require
-from ghgs_lit.files import write_atomically
-from ghgs_lit.prediction.export.ply import SH_CONSTANT
+from ghgs_lit.prediction.export.compact import rgba
+from ghgs_lit.prediction.export.ply import SH_CONSTANT, stored_values
 from ghgs_lit.prediction.export.world import AXES, turn
 from ghgs_lit.types import Gaussians
 
@@ -24,13 +22,12 @@ _KERNEL = {
 }
 
 
-def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
-    """Write the Gaussians of one subject (RGB colours).
+def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
+    """The content of a file of the Gaussians of one subject (RGB colours).
 
     Args:
         gaussians: in the world of the files.
         up: the unit vector [3] of that world that points up.
-        path: the file to write.
 
     Raises:
         InputError: there are none: glTF has no empty lists.
@@ -39,18 +36,14 @@ def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
 
     require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)
 
-    means, scales, quaternions, opacities, colors = (
-        getattr(gaussians, name).detach().float().cpu()
-        for name in ("means", "scales", "quaternions", "opacities", "colors")
-    )
-    rgba = torch.cat([colors, opacities[:, None]], dim=-1).clamp(0, 1) * 255
+    stored = stored_values(gaussians)
     columns = {
-        "POSITION": means,
-        "COLOR_0": rgba.round().byte(),
-        f"{EXTENSION}:ROTATION": torch.nn.functional.normalize(quaternions, dim=-1)[:, [1, 2, 3, 0]],
-        f"{EXTENSION}:SCALE": scales,
-        f"{EXTENSION}:OPACITY": opacities.clamp(0, 1),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (colors - 0.5) / SH_CONSTANT,
+        "POSITION": stored["means"],
+        "COLOR_0": rgba(stored),
+        f"{EXTENSION}:ROTATION": stored["quaternions"][:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": stored["scales"],
+        f"{EXTENSION}:OPACITY": stored["opacities"].clamp(0, 1),
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": (stored["colors"] - 0.5) / SH_CONSTANT,
     }
     model, blob = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[0])]), b""
     for name, values in columns.items():
@@ -79,5 +72,4 @@ def write_glb(gaussians: Gaussians, up: torch.Tensor, path: Path) -> None:
     )
     model.extensionsUsed, model.buffers = [EXTENSION], [gltf.Buffer(byteLength=len(blob))]
     model.set_binary_blob(blob)
-    content = b"".join(model.save_to_bytes())
-    write_atomically(path, lambda temporary: temporary.write_bytes(content))
+    return b"".join(model.save_to_bytes())

@@ -7,35 +7,32 @@ import json
 import re
 from collections.abc import Sequence
 from importlib.resources import files
-from pathlib import Path
 
 from torch import Tensor
 
-from ghgs_lit.files import write_text_atomically
-from ghgs_lit.geometry.projection import look_at_point
-from ghgs_lit.prediction.export.splat import to_records
+from ghgs_lit.prediction.export.compact import to_records
 from ghgs_lit.types import Cameras, Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
 
 
-def write_page(
-    gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tensor, name: str, path: Path
-) -> None:
-    """Write the page; it begins at the first camera, and has a button for each.
+def page(
+    gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tensor, center: Tensor, name: str
+) -> str:
+    """The text of the page, which begins at the first camera, and has a button for each.
 
     Args:
         gaussians: of one subject, RGB colours.
         cameras: of the photographs [V].
         views: their names.
         up: the unit vector [3] that points up.
+        center: the point [3] that it turns about.
         name: of the subject, for the title.
-        path: the file to write.
     """
     scene = {
         "size": [cameras.width, cameras.height],
         "up": up.tolist(),
-        "target": look_at_point(cameras).tolist(),
-        "pixel": pixel_size(cameras),
+        "target": center.tolist(),
+        "pixel": pixel_size(cameras, center),
         "low_pass": gaussians.low_pass,
         "antialiased": gaussians.antialiased,
         "cameras": [
@@ -53,4 +50,4 @@ def write_page(
         "scene": json.dumps(scene).replace("</", "<\\/"),
         "data": data,
     }
-    write_text_atomically(path, re.sub(r"\{\{(\w+)\}\}", lambda place: values[place[1]], text))
+    return re.sub(r"\{\{(\w+)\}\}", lambda name: values[name[1]], text)

@@ -1,15 +1,19 @@
 """Gaussians as the PLY file that viewers of 3D Gaussian Splatting read.
 
 Positions in metres in the world frame, opacity as logit, standard deviations as logarithm, unit quaternions
-``(w, x, y, z)``, colour as the constant term of spherical harmonics.
+``(w, x, y, z)``, colour as the constant term of spherical harmonics. A comment of the header has the
+constants of the image that the Gaussians were made for; other programs ignore it.
 """
 
+import re
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
 from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
@@ -17,6 +21,8 @@ from ghgs_lit.types import Gaussians
 
 SH_CONSTANT = 0.5 / np.sqrt(np.pi)
 """Value of the constant spherical harmonic: colour = 0.5 + SH_CONSTANT * f_dc."""
+_CONSTANTS = "ghgs_lit low_pass={low_pass!r} antialiased={antialiased}"
+_CONSTANTS_PATTERN = re.compile(r"ghgs_lit low_pass=(\S+) antialiased=(True|False)")
 _OPACITY_LIMIT = 1e-6  # a logit of exactly 0 or 1 is infinite
 _SMALLEST_SCALE = 1e-9  # metres
 _GROUPS = {
@@ -44,40 +50,58 @@ def ply_bytes(gaussians: Gaussians) -> bytes:
     require(len(gaussians.splits) == 1, "write_ply", "the Gaussians of one subject", len(gaussians.splits))
     channels = gaussians.colors.shape[1]
     require(channels == 3, "write_ply", "colours of 3 channels", channels)
-    fields = ("means", "quaternions", "scales", "opacities", "colors")
-    means, quaternions, scales, opacities, colors = (
-        getattr(gaussians, name).detach().to("cpu", torch.float64) for name in fields
-    )
-    values = {
-        "means": means,
-        "normals": torch.zeros_like(means),
-        "colors": (colors - 0.5) / SH_CONSTANT,
-        "opacities": torch.logit(opacities.clamp(_OPACITY_LIMIT, 1 - _OPACITY_LIMIT))[:, None],
-        "scales": scales.clamp(min=_SMALLEST_SCALE).log(),
-        "quaternions": torch.nn.functional.normalize(quaternions, dim=-1),
+    values = stored_values(gaussians, torch.float64)
+    opacities = values["opacities"].clamp(_OPACITY_LIMIT, 1 - _OPACITY_LIMIT)
+    values |= {
+        "normals": torch.zeros_like(values["means"]),
+        "colors": (values["colors"] - 0.5) / SH_CONSTANT,
+        "opacities": torch.logit(opacities)[:, None],
+        "scales": values["scales"].clamp(min=_SMALLEST_SCALE).log(),
     }
-    vertices = np.empty(len(gaussians), dtype=[(name, "<f4") for names in _GROUPS.values() for name in names])
-    for group, names in _GROUPS.items():
-        for column, name in enumerate(names):
-            vertices[name] = values[group][:, column].numpy()
+    columns = {
+        name: values[group][:, i].numpy().astype("<f4")
+        for group, names in _GROUPS.items()
+        for i, name in enumerate(names)
+    }
+    low_pass, antialiased = float(gaussians.low_pass), bool(gaussians.antialiased)
+    return vertices_ply(columns, [_CONSTANTS.format(low_pass=low_pass, antialiased=antialiased)])
+
+
+def stored_values(gaussians: Gaussians, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """Means, scales, unit quaternions, opacities and colours on the CPU, by the names of their fields."""
+    names = ("means", "scales", "quaternions", "opacities", "colors")
+    values = {name: getattr(gaussians, name).detach().to("cpu", dtype) for name in names}
+    return values | {"quaternions": torch.nn.functional.normalize(values["quaternions"], dim=-1)}
+
+
+def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()) -> bytes:
+    """The content of a binary PLY with a vertex for each row of the columns [N]."""
+    vertices = np.rec.fromarrays(list(columns.values()), names=list(columns))
     content = BytesIO()
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(content)
+    elements = [PlyElement.describe(np.asarray(vertices), "vertex")]
+    PlyData(elements, byte_order="<", comments=list(comments)).write(content)
     return content.getvalue()
 
 
 def read_ply(path: Path) -> Gaussians:
     """Read such a file as the Gaussians of one subject, without colours that depend on the direction.
 
+    A file without this package's comment is taken for one that was made for 3D Gaussian Splatting's own
+    renderer: a low-pass of 0.3 px^2, not antialiased.
+
     Raises:
         InputError: not such a file.
     """
     try:
-        vertices = PlyData.read(path)["vertex"]
+        content = PlyData.read(path)
+        vertices = content["vertex"]
         columns = {
             group: torch.from_numpy(np.stack([np.asarray(vertices[n], np.float32) for n in names], -1))
             for group, names in _GROUPS.items()
             if group != "normals"
         }
+        matches = filter(None, map(_CONSTANTS_PATTERN.fullmatch, content.comments))
+        constants = [{"low_pass": float(m[1]), "antialiased": m[2] == "True"} for m in matches]
     except (PlyParseError, KeyError, ValueError) as error:
         raise InputError(f"{path}: expected a 3D Gaussian Splatting PLY; found {error}") from error
     return Gaussians(
@@ -87,4 +111,5 @@ def read_ply(path: Path) -> Gaussians:
         opacities=columns["opacities"][:, 0].sigmoid(),
         colors=columns["colors"] * SH_CONSTANT + 0.5,
         splits=(len(columns["means"]),),
+        **(constants[0] if constants else {}),
     )

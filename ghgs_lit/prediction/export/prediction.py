@@ -1,96 +1,165 @@
-"""Everything that is written of a prediction: one entry of ``WRITERS`` for each format."""
+"""Everything that is written of a prediction: one entry of ``FORMATS`` for each format."""
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
-from ghgs_lit.prediction.export.compact import FORMATS, write_compact
-from ghgs_lit.prediction.export.gltf import write_glb
-from ghgs_lit.prediction.export.maps import depth_unit, write_depths, write_inputs, write_points
-from ghgs_lit.prediction.export.page import write_page
-from ghgs_lit.prediction.export.ply import ply_bytes, write_ply
-from ghgs_lit.prediction.export.scene import OutputOptions, Scene, options_of, scene_of
-from ghgs_lit.prediction.export.splat import to_records
-from ghgs_lit.prediction.export.video import write_mp4
+from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
+from ghgs_lit.prediction.export.gltf import glb_bytes
+from ghgs_lit.prediction.export.maps import depth_files, depth_unit, input_files, png, points_ply
+from ghgs_lit.prediction.export.page import page
+from ghgs_lit.prediction.export.ply import ply_bytes
+from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_name
+from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.runs.results import plain
 from ghgs_lit.types import Batch, Prediction
-from ghgs_lit.visualization.pictures import save_png, sheet
+from ghgs_lit.visualization.pictures import sheet
 
 
-def _ply(scene: Scene, directory: Path) -> list[Path]:
-    path = directory / "gaussians.ply"
-    write_ply(scene.stored, path)
-    return [path]
+@dataclass(frozen=True)
+class Format:
+    """One format.
+
+    Attributes:
+        files: their names below the directory of the prediction; one with ``{view}`` or ``{frame}`` stands
+            for a file of each view, or of each picture of the turntable.
+        contents: of these files, in their order.
+        package: that it needs.
+        extra: of this package, which installs it.
+    """
+
+    files: tuple[str, ...]
+    contents: Callable[[ExportedSubject], Iterable[bytes]]
+    package: str | None = None
+    extra: str = "formats"
+
+    def names(self, views: Sequence[str], frames: int) -> list[str]:
+        """The names of all files."""
+        names = []
+        for pattern in self.files:
+            if "{view}" in pattern:
+                names += [pattern.format(view=file_name(view)) for view in views]
+            elif "{frame" in pattern:
+                names += [pattern.format(frame=frame) for frame in range(frames)]
+            else:
+                names.append(pattern)
+        return names
 
 
-def _compact(scene: Scene, directory: Path, name: str) -> list[Path]:
-    path = directory / f"gaussians.{FORMATS[name]}"
-    write_compact(ply_bytes(scene.stored), path, name)
-    return [path]
+def _converted(name: str) -> Format:
+    contents = partial(_contents_of_converted, name=name)
+    return Format((f"gaussians.{CONVERTED[name]}",), contents, "gaussforge")
 
 
-def _splat(scene: Scene, directory: Path) -> list[Path]:
-    path = directory / "gaussians.splat"
-    data = to_records(scene.stored).tobytes()
-    write_atomically(path, lambda temporary: temporary.write_bytes(data))
-    return [path]
+def _contents_of_converted(subject: ExportedSubject, name: str) -> Iterable[bytes]:
+    return [converted(ply_bytes(subject.for_other_renderers), name)]
 
 
-def _glb(scene: Scene, directory: Path) -> list[Path]:
-    path = directory / "gaussians.glb"
-    write_glb(scene.stored, scene.up, path)
-    return [path]
+def _html(subject: ExportedSubject) -> Iterable[bytes]:
+    text = page(subject.gaussians, subject.cameras, subject.views, subject.up, subject.center, subject.name)
+    return [text.encode()]
 
 
-def _html(scene: Scene, directory: Path) -> list[Path]:
-    path = directory / "viewer.html"
-    write_page(scene.gaussians, scene.cameras, scene.views, scene.up, scene.name, path)
-    return [path]
+#: The file that lists the others.
+REPORT = "report.json"
 
-
-def _turntable(scene: Scene, directory: Path) -> list[Path]:
-    """Pictures from all around, ``turntable/000.png`` and so on."""
-    paths = [directory / "turntable" / f"{frame:03d}.png" for frame in range(scene.options.frames)]
-    for picture, path in zip(scene.turntable, paths, strict=True):
-        save_png(picture, path)
-    return paths
-
-
-def _mp4(scene: Scene, directory: Path) -> list[Path]:
-    path = directory / "turntable.mp4"
-    write_mp4(scene.turntable, path, scene.options.fps)
-    return [path]
-
-
-WRITERS: dict[str, Callable[[Scene, Path], list[Path]]] = {
-    "ply": _ply,
-    **{name: partial(_compact, name=name) for name in FORMATS},
-    "splat": _splat,
-    "glb": _glb,
-    "html": _html,
-    "turntable": _turntable,
-    "mp4": _mp4,
-    "depth": write_depths,
-    "points": write_points,
-    "inputs": write_inputs,
+FORMATS: dict[str, Format] = {
+    "ply": Format(("gaussians.ply",), lambda s: [ply_bytes(s.stored)]),
+    **{name: _converted(name) for name in CONVERTED},
+    "splat": Format(("gaussians.splat",), lambda s: [to_records(s.for_other_renderers).tobytes()]),
+    "glb": Format(("gaussians.glb",), lambda s: [glb_bytes(s.for_other_renderers, s.up)], "pygltflib"),
+    "html": Format(("viewer.html",), _html),
+    "turntable": Format(("turntable/{frame:03d}.png",), lambda s: map(png, s.turntable)),
+    "mp4": Format(
+        ("turntable.mp4",), lambda s: [mp4_bytes(s.turntable, s.options.fps)], "imageio_ffmpeg", "video"
+    ),
+    "depth": Format(("depth/{view}.png", "depth.npz"), depth_files),
+    "points": Format(("points.ply",), lambda s: [points_ply(s)]),
+    "inputs": Format(("inputs/{view}.png", "cameras.json"), input_files),
 }
-"""The writer of each format: writes into a directory and returns the paths."""
 
 
 def output_options(config: Mapping[str, Any]) -> OutputOptions:
-    """The options of a verb's configuration, checked before any work (:func:`options_of`)."""
-    return options_of(config, tuple(WRITERS))
+    """The options of a verb's configuration, checked before any work.
+
+    Args:
+        config: plain data with ``formats`` (``all`` stands for all of them), ``up``, ``smooth`` and
+            ``turntable``.
+
+    Raises:
+        InputError: an unknown format, a value out of range, or a package that is not installed.
+    """
+    formats = config["formats"]
+    formats = [formats] if isinstance(formats, str) else formats
+    formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
+    for name in formats:
+        choice("formats", name, ("all", *FORMATS))
+        needed = FORMATS[name].package
+        if needed is not None and find_spec(needed) is None:
+            hint = f"pip install 'ghgs-lit[{FORMATS[name].extra}]'"
+            raise InputError(f"formats: expected the package {needed} for {name} ({hint}); found none")
+    frames = config["turntable"]["frames"]
+    require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
+    return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])
+
+
+def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
+    """The names below the directory of all files that :func:`write_prediction` writes of these views."""
+    names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
+    return [*names, "sheet.png", REPORT]
+
+
+def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
+    """Refuse to replace an input, or a file that :func:`write_prediction` did not write.
+
+    Args:
+        directory: of the outputs.
+        names: of these, below it.
+        inputs: files that are read.
+
+    Raises:
+        InputError: names the first such file.
+    """
+    read = {path.resolve() for path in inputs}
+    written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
+    for name in names:
+        path = directory / name
+        if path.resolve() in read:
+            raise InputError(
+                f"{path}: expected another folder (out=...) than that of an input; found the input"
+            )
+        if path.exists() and name not in written:
+            expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
+            raise InputError(f"{path}: expected {expected}; found another file")
+
+
+def _report_before(directory: Path) -> dict[str, Any]:
+    """The report of an earlier prediction in a directory; empty where there is none."""
+    try:
+        report = json.loads((directory / REPORT).read_text())
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) and isinstance(report.get("files"), dict) else {}
+
+
+def _written_before(directory: Path) -> list[str]:
+    """The files that earlier predictions wrote into a directory."""
+    report = _report_before(directory)
+    return [*report.get("files", ()), *report.get("earlier_files", ())]
 
 
 @torch.no_grad()
@@ -107,7 +176,7 @@ def write_prediction(
     Lengths in the files are in the unit of the batch's cameras.
 
     Args:
-        directory: files of these names are replaced, others stay.
+        directory: files that an earlier prediction wrote are replaced, others stay.
         batch: photographs, masks and cameras of the subject; the sheet compares renders with targets, too.
         prediction: of this batch.
         renderer: draws the turntable, and the input views for the report.
@@ -118,45 +187,59 @@ def write_prediction(
         What was written, ``report.json`` last.
 
     Raises:
-        InputError: several subjects.
+        InputError: several subjects, or a file of another origin is in the way.
     """
-    scene = scene_of(batch, prediction, renderer, options)
+    subject = exported_subject(batch, prediction, renderer, options)
+    names = output_files(options, subject.views)
+    require_free(directory, names)
+    earlier = [n for n in _written_before(directory) if n not in names and (directory / n).exists()]
+    # Before the files: those of a run that is cut off are known as ours, too.
+    known = {"files": dict.fromkeys(names[:-1]), "earlier_files": earlier}
+    write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
     paths, seconds = [], {}
+
+    def write(name: str, content: bytes) -> None:
+        paths.append(directory / name)
+        write_atomically(paths[-1], lambda temporary: temporary.write_bytes(content))
+
     for name in options.formats:
         begin = time.perf_counter()
-        paths += WRITERS[name](scene, directory)
+        names = FORMATS[name].names(subject.views, options.frames)
+        for file, content in zip(names, FORMATS[name].contents(subject), strict=True):
+            write(file, content)
         seconds[f"write {name}"] = time.perf_counter() - begin
     image = None if batch.targets is None else renderer(prediction.gaussians, batch.targets.cameras).image
-    paths.append(directory / "sheet.png")
-    save_png(sheet(batch, image, 0, prediction.depth, prediction.depth_valid), paths[-1])
+    write("sheet.png", png(sheet(batch, image, 0, prediction.depth, prediction.depth_valid)))
     facts = dict(facts or {})
-    report = {**_report(scene), **facts, "seconds": {**facts.get("seconds", {}), **seconds}}
+    report = {**_report(subject), **facts, "seconds": {**facts.get("seconds", {}), **seconds}}
     report["files"] = {str(path.relative_to(directory)): path.stat().st_size for path in paths}
-    path = directory / "report.json"
+    if earlier:
+        report["earlier_files"] = earlier
+    path = directory / REPORT
     write_text_atomically(path, json.dumps(plain(report), indent=1, allow_nan=False))
     return [*paths, path]
 
 
-def _report(scene: Scene) -> dict[str, Any]:
-    """Counts and checks of a scene; PSNR in dB in the box of the subject says how the inputs are met."""
-    gaussians, valid = scene.gaussians, scene.depth_valid
-    lost = scene.masks & ~valid
-    image = scene.renderer(gaussians, scene.cameras[None]).image[0].clamp(0, 1)
-    quality = psnr(image, scene.images, box_of(scene.masks)).tolist()
+def _report(subject: ExportedSubject) -> dict[str, Any]:
+    """Counts and checks of a subject; PSNR in dB in the box of the subject says how the inputs are met."""
+    gaussians, valid = subject.gaussians, subject.depth_valid
+    lost = subject.masks & ~valid
+    image = subject.renderer(gaussians, subject.cameras[None]).image[0].clamp(0, 1)
+    quality = psnr(image, subject.images, box_of(subject.masks)).tolist()
     means = gaussians.means if len(gaussians) else gaussians.means.new_full((1, 3), torch.nan)
     return {
-        "subject": scene.name,
-        "views": list(scene.views),
+        "subject": subject.name,
+        "views": list(subject.views),
         "gaussians": len(gaussians),
-        "gaussians_not_finite": scene.dropped,
-        "frame": "world of the cameras" if scene.options.up is None else f"up is +{scene.options.up}",
-        "up": scene.up.tolist(),
+        "gaussians_not_finite": subject.dropped,
+        "frame": "world of the cameras" if subject.options.up is None else f"up is +{subject.options.up}",
+        "up": subject.up.tolist(),
         "subject_size": None if gaussians.metre is None else HEIGHT * float(gaussians.metre[0]),
         "smallest": means.amin(0).tolist(),
         "largest": means.amax(0).tolist(),
-        "depths_not_finite": dict(zip(scene.views, lost.flatten(1).sum(1).tolist(), strict=True)),
-        "depth_pixels": dict(zip(scene.views, valid.flatten(1).sum(1).tolist(), strict=True)),
-        "depth_png_unit": depth_unit(float(torch.where(valid, scene.depth, 0).max())),
-        "psnr_box_of_inputs": dict(zip(scene.views, quality, strict=True)),
+        "depths_not_finite": dict(zip(subject.views, lost.flatten(1).sum(1).tolist(), strict=True)),
+        "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
+        "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
+        "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
         "versions": versions(),
     }

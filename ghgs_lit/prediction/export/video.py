@@ -2,10 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
-
-from ghgs_lit.files import write_atomically
 
 # RGB is told apart from video levels by these: a player that guesses the matrix shows other colours.
 _COLORS = (
@@ -13,31 +12,29 @@ _COLORS = (
 )
 
 
-def write_mp4(pictures: Sequence[np.ndarray], path: Path, fps: int) -> None:
-    """Write pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
+def mp4_bytes(pictures: Sequence[np.ndarray], fps: int) -> bytes:
+    """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
 
     Args:
         pictures: at least one.
-        path: the file to write.
         fps: pictures per second.
     """
     import imageio_ffmpeg
 
     height, width = pictures[0].shape[:2]
     pad = ((0, height % 2), (0, width % 2), (0, 0))
-
-    def write(temporary: Path) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "video.mp4")
         writer = imageio_ffmpeg.write_frames(
-            str(temporary),
+            str(path),
             (width + width % 2, height + height % 2),
             fps=fps,
             quality=8,
             macro_block_size=2,
-            output_params=[*_COLORS.split(), "-movflags", "+faststart", "-f", "mp4"],
+            output_params=[*_COLORS.split(), "-movflags", "+faststart"],
         )
         writer.send(None)
         for picture in pictures:
             writer.send(np.ascontiguousarray(np.pad(picture, pad, mode="edge")))
         writer.close()
-
-    write_atomically(path, write)
+        return path.read_bytes()

@@ -48,10 +48,13 @@ _TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
 
 @dataclass(frozen=True)
 class _Views:
-    """What is drawn in each of the ``n`` views of a batch, and what it is compared with."""
+    """The ``n`` views of a batch, each with the Gaussians that are drawn in it and its photograph.
+
+    ``owner`` is the number of the view that each of the ``N`` Gaussians is drawn in.
+    """
 
     gaussians: Gaussians
-    own: Int[Tensor, " N"]
+    owner: Int[Tensor, " N"]
     cameras: Cameras
     photographs: Float[Tensor, "n 3 H W"]
     silhouettes: Float[Tensor, "n H W"]
@@ -89,8 +92,8 @@ class CameraRefinement:
                 break
             inside, moved = dataclasses.replace(inside, cameras=cameras), moved | is_better
         # To the frame and back is not exact.
-        found = _chosen(moved, frame.leave_cameras(inside.cameras, batch.cameras), batch.cameras)
-        return dataclasses.replace(batch, cameras=found)
+        cameras = _chosen(moved, frame.leave_cameras(inside.cameras, batch.cameras), batch.cameras)
+        return dataclasses.replace(batch, cameras=cameras)
 
     @torch.no_grad()
     def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Float[Tensor, " B"]]:
@@ -108,7 +111,7 @@ class CameraRefinement:
         return dataclasses.replace(batch, cameras=cameras), is_better, first
 
     def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
-        """What the rounds make small, with the cameras as they are."""
+        """The loss of the rounds with the cameras as they are."""
         views = _views(self.predict(batch), batch)
         return _loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
@@ -136,8 +139,8 @@ class CameraRefinement:
         with torch.autocast(axes.device.type, enabled=False):
             motion = without_common(raw.detach(), axes)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
-        found = dataclasses.replace(cameras, extrinsics=extrinsics)
-        return _chosen(is_better, found, cameras), is_better
+        corrected = dataclasses.replace(cameras, extrinsics=extrinsics)
+        return _chosen(is_better, corrected, cameras), is_better
 
 
 def _chosen(which: Bool[Tensor, " B"], first: Cameras, second: Cameras) -> Cameras:
@@ -151,7 +154,7 @@ def _chosen(which: Bool[Tensor, " B"], first: Cameras, second: Cameras) -> Camer
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
-    """How far the subject moved in each view's photograph: the root mean square over a box around it."""
+    """Pixels that the subject moved by in each photograph [B][V], root mean square over a box around it."""
     frame = Frame.of(before)
     corners = HEIGHT / 2 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], device=before.masks.device)] * 3)
     seen = []
@@ -175,14 +178,14 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
     others = gaussians.select(torch.cat(kept), counts)
     if others.metre is not None:
         others = dataclasses.replace(others, metre=others.metre.repeat_interleave(v))
-    own = torch.repeat_interleave(torch.tensor(counts, device=element.device))
+    owner = torch.repeat_interleave(torch.tensor(counts, device=element.device))
     cameras = batch.cameras
     lenses, poses = (matrix.flatten(0, 1)[:, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
     apart = Cameras(lenses, poses, cameras.height, cameras.width)
     photographs = at_least_float32(on_black(batch)).flatten(0, 1)
     return _Views(
         others,
-        own,
+        owner,
         apart,
         photographs,
         coverage(batch).flatten(0, 1),
@@ -192,7 +195,7 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
 
 def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
     """The Gaussians of each view, moved as if its camera had moved the other way; their axes stay."""
-    rotations, shifts = (value.flatten(0, 1)[views.own] for value in rigid(motion, HEIGHT / 2))
+    rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
     return dataclasses.replace(views.gaussians, means=means)
 

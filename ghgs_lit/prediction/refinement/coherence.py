@@ -31,7 +31,7 @@ _FAR = 20.0
 _FROM, _TO = 0.25, 8.0
 #: Half the width in pixels over which a slope of a distance map is taken.
 _REACH = 0.75
-#: Mean distance in pixels of rays near outlines that is none: silhouettes explain one another.
+#: Mean distance in pixels of rays near outlines below which silhouettes explain one another.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
 #: of the logarithms of focal lengths over it: lenses are known better than where cameras stand.
@@ -43,9 +43,9 @@ class _Phase:
     """Some steps, what they make small, and the weight of a ray whose distance is ``r`` pixels.
 
     First, rays must meet the other silhouettes: those that do have no weight, those that miss them by more
-    than ``scale`` one that falls with 1 / r. Then, exactly as deep as they lie in their own: of a
-    silhouette and of one from behind both outlines show nearly the same points. Other rays differ by more
-    than ``scale``, and lose their weight (Geman and McClure).
+    than ``scale`` one that falls with 1 / r. Then, they must lie as deep in the others as in their
+    own: outlines seen from the front and from behind show nearly the same points. Rays that differ by more
+    than ``scale`` lose their weight (Geman and McClure).
     """
 
     steps: int
@@ -53,8 +53,8 @@ class _Phase:
     scale: float
     is_exact: bool
 
-    def distances(self, depth: Tensor, own: Tensor) -> Tensor:
-        return depth - own if self.is_exact else depth.clamp(max=0)
+    def distances(self, depth: Tensor, depth_at_home: Tensor) -> Tensor:
+        return depth - depth_at_home if self.is_exact else depth.clamp(max=0)
 
     def weights(self, r: Tensor) -> Tensor:
         if self.is_exact:
@@ -67,12 +67,14 @@ _PHASES = (_Phase(12, _TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=Tr
 
 @dataclass(frozen=True)
 class _Outlines:
-    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it."""
+    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it.
+
+    Ray ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside the outline."""
 
     maps: Float[Tensor, "V 1 h w"]
     view: Int[Tensor, " R"]
     pixels: Float[Tensor, "R 2"]
-    own: Float[Tensor, " R"]
+    depth: Float[Tensor, " R"]
     size: tuple[int, int]
 
     @classmethod
@@ -86,9 +88,9 @@ class _Outlines:
         maps = maps.clamp(-_FAR, _FAR).to(mattes)
         view = torch.arange(len(mattes))[:, None, None].expand(-1, *size)
         pixels = pixel_centers(*size, mattes).expand(*view.shape, 2)
-        own = sample(maps, view, _FINER * pixels)[..., 0]
-        near = (own >= _FROM) & (own <= _TO)
-        return cls(maps, view[near], pixels[near], own[near], size)
+        depth = sample(maps, view, _FINER * pixels)[..., 0]
+        near = (depth >= _FROM) & (depth <= _TO)
+        return cls(maps, view[near], pixels[near], depth[near], size)
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
         """Distances at pixels; beyond the photograph those of its border, where a subject may go on."""
@@ -142,16 +144,16 @@ def coherent_cameras(batch: Batch) -> tuple[Cameras, Float[Tensor, " B"]]:
     """
     cameras = batch.cameras
     parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)
-    # A small problem of many short steps, and distances to outlines are found on a CPU.
+    # A small problem of many short steps, and distances to outlines are computed on a CPU.
     elements = zip(*(part.float().cpu() for part in parts), strict=True)
     with torch.autocast("cpu", enabled=False):
         lenses, poses, distances = zip(*(_coherent(*element) for element in elements), strict=True)
-    found = dataclasses.replace(
+    moved = dataclasses.replace(
         cameras,
         intrinsics=torch.stack(lenses).to(cameras.intrinsics),
         extrinsics=torch.stack(poses).to(cameras.extrinsics),
     )
-    return found, torch.tensor(distances, device=batch.masks.device)
+    return moved, torch.tensor(distances, device=batch.masks.device)
 
 
 def _coherent(
@@ -159,15 +161,15 @@ def _coherent(
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], float]:
     """Intrinsics and extrinsics of one element after all steps, and the mean distance with the given ones."""
     outlines, given, first = _Outlines.of(mattes), (lens, pose), None
-    if not len(outlines.own):
+    if not len(outlines.depth):
         return *given, math.inf
     for phase in _PHASES:
         for _ in range(phase.steps):
-            *found, distance = _step(outlines, lens, pose, phase)
+            next_lens, next_pose, distance = _step(outlines, lens, pose, phase)
             first = float(distance) if first is None else first
             if first < _COHERENT:
                 return *given, first
-            lens, pose = found
+            lens, pose = next_lens, next_pose
     return lens, pose, first
 
 
@@ -176,10 +178,10 @@ def _step(
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Float[Tensor, ""]]:
     """Intrinsics and extrinsics after one step of Gauss-Newton, and the mean distance before it."""
     count = len(pose)
-    near = outlines.own <= phase.to
-    view, own = outlines.view[near], outlines.own[near]
+    near = outlines.depth <= phase.to
+    view, depth_at_home = outlines.view[near], outlines.depth[near]
     points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
-    distances = phase.distances(depth, own)
+    distances = phase.distances(depth, depth_at_home)
     # One pixel for each unit of the unknowns, about.
     pixel = HEIGHT / 2 * (lens[:, 0, 0] / pose[:, 2, 3]).mean()
     rays = max(len(distances), 1)
@@ -207,7 +209,10 @@ def _best_points(
     view: Int[Tensor, " R"],
     pixels: Float[Tensor, "R 2"],
 ) -> tuple[Float[Tensor, "R 3"], Int[Tensor, " R"], Float[Tensor, " R"]]:
-    """Of each ray the point deepest in the other silhouettes, the one that it is least deep in, how deep.
+    """Points deepest in the other silhouettes, one of each ray, with the silhouette that it is least deep in.
+
+    Returns:
+        The points, the numbers of these silhouettes, and the signed depths in them in pixels.
 
     Args:
         view: the silhouette of each ray, in ascending order.
@@ -215,16 +220,16 @@ def _best_points(
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
     views, points = range(len(pose)), []
-    for own in views:
-        rays = pixels[view == own]
-        ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[own], pose[own]) - centers[own]
-        depths = pose[own, 2, 3] + along
+    for home in views:
+        rays = pixels[view == home]
+        ahead = unproject(rays, torch.ones_like(rays[:, 0]), lens[home], pose[home]) - centers[home]
+        depths = pose[home, 2, 3] + along
         least = rays.new_full((len(rays), _DEPTHS), torch.inf)
         for one in views:
-            if one != own:
-                seen = outlines.along(one, lens[one], pose[one], centers[own], ahead, depths)
+            if one != home:
+                seen = outlines.along(one, lens[one], pose[one], centers[home], ahead, depths)
                 least = torch.minimum(least, seen)
-        points.append(centers[own] + depths[least.argmax(1)][:, None] * ahead)
+        points.append(centers[home] + depths[least.argmax(1)][:, None] * ahead)
     points = torch.cat(points)
     shown = []
     for one in views:
@@ -241,7 +246,7 @@ def _gradients(
     points: Float[Tensor, "R 3"],
     other: Int[Tensor, " R"],
 ) -> Float[Tensor, "R 3"]:
-    """How distances grow where points move, in the world's axes."""
+    """Derivatives of the distances by the positions of the points, in the world's axes."""
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
     inside = world_to_camera(points, pose[other])
@@ -253,8 +258,11 @@ def _gradients(
 def _rows(
     points: Float[Tensor, "R 3"], gradients: Float[Tensor, "R 3"], pose: Float[Tensor, "R 4 4"]
 ) -> Float[Tensor, "R 7"]:
-    """How distances grow with small changes of what a camera sees: rotation vectors of points, shifts in half
-    heights, and the logarithm of the focal length, as which points move away from the optical axis."""
+    """Derivatives of the distances by small changes of a camera.
+
+    These are rotation vectors of the points, their shifts in half heights, and the logarithm of the focal
+    length, which moves points away from the optical axis.
+    """
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
     return torch.cat((torch.linalg.cross(points, gradients), HEIGHT / 2 * gradients, zoom), -1)

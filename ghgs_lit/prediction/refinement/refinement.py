@@ -25,7 +25,7 @@ Renderer = Callable[..., Rendering]
 
 @dataclass(frozen=True)
 class Change:
-    """How far a value may go, and the step of Adam while it is near its start."""
+    """The largest change of a value, and the step of Adam while it is near its start."""
 
     limit: float
     rate: float
@@ -121,27 +121,27 @@ class Refinement:
         if "scales" in change:
             changed["scales"] = gaussians.scales * change["scales"].exp()
         if "opacities" in change:
-            # Of opacities 0 and 1, which no step could leave.
+            # No step could leave an opacity of exactly 0 or 1.
             logit = torch.logit(gaussians.opacities.clamp(1e-4, 1 - 1e-4))
             changed["opacities"] = torch.sigmoid(logit + change["opacities"])
         return dataclasses.replace(gaussians, **changed)
 
     def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch) -> Report:
-        """What refinement gained; to hold out the last input takes as long as refinement.
+        """The gain of a refinement; holding out the last input takes as long as the refinement.
 
         Args:
             gaussians, refined: before and after.
             batch: one element, of which they were predicted.
         """
         views = list(range(batch.images.shape[1]))
-        inputs = tuple(self._psnr(found, batch, views) for found in (gaussians, refined))
+        inputs = tuple(self._psnr(splats, batch, views) for splats in (gaussians, refined))
         held_out = None
         if len(views) > 2:
             *seen, hidden = views
             kept = gaussians.image != hidden
             others = gaussians.select(kept, (int(kept.sum()),))
             both = others, self(others, batch, seen)
-            held_out = tuple(self._psnr(found, batch, [hidden]) for found in both)
+            held_out = tuple(self._psnr(splats, batch, [hidden]) for splats in both)
         return Report(self.steps, inputs, held_out)
 
     @torch.no_grad()

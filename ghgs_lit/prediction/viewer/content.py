@@ -1,4 +1,4 @@
-"""What a page shows: read from the directory of a prediction, or from a PLY."""
+"""Contents of a page, read from the directory of a prediction or from a PLY."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,12 +17,13 @@ from ghgs_lit.metrics import flip_map, psnr
 from ghgs_lit.metrics.functional import box_of, mean_over
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
+from ghgs_lit.prediction.export.compact import visible_first
 from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.prediction.export.world import AXES
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import colorize, to_uint8
-from ghgs_lit.visualization.turntable import up_direction
+from ghgs_lit.visualization.turntable import center_of, subject_points, up_direction
 
 _HULL_POINTS = 50_000
 
@@ -41,10 +42,14 @@ class Content:
         return self.batch.cameras[0]
 
     @cached_property
+    def center(self) -> Float[Tensor, "3"]:
+        """The middle of the subject."""
+        return center_of(subject_points(self.gaussians), self.cameras)
+
+    @cached_property
     def order(self) -> Tensor:
-        """Indices of the Gaussians, those that are seen most first: by opacity and size."""
-        g = self.gaussians
-        return (g.opacities.double() * g.scales.double().prod(-1)).argsort(descending=True, stable=True)
+        """Indices of the Gaussians, large and opaque ones first."""
+        return visible_first(self.gaussians)
 
     @cached_property
     def points(self) -> tuple[np.ndarray, np.ndarray]:

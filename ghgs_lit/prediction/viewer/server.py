@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.projection import look_at_point
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.prediction.export.scene import smoothed
+from ghgs_lit.prediction.export.subject import smoothed
 from ghgs_lit.prediction.viewer.content import Content
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import pixel_size
@@ -64,7 +63,7 @@ class Viewer:
         g, order = self.content.gaussians, self.content.order
         if self.content.batch is not None:
             # On a screen that is larger than the photographs there would be gaps.
-            g = smoothed(g, pixel_size(self.content.cameras))
+            g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
         root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
         covariances = (root @ root.mT).numpy()
         self._covariances = covariances
@@ -124,7 +123,7 @@ class Viewer:
 
         cameras, batch = self.content.cameras, self.content.batch
         self._poses, self._frustums = [], []
-        target = look_at_point(cameras).numpy()
+        target = self.content.center.numpy()
         size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
         for view, name in enumerate(batch.views[0]):
             k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
@@ -178,12 +177,12 @@ class Viewer:
         go.on_click(lambda _: self.go_to(views.index(self.view.value)))
 
         def show() -> None:
-            found = self._comparison
+            values = self._comparison
             self._show_frustums()
-            self.image.image = found[self._shown]
+            self.image.image = values[self._shown]
             self.text.content = (
                 f"{self._shown} of {self.view.value}; in the subject's box:"
-                f" FLIP {found['flip']:.4f}, PSNR {found['psnr']:.2f} dB"
+                f" FLIP {values['flip']:.4f}, PSNR {values['psnr']:.2f} dB"
             )
 
         @self.view.on_update

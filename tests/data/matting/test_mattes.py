@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, zoom
 from ghgs_lit import Capture
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.geometry.outlines import signed_distance
-from ghgs_lit.prediction.capture import capture
+from ghgs_lit.prediction.capture import crops
 from tests.helpers.figures import Figure
 
 HEIGHT, WIDTH = 216, 180
@@ -103,10 +103,10 @@ def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, heig
         calls.append((image.shape[:2], matte.shape, pixels))
         return image, matte
 
-    monkeypatch.setattr(capture, "refined_matte", record)
+    monkeypatch.setattr(crops, "refined_matte", record)
     figure = Figure(height=height, width=height * 3 // 4)
     taken = Capture.read(tmp_path, figure.write(tmp_path))
-    cut = [int(1 / capture._SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
+    cut = [int(1 / crops._SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
     taken.batch((112, 84), 4)
     for (size, same, pixels), rows in zip(calls, cut, strict=True):
         assert size == same
@@ -136,7 +136,7 @@ def test_a_matte_that_loses_the_subject_is_refused(monkeypatch, tmp_path):
     """The mask stays as it is, and the warning names the photograph."""
     figure = Figure()
     taken = Capture.read(tmp_path, figure.write(tmp_path))
-    monkeypatch.setattr(capture, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
+    monkeypatch.setattr(crops, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
     with pytest.warns(UserWarning, match="refine_masks: expected colours of cam") as warned:
         found = taken.batch((56, 42), 4)
     assert len(warned) == len(taken.photographs)

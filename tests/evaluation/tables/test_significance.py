@@ -7,9 +7,10 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from ghgs_lit.config.verbs import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import to_markdown
-from ghgs_lit.evaluation.tables.significance import PairedTest, compare, holm, needed_errors
+from ghgs_lit.evaluation.tables.significance import compare, holm, needed_errors
 from tests.helpers.tables import body, tables_of, write_run
 
 RNG = np.random.default_rng(0)

@@ -223,8 +223,8 @@ def test_a_bent_photograph_is_straightened(tmp_path):
         Image.fromarray(mask).save(tmp_path / f"{name}_mask.png")
         camera["distortion"] = distortion
     figure.names = []
-    bent = CaptureFolder(tmp_path, figure.write(tmp_path)).read(tmp_path.name)
-    for one, other in zip(straight.photographs, bent.photographs, strict=True):
+    bent = CaptureFolder(tmp_path, figure.write(tmp_path)).photographs(tmp_path.name)
+    for one, other in zip(straight.photographs, bent, strict=True):
         assert (one.mask ^ other.mask).sum() < 0.08 * one.mask.sum()
         crossed = np.array(Image.open(tmp_path / f"{one.name}_mask.png")) > 127
         assert (one.mask ^ other.mask).sum() < 0.5 * (one.mask ^ crossed).sum()
@@ -245,7 +245,7 @@ def test_a_folder_for_each_instant_and_one_for_each_camera(tmp_path):
             shutil.copy(source / f"{name}_mask.png", tmp_path / "masks" / name / f"{instant}.png")
     other = CaptureFolder(tmp_path / "cameras", path, masks=tmp_path / "masks")
     assert other.instants == ["000", "001"]
-    for one, two in zip(folder.read("001").photographs, other.read("001").photographs, strict=True):
+    for one, two in zip(folder.photographs("001"), other.photographs("001"), strict=True):
         assert one.name == two.name
         np.testing.assert_array_equal(one.image, two.image)
         np.testing.assert_array_equal(one.mask, two.mask)

@@ -17,12 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import psnr
-from ghgs_lit.prediction.export.compact import FORMATS, write_compact
-from ghgs_lit.prediction.export.gltf import EXTENSION, write_glb
-from ghgs_lit.prediction.export.page import write_page
+from ghgs_lit.prediction.export.compact import CONVERTED, RECORD, converted, to_records
+from ghgs_lit.prediction.export.gltf import EXTENSION, glb_bytes
+from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import SH_CONSTANT, ply_bytes, read_ply
-from ghgs_lit.prediction.export.splat import RECORD, to_records
-from ghgs_lit.prediction.export.video import write_mp4
+from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Gaussians
 from tests.helpers.splats import body, camera_ring
@@ -43,7 +42,7 @@ def decibels(found: Gaussians, wanted: Gaussians) -> float:
     return float(psnr(*images).min())
 
 
-def converted(data: bytes, name: str, path) -> Gaussians:
+def read_back(data: bytes, name: str, path) -> Gaussians:
     """The content of a file as gaussforge reads it."""
     path.write_bytes(GaussForge().convert(data, name, "ply")["data"])
     return read_ply(path)
@@ -52,17 +51,16 @@ def converted(data: bytes, name: str, path) -> Gaussians:
 # What is lost is quantization; a wrong axis, order or unit is below 25 dB.
 @pytest.mark.parametrize(("name", "least"), [("compressed_ply", 45), ("spz", 45), ("sog", 55)])
 def test_compact_files_render_alike(gaussians, name, least, tmp_path):
-    path = tmp_path / f"a.{FORMATS[name]}"
-    write_compact(ply_bytes(gaussians), path, name)
-    ply = len(ply_bytes(gaussians))
-    assert path.stat().st_size < ply / 2
-    assert decibels(converted(path.read_bytes(), FORMATS[name], tmp_path / "a.ply"), gaussians) > least
+    ply = ply_bytes(gaussians)
+    content = converted(ply, name)
+    assert len(content) < len(ply) / 2
+    assert decibels(read_back(content, CONVERTED[name], tmp_path / "a.ply"), gaussians) > least
 
 
 def test_a_splat_file_renders_alike_and_begins_with_large_gaussians(gaussians, tmp_path):
     records = to_records(gaussians)
     assert records.nbytes == 32 * len(gaussians)
-    read = converted(records.tobytes(), "splat", tmp_path / "a.ply")
+    read = read_back(records.tobytes(), "splat", tmp_path / "a.ply")
     assert decibels(read, gaussians) > 50
     found, wanted = (
         torch.nn.functional.normalize(g.quaternions[g.means[:, 0].argsort()], dim=-1)
@@ -75,7 +73,7 @@ def test_a_splat_file_renders_alike_and_begins_with_large_gaussians(gaussians, t
 
 def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path):
     """Linear scales, opacities, xyzw, SH; lossless; the node turns the world's up to glTF's +y."""
-    write_glb(gaussians, UP, tmp_path / "a.glb")
+    (tmp_path / "a.glb").write_bytes(glb_bytes(gaussians, UP))
     model = pygltflib.GLTF2().load(tmp_path / "a.glb")
     primitive, blob = model.meshes[0].primitives[0], model.binary_blob()
     assert model.extensionsUsed == [EXTENSION]
@@ -106,19 +104,18 @@ def test_a_glb_has_the_khronos_extension_and_stands_upright(gaussians, tmp_path)
     colors = (gaussians.colors.clamp(0, 1) * 255).round().numpy()
     assert np.array_equal(cloud.colors[:, :3], colors)
     with pytest.raises(InputError, match="at least one Gaussian; found 0"):
-        write_glb(gaussians.select(slice(0, 0), (0,)), UP, tmp_path / "b.glb")
+        glb_bytes(gaussians.select(slice(0, 0), (0,)), UP)
 
 
 def test_a_ply_is_lossless(gaussians, tmp_path):
-    assert decibels(converted(ply_bytes(gaussians), "ply", tmp_path / "a.ply"), gaussians) > 80
+    assert decibels(read_back(ply_bytes(gaussians), "ply", tmp_path / "a.ply"), gaussians) > 80
 
 
 def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     """One file: no address, the records as they are in .splat, the cameras; names cannot end the script."""
     cameras = camera_ring(2, 100, 80)[0]
     name = "</title><script>{{data}}"
-    write_page(gaussians, cameras, ("a", "</script>"), UP, name, tmp_path / "a.html")
-    text = (tmp_path / "a.html").read_text()
+    text = page(gaussians, cameras, ("a", "</script>"), UP, torch.tensor([0.0, 0.1, 0.2]), name)
     assert not re.search(r"https?://|src=|href=|import ", text)
     assert text.count("<script") == text.count("</script>") == 3
     parts = dict(re.findall(r'<script type="[^"]+" id="(\w+)">(.*?)</script>', text, re.S))
@@ -126,6 +123,7 @@ def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     assert [camera["name"] for camera in scene["cameras"]] == ["a", "</script>"]
     assert np.allclose(scene["cameras"][1]["extrinsics"], cameras.extrinsics[1])
     assert scene["size"] == [80, 100]
+    assert np.allclose(scene["target"], [0, 0.1, 0.2])
     records = np.frombuffer(gzip.decompress(base64.b64decode(parts["data"])), RECORD)
     assert np.array_equal(records, to_records(gaussians))
 
@@ -138,7 +136,7 @@ def test_a_video_shows_the_pictures_in_their_colors(tmp_path):
         np.tile(np.concatenate([row, row[-1:]]) * (5 - frame) // 5, (45, 1, 1)).astype(np.uint8)
         for frame in range(5)
     ]
-    write_mp4(pictures, tmp_path / "a.mp4", 10)
+    (tmp_path / "a.mp4").write_bytes(mp4_bytes(pictures, 10))
     frames = read_frames(str(tmp_path / "a.mp4"))
     meta = next(frames)
     assert meta["source_size"] == (62, 46)

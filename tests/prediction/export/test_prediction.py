@@ -2,22 +2,27 @@
 
 import dataclasses
 import json
+import re
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 import trimesh
+from gaussforge import GaussForge
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
+from ghgs_lit.metrics import psnr
+from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
 from ghgs_lit.prediction.export import OutputOptions, output_options, write_prediction
 from ghgs_lit.prediction.export.maps import depth_unit
 from ghgs_lit.prediction.export.ply import read_ply
+from ghgs_lit.prediction.export.subject import for_other_renderers
 from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.types import Batch, Cameras
@@ -180,7 +185,7 @@ def test_options_are_read():
 
 
 def test_a_missing_package_is_named_before_any_work(monkeypatch):
-    monkeypatch.setattr("ghgs_lit.prediction.export.scene.find_spec", lambda name: None)
+    monkeypatch.setattr("ghgs_lit.prediction.export.prediction.find_spec", lambda name: None)
     with pytest.raises(
         InputError, match=r"gaussforge for spz \(pip install 'ghgs-lit\[formats\]'\); found none"
     ):
@@ -204,3 +209,74 @@ def test_smooth_files_have_no_gaps_on_larger_screens(tmp_path, antialiased, size
     errors = {smooth: float((alpha - wanted).abs()[wanted > 0.5].mean()) for smooth, alpha in alphas.items()}
     assert errors[True] < 0.1
     assert antialiased or errors[False] > 3 * errors[True]
+
+
+def made_for_thin_pixels(size: int = 60):
+    """Discs of about a pixel, made for a low-pass of 0.1 px^2 with antialiasing, and their photographs."""
+    gaussians, cameras = body(1500, size), camera_ring(2, size, size)
+    gaussians = dataclasses.replace(gaussians, low_pass=0.1, antialiased=True)
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    return batch, dataclasses.replace(Standin()(batch), gaussians=gaussians)
+
+
+def test_other_viewers_draw_what_ours_draws(tmp_path):
+    """They add 0.3 px^2 and are not antialiased: their files make up for it, the PLY says it."""
+    batch, prediction = made_for_thin_pixels()
+    wanted, boxes = batch.images[0], box_of(batch.masks[0])
+    write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(("ply", "splat"), frames=0))
+    exact = render(read_ply(tmp_path / "gaussians.ply"), batch.cameras).image[0]
+    assert psnr(exact, wanted, boxes).min() > 60
+    data = GaussForge().convert((tmp_path / "gaussians.splat").read_bytes(), "splat", "ply")["data"]
+    (tmp_path / "viewer.ply").write_bytes(data)
+    adapted = render(read_ply(tmp_path / "viewer.ply"), batch.cameras).image[0]
+    as_is = dataclasses.replace(prediction.gaussians, low_pass=0.3, antialiased=False)
+    blurred = render(as_is, batch.cameras).image[0]
+    gain = psnr(adapted.clamp(0, 1), wanted, boxes) - psnr(blurred.clamp(0, 1), wanted, boxes)
+    assert gain.min() > 4
+
+
+def test_gaussians_for_other_viewers_stay_as_they_are():
+    gaussians = body(50, 60)
+    assert for_other_renderers(gaussians, 0.01) is gaussians
+
+
+def test_no_picture_of_a_turntable_cuts_the_subject(tmp_path):
+    """Also where optical axes meet elsewhere: crops have their principal point anywhere."""
+    gaussians, cameras = body(1500, 60), camera_ring(3, 60, 60)
+    shift = torch.tensor([0.0, 0.7, 0.0])  # what is photographed is above the point that all cameras look at
+    gaussians = dataclasses.replace(gaussians, means=gaussians.means + shift)
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[..., 1, 2] -= 0.7 / 3.0 * intrinsics[..., 1, 1]
+    cameras = dataclasses.replace(cameras, intrinsics=intrinsics)
+    rendering = render(gaussians, cameras)
+    batch = Batch(rendering.image.clamp(0, 1), rendering.alpha[:, :, 0] > 0.5, cameras)
+    assert batch.masks.any()
+    prediction = dataclasses.replace(Standin()(batch), gaussians=gaussians)
+    options = OutputOptions(("turntable", "html"), frames=5)
+    write_prediction(tmp_path, batch, prediction, Renderer(), options)
+    for frame in range(5):
+        picture = iio.imread(tmp_path / "turntable" / f"{frame:03d}.png").max(-1)
+        assert picture.max() > 100
+        assert max(border.max() for border in (picture[0], picture[-1], picture[:, 0], picture[:, -1])) == 0
+    target = re.search(r'"target": \[([^]]*)\]', (tmp_path / "viewer.html").read_text())[1]
+    assert np.allclose([float(value) for value in target.split(",")], shift, atol=0.05)
+
+
+def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
+    """Files of an earlier prediction stay known over runs that write others."""
+    batch, prediction = subject
+
+    def write(*formats):
+        return write_prediction(tmp_path, batch, prediction, Renderer(), OutputOptions(formats, frames=0))
+
+    write("points", "inputs")
+    write("ply")
+    write("points", "inputs")
+    (tmp_path / "depth.npz").write_text("somebody's")
+    with pytest.raises(InputError, match=r"depth\.npz: expected no file, or one that an earlier prediction"):
+        write("ply", "depth")
+    assert (tmp_path / "depth.npz").read_text() == "somebody's"
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises(InputError, match=r"found another file"):
+        write("ply")

@@ -1,6 +1,63 @@
 """Files of cameras: one module a format, each a function from a path to a :class:`CameraFile`."""
 
+from collections.abc import Callable
+from pathlib import Path
+
+from ghgs_lit.errors import InputError, choice
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile
-from ghgs_lit.prediction.capture.formats.reading import FORMATS, read_cameras
+from ghgs_lit.prediction.capture.formats.colmap import model_folder, read_colmap
+from ghgs_lit.prediction.capture.formats.json_and_toml import read_json, read_json_file, read_toml
+from ghgs_lit.prediction.capture.formats.nerfstudio import read_nerfstudio
+from ghgs_lit.prediction.capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
+
+#: Readers by the format's name; ``ghgs`` is this package's JSON.
+FORMATS: dict[str, Callable[[Path], CameraFile]] = {
+    "ghgs": read_json,
+    "colmap": read_colmap,
+    "nerfstudio": read_nerfstudio,
+    "opencv": read_opencv,
+    "easymocap": read_easymocap,
+    "toml": read_toml,
+}
+
+
+def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
+    """Read a file or a folder of cameras.
+
+    Args:
+        path: of the file; COLMAP's models, OpenCV's files for each camera and EasyMocap's are folders.
+        format: one of :data:`FORMATS`; ``auto`` tells it from the names of files and the keys of JSON.
+
+    Raises:
+        InputError: there is no such path, the format is not known, or a camera is wrong.
+    """
+    path = Path(path).expanduser()
+    choice("calibration.format", format, ("auto", *FORMATS))
+    if not path.exists():
+        raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
+    return FORMATS[_format_of(path) if format == "auto" else format](path)
+
+
+def _format_of(path: Path) -> str:
+    suffix, folder = path.suffix.lower(), path if path.is_dir() else path.parent
+    if path.name in EASYMOCAP or (path.is_dir() and (path / EASYMOCAP[0]).exists()):
+        return "easymocap"
+    if path.is_dir():
+        if model_folder(path) is not None:
+            return "colmap"
+        if any(path.glob("*.y*ml")):
+            return "opencv"
+    elif suffix in (".yml", ".yaml"):
+        return "opencv"
+    elif suffix == ".toml":
+        return "toml"
+    elif suffix == ".json":
+        return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
+    elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
+        return "colmap"
+    raise InputError(
+        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, or TOML; "
+        f"found {'a folder without any' if path.is_dir() else repr(path.suffix)}"
+    )

@@ -6,7 +6,7 @@ import numpy as np
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, by_name
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
 
 #: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
 _MODELS = {
@@ -20,13 +20,13 @@ _MODELS = {
     "RADIAL_FISHEYE": "f cx cy k1 k2",
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
-_ORDER = {False: ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"], True: ["k1", "k2", "k3", "k4"]}
+_ORDER = {False: "k1 k2 p1 p2 k3 k4 k5 k6", True: "k1 k2 k3 k4"}
 
 
 def model_folder(path: Path) -> Path | None:
     """The folder of a sparse model at or below ``path``, None where there is none."""
-    places = [path, path / "sparse" / "0", path / "sparse", path / "0"]
-    return next((p for p in places if (p / "cameras.bin").exists() or (p / "cameras.txt").exists()), None)
+    folders = [path, path / "sparse" / "0", path / "sparse", path / "0"]
+    return next((p for p in folders if (p / "cameras.bin").exists() or (p / "cameras.txt").exists()), None)
 
 
 def read_colmap(path: Path) -> CameraFile:
@@ -50,19 +50,19 @@ def read_colmap(path: Path) -> CameraFile:
     images = [image for image in model.images.values() if image.has_pose]
     require(bool(images), str(folder), "photographs with a pose", "none")
     cameras = [_camera(folder, image, model.cameras[image.camera_id]) for image in images]
-    return CameraFile(by_name(cameras), Convention(), "colmap")
+    return CameraFile.of(cameras, Convention(), "colmap")
 
 
 def _camera(folder: Path, image, camera) -> StoredCamera:
-    place, model = f"{folder}: {image.name}", camera.model.name
-    require(model in _MODELS, place, f"a camera model among {', '.join(_MODELS)}", model)
+    """The camera of a registered photograph."""
+    origin, model = f"{folder}: {image.name}", camera.model.name
+    require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
     fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))
-    intrinsics = np.array([[fx, 0, values["cx"]], [0, fy, values["cy"]], [0, 0, 1]])
+    intrinsics = pinhole(fx, fy, values["cx"], values["cy"])
     fisheye = "FISHEYE" in model
-    distortion = np.array([values.get(name, 0.0) for name in _ORDER[fisheye]])
-    distortion = distortion if distortion.any() else np.zeros(0)
+    distortion = coefficients(values, _ORDER[fisheye])
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
     size = (camera.height, camera.width)
-    return StoredCamera(image.name, place, intrinsics, pose, size, distortion, fisheye)
+    return StoredCamera(image.name, origin, intrinsics, pose, size, distortion, fisheye)

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from ghgs_lit.data.decoding import check_array
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, by_name
-from ghgs_lit.prediction.capture.formats.fields import OPENCV, camera_from_fields, is_camera, size_from_fields
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
+from ghgs_lit.prediction.capture.formats.opencv import cameras_from_fields, has_intrinsics, size_from_fields
+from ghgs_lit.prediction.export.maps import camera_entry, cameras_json
+
+_KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
@@ -20,12 +23,7 @@ def read_json_file(path: Path) -> dict[str, Any]:
     Raises:
         InputError: it is none.
     """
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected JSON; found {error}") from error
-    require(isinstance(found, dict), str(path), "a JSON object", type(found).__name__)
-    return found
+    return read_mapping(path, json.loads, "JSON", "a JSON object")
 
 
 def read_json(path: Path) -> CameraFile:
@@ -41,11 +39,11 @@ def read_json(path: Path) -> CameraFile:
     content = read_json_file(path)
     named = content.get("cameras", content)
     require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
-    own = {name: c for name, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
-    if own:
-        cameras = [_own(name, f"{path}: {name}", camera) for name, camera in own.items()]
-        return CameraFile(by_name(cameras), Convention(), "ghgs")
-    return _of_opencv(path, named, "opencv")
+    with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
+    if not with_extrinsics:
+        return _read_matrices(path, named, "opencv")
+    cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
+    return CameraFile.of(cameras, Convention(), "ghgs")
 
 
 def read_toml(path: Path) -> CameraFile:
@@ -54,45 +52,35 @@ def read_toml(path: Path) -> CameraFile:
     Raises:
         InputError: a camera is missing or wrong.
     """
-    try:
-        tables = tomllib.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: expected TOML; found {error}") from error
+    tables = read_mapping(path, tomllib.loads, "TOML", "TOML")
     named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
-    return _of_opencv(path, named, "toml")
+    return _read_matrices(path, named, "toml")
 
 
-def _of_opencv(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
-    found = {name: camera for name, camera in named.items() if is_camera(camera)}
-    require(bool(found), str(path), "cameras with intrinsics and extrinsics (or K, R and T)", sorted(named))
-    cameras = [camera_from_fields(name, f"{path}: {name}", camera) for name, camera in found.items()]
-    return CameraFile(by_name(cameras), OPENCV, name_of_format)
+def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
+    """OpenCV's matrices by the names of cameras."""
+    expected = "cameras with intrinsics and extrinsics (or K, R and T)"
+    with_intrinsics = {name: camera for name, camera in named.items() if has_intrinsics(camera)}
+    cameras = cameras_from_fields(path, with_intrinsics, expected, sorted(named))
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
 
 
-def _own(name: str, place: str, camera: Mapping[str, Any]) -> StoredCamera:
-    known = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
-    unknown = sorted(set(camera) - set(known))
-    require(not unknown, place, f"keys among {', '.join(known)}", unknown)
-    require("intrinsics" in camera, place, "intrinsics", sorted(camera))
-    pose = check_array(f"{place}: extrinsics", camera["extrinsics"], [(4, 4), (3, 4)])
-    distortion = check_array(f"{place}: distortion", camera.get("distortion", []), [(None,)])
-    fisheye = bool(camera.get("fisheye", False))
-    return StoredCamera(
-        name, place, camera["intrinsics"], pose, size_from_fields(place, camera), distortion, fisheye
-    )
+def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
+    """A camera of this package's JSON."""
+    unknown = sorted(set(camera) - set(_KEYS))
+    require(not unknown, origin, f"keys among {', '.join(_KEYS)}", unknown)
+    require("intrinsics" in camera, origin, "intrinsics", sorted(camera))
+    pose = check_array(f"{origin}: extrinsics", camera["extrinsics"], [(4, 4), (3, 4)])
+    distortion = check_array(f"{origin}: distortion", camera.get("distortion", []), [(None,)])
+    size, fisheye = size_from_fields(origin, camera), bool(camera.get("fisheye", False))
+    return StoredCamera(name, origin, camera["intrinsics"], pose, size, distortion, fisheye)
 
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
     """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
-    content = {
-        name: {
-            "intrinsics": camera.intrinsics.tolist(),
-            "extrinsics": camera.extrinsics.tolist(),
-            "width": size[1],
-            "height": size[0],
-            "distortion": camera.distortion.tolist(),
-            "fisheye": camera.fisheye,
-        }
+    entries = {
+        name: camera_entry(camera.intrinsics, camera.extrinsics, size)
+        | {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
         for name, (camera, size) in cameras.items()
     }
-    write_text_atomically(path, json.dumps({"cameras": content}, indent=1) + "\n")
+    write_text_atomically(path, cameras_json(entries) + "\n")

@@ -10,16 +10,30 @@ import numpy as np
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, by_name
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
-_FOCAL = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
-_KEYS = (*_FOCAL, "k1", "k2", "k3", "k4", "p1", "p2")
+_KEYS = [
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "camera_angle_x",
+    "camera_angle_y",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+]
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 
 def read_nerfstudio(path: Path) -> CameraFile:
-    """Cameras of ``frames``, whose own intrinsics win over those of the whole file.
+    """Cameras of ``frames``; intrinsics of a frame win over those of the whole file.
 
     Raises:
         InputError: a frame is wrong.
@@ -29,39 +43,37 @@ def read_nerfstudio(path: Path) -> CameraFile:
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
     cameras = [_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]
     convention = Convention(extrinsics="camera_to_world", axes="opengl")
-    return CameraFile(by_name(cameras), convention, "nerfstudio")
+    return CameraFile.of(cameras, convention, "nerfstudio")
 
 
-def _camera(path: Path, place: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
-    require(isinstance(frame, Mapping), place, "a mapping", frame)
+def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
+    require(isinstance(frame, Mapping), origin, "a mapping", frame)
     for key in ("file_path", "transform_matrix"):
-        require(key in frame, place, key, sorted(frame))
+        require(key in frame, origin, key, sorted(frame))
     fields = {**shared, **frame}
     model = fields.get("camera_model", "OPENCV")
-    choice(f"{place}: camera_model", model, _MODELS)
+    choice(f"{origin}: camera_model", model, _MODELS)
     fisheye = model == "OPENCV_FISHEYE"
-    numbers = {key: _number(place, key, fields[key]) for key in _KEYS if key in fields}
+    numbers = {key: _number(origin, key, fields[key]) for key in _KEYS if key in fields}
     size = (int(numbers["h"]), int(numbers["w"])) if {"h", "w"} <= set(numbers) else None
-    intrinsics = _intrinsics(place, numbers, size)
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    distortion = np.array([numbers.get(name, 0.0) for name in names])
-    distortion = distortion if distortion.any() else np.zeros(0)
-    pose = check_array(f"{place}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
+    intrinsics = _intrinsics(origin, numbers, size)
+    distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3")
+    pose = check_array(f"{origin}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
     mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-    return StoredCamera(str(frame["file_path"]), place, intrinsics, pose, size, distortion, fisheye, mask)
+    return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
 
 
-def _number(place: str, key: str, value: Any) -> float:
+def _number(origin: str, key: str, value: Any) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):
         number = math.nan
-    require(math.isfinite(number), f"{place}: {key}", "a finite number", value)
+    require(math.isfinite(number), f"{origin}: {key}", "a finite number", value)
     return number
 
 
-def _intrinsics(place: str, numbers: Mapping[str, float], size: tuple[int, int] | None) -> np.ndarray:
-    """From focal lengths in pixels, or from angles of view; the principal point is the middle by default."""
+def _intrinsics(origin: str, numbers: Mapping[str, float], size: tuple[int, int] | None) -> np.ndarray:
+    """Intrinsics of focal lengths or angles of view; the principal point is the middle by default."""
     height, width = size or (None, None)
     focal = {}
     for axis, side in (("x", width), ("y", height)):
@@ -72,10 +84,10 @@ def _intrinsics(place: str, numbers: Mapping[str, float], size: tuple[int, int] 
             focal[axis] = side / 2 / math.tan(angle / 2)
     if not focal or (size is None and not {"cx", "cy"} <= set(numbers)):
         raise InputError(
-            f"{place}: expected fl_x, cx and cy, or w, h and camera_angle_x; found {sorted(numbers)}"
+            f"{origin}: expected fl_x, cx and cy, or w, h and camera_angle_x; found {sorted(numbers)}"
         )
     # Square pixels where one focal length is given.
     fx, fy = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
     cx = numbers["cx"] if "cx" in numbers else width / 2
     cy = numbers["cy"] if "cy" in numbers else height / 2
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return pinhole(fx, fy, cx, cy)

@@ -1,4 +1,9 @@
-"""OpenCV's YAML (``cv2.FileStorage``): a file for each camera, all cameras in one, or EasyMocap's pair."""
+"""OpenCV's matrices under the names that programs give them, and the YAML that has them.
+
+YAML of ``cv2.FileStorage`` is a file for each camera, all cameras in one, or EasyMocap's pair. Files differ
+in the spelling: ``camera_matrix`` or ``K``, ``distortion_coefficients`` or ``dist``, ``rvec`` or ``R``. Poses
+map the world to the camera, pixel centres are at integers.
+"""
 
 import re
 from collections.abc import Mapping
@@ -7,15 +12,28 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
+from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, by_name
-from ghgs_lit.prediction.capture.formats.fields import OPENCV, camera_from_fields, is_camera
+from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
 
 #: The files of EasyMocap: intrinsics and poses.
 EASYMOCAP = ("intri.yml", "extri.yml")
 # Its keys carry the camera's name: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01.
 _WITH_NAME = re.compile(r"(K|dist|D|R|Rot|T|H|W)_(.+)")
+# Spelled without case and underscores; a rotation matrix is preferred to a vector where there are both.
+_NAMES = {
+    "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
+    "distortion": ("d", "dist", "distortioncoefficients", "distcoeffs", "distortions", "distortion"),
+    "rotation": ("rot", "rotationmatrix", "r", "rvec", "rotation", "rotationvector"),
+    "translation": ("t", "tvec", "translation", "translationvector"),
+    "size": ("size", "imagesize", "imgsize"),
+    "width": ("width", "imagewidth", "w"),
+    "height": ("height", "imageheight", "h"),
+    "fisheye": ("fisheye",),
+}
 
 
 class _Loader(yaml.SafeLoader):
@@ -33,22 +51,6 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _matrix)
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping of a YAML file of ``cv2.FileStorage``.
-
-    Raises:
-        InputError: it is no such file.
-    """
-    try:
-        # OpenCV writes "%YAML:1.0", which is not a directive of YAML.
-        text = re.sub(r"\A%YAML[^\n]*\n", "", path.read_text())
-        found = yaml.load(text, _Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected YAML of OpenCV; found {error}") from error
-    require(isinstance(found, dict), str(path), "YAML of OpenCV with named matrices", type(found).__name__)
-    return found
-
-
 def read_opencv(path: Path) -> CameraFile:
     """Cameras of a YAML file, or of all YAML files of a folder.
 
@@ -56,27 +58,16 @@ def read_opencv(path: Path) -> CameraFile:
         InputError: a camera is missing or wrong.
     """
     files = sorted([*path.glob("*.yml"), *path.glob("*.yaml")]) if path.is_dir() else [path]
-    cameras = [camera for file in files for camera in _cameras(file)]
-    return CameraFile(by_name(cameras), OPENCV, "opencv")
-
-
-def _cameras(file: Path) -> list:
-    """Cameras of one file: of its mappings, of keys with names, or the one that the whole file is."""
-    fields = read_yaml(file)
-    if is_camera(fields):
-        return [camera_from_fields(file.stem, str(file), fields)]
-    named = {name: value for name, value in fields.items() if is_camera(value)} or _split(fields)
-    require(bool(named), str(file), "a camera matrix (camera_matrix, K or K_<name>)", sorted(fields))
-    return [camera_from_fields(name, f"{file}: {name}", value) for name, value in named.items()]
-
-
-def _split(fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Cameras whose keys carry their names."""
-    found: dict[str, dict[str, Any]] = {}
-    for key, value in fields.items():
-        if match := _WITH_NAME.fullmatch(key):
-            found.setdefault(match[2], {})[match[1]] = value
-    return {name: camera for name, camera in found.items() if is_camera(camera)}
+    cameras: list[StoredCamera] = []
+    for file in files:
+        fields = _read_yaml(file)
+        if has_intrinsics(fields):
+            cameras.append(camera_from_fields(file.stem, str(file), fields))
+        else:
+            named = {name: value for name, value in fields.items() if has_intrinsics(value)}
+            expected = "a camera matrix (camera_matrix, K or K_<name>)"
+            cameras += cameras_from_fields(file, named or _by_name(fields), expected, sorted(fields))
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
 
 
 def read_easymocap(path: Path) -> CameraFile:
@@ -87,12 +78,101 @@ def read_easymocap(path: Path) -> CameraFile:
     """
     folder = path if path.is_dir() else path.parent
     fields: dict[str, Any] = {}
-    for name in EASYMOCAP:
-        require(
-            (folder / name).exists(), str(folder / name), "EasyMocap's file beside the other", "no such file"
-        )
-        fields |= read_yaml(folder / name)
-    named = _split(fields)
+    for file in (folder / name for name in EASYMOCAP):
+        require(file.exists(), str(file), "EasyMocap's file beside the other", "no such file")
+        fields |= _read_yaml(file)
+    named = _by_name(fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
     cameras = [camera_from_fields(name, f"{folder}: {name}", camera) for name, camera in named.items()]
-    return CameraFile(by_name(cameras), OPENCV, "easymocap")
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping of a YAML file of ``cv2.FileStorage``."""
+
+    def parse(text: str) -> Any:
+        try:
+            # OpenCV writes "%YAML:1.0", which is not a directive of YAML.
+            return yaml.load(re.sub(r"\A%YAML[^\n]*\n", "", text), _Loader)
+        except yaml.YAMLError as error:
+            raise ValueError(error) from error
+
+    return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
+
+
+def _by_name(fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Cameras whose keys carry their names."""
+    cameras: dict[str, dict[str, Any]] = {}
+    for key, value in fields.items():
+        if match := _WITH_NAME.fullmatch(key):
+            cameras.setdefault(match[2], {})[match[1]] = value
+    return {name: camera for name, camera in cameras.items() if has_intrinsics(camera)}
+
+
+def cameras_from_fields(
+    path: Path, named: Mapping[str, Any], expected: str, keys: list[str]
+) -> list[StoredCamera]:
+    """The cameras of a file by name.
+
+    Raises:
+        InputError: there is none of what is ``expected`` among the ``keys``, or one is wrong.
+    """
+    require(bool(named), str(path), expected, keys)
+    return [camera_from_fields(name, f"{path}: {name}", camera) for name, camera in named.items()]
+
+
+def find(fields: Mapping[str, Any], what: str) -> Any:
+    """The value of an entry of ``_NAMES``; None where no spelling of it is there."""
+    spelled = {key.lower().replace("_", ""): value for key, value in fields.items()}
+    return next((spelled[name] for name in _NAMES[what] if name in spelled), None)
+
+
+def has_intrinsics(fields: Any) -> bool:
+    """True of a mapping with a camera matrix."""
+    return isinstance(fields, Mapping) and find(fields, "intrinsics") is not None
+
+
+def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> StoredCamera:
+    """The camera that ``fields`` describe.
+
+    Args:
+        name: of the camera.
+        origin: file and key, for messages.
+        fields: matrices, lists and numbers by any of their names.
+
+    Raises:
+        InputError: a matrix is missing, or is none.
+    """
+
+    def array(what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
+        value, names = find(fields, what), " or ".join(_NAMES[what])
+        require(value is not None, origin, f"{what} ({names})", sorted(fields))
+        return check_array(f"{origin}: {what}", value, shapes)
+
+    rotation = array("rotation", (3, 3), (3,), (3, 1), (1, 3))
+    if rotation.size == 3:
+        rotation = Rotation.from_rotvec(rotation.ravel()).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = array("translation", (3,), (3, 1), (1, 3)).ravel()
+    no_distortion = find(fields, "distortion") is None
+    distortion = np.zeros(0) if no_distortion else array("distortion", (None,), (None, 1), (1, None)).ravel()
+    intrinsics, fisheye = array("intrinsics", (3, 3)), bool(find(fields, "fisheye"))
+    return StoredCamera(name, origin, intrinsics, pose, size_from_fields(origin, fields), distortion, fisheye)
+
+
+def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:
+    """(height, width) where they are given, as two numbers or as a list (width, height)."""
+    width, height = find(fields, "width"), find(fields, "height")
+    if (both := find(fields, "size")) is not None:
+        width, height = check_array(f"{origin}: size", both, [(2,), (2, 1), (1, 2)]).ravel()
+    if width is None or height is None:
+        return None
+    try:
+        size = int(height), int(width)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{origin}: expected width and height in pixels; found {width!r}, {height!r}"
+        ) from None
+    require(min(size) > 0, origin, "a width and a height above 0", size)
+    return size

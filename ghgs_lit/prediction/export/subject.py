@@ -1,42 +1,41 @@
-"""What is written of one subject: its prediction, photographs and cameras, in the frame of the files."""
+"""One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
-from ghgs_lit.visualization.turntable import pixel_size, turntable, up_direction
+from ghgs_lit.visualization.turntable import (
+    center_of,
+    pixel_size,
+    subject_points,
+    turntable,
+    up_direction,
+)
 
-#: The package that a format needs, and the extra that installs it.
-PACKAGES = {
-    "compressed_ply": ("gaussforge", "formats"),
-    "spz": ("gaussforge", "formats"),
-    "sog": ("gaussforge", "formats"),
-    "glb": ("pygltflib", "formats"),
-    "mp4": ("imageio_ffmpeg", "video"),
-}
+#: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
+VIEWER_LOW_PASS = 0.3
+#: The least standard deviation of a Gaussian in pixels.
+_SMALLEST = 1e-3
 
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written, and how.
+    """Choices for the files of a prediction.
 
     Args:
-        formats: names of :data:`ghgs_lit.prediction.export.prediction.WRITERS`.
+        formats: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`.
         up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
         smooth: the files of Gaussians hold what a renderer adds in pixels of the photographs.
         frames: pictures of the turntable.
@@ -71,8 +70,23 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
     )
 
 
+def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
+    """Gaussians that 3D Gaussian Splatting's own renderer draws as ours draws the given ones.
+
+    It adds 0.3 px^2 whatever Gaussians were made for, and takes no opacity for it. Variances lose what it
+    adds too much at the photographs' size, whose pixels are ``pixel`` metres wide; Gaussians that ours draws
+    smaller than 0.3 px^2 become points.
+    """
+    if gaussians.low_pass == VIEWER_LOW_PASS and not gaussians.antialiased:
+        return gaussians
+    drawn = smoothed(gaussians, pixel)
+    variances = drawn.scales.square() - VIEWER_LOW_PASS * pixel**2
+    scales = variances.clamp(min=(_SMALLEST * pixel) ** 2).sqrt()
+    return dataclasses.replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
+
+
 @dataclass(frozen=True)
-class Scene:
+class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
 
     ``images`` are premultiplied by ``mattes``, which are the masks where there are none.
@@ -96,9 +110,14 @@ class Scene:
     renderer: Renderer
     options: OutputOptions
 
+    @property
+    def file_names(self) -> list[str]:
+        """The names of the views as parts of the names of files."""
+        return [file_name(view) for view in self.views]
+
     @cached_property
     def stored(self) -> Gaussians:
-        """The Gaussians as their files hold them.
+        """The Gaussians as the PLY holds them, which says what image they were made for.
 
         A renderer adds ``low_pass`` square pixels of its own screen to a Gaussian that was made for the
         photographs' pixels; with ``smooth`` the file has these already (as the 3D smoothing of
@@ -106,12 +125,34 @@ class Scene:
         """
         if not self.options.smooth:
             return self.gaussians
-        return smoothed(self.gaussians, pixel_size(self.cameras))
+        return smoothed(self.gaussians, self.pixel)
+
+    @cached_property
+    def for_other_renderers(self) -> Gaussians:
+        """The Gaussians as files hold them that cannot say what image they were made for."""
+        if self.options.smooth:
+            return self.stored
+        return for_other_renderers(self.gaussians, self.pixel)
+
+    @cached_property
+    def body(self) -> Float[Tensor, "n 3"]:
+        """The points that pictures of the whole subject show (:func:`subject_points`)."""
+        return subject_points(self.gaussians)
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The point that the page and the turntable turn about."""
+        return center_of(self.body, self.cameras)
+
+    @property
+    def pixel(self) -> float:
+        """The side of a photograph's pixel at the subject, in the unit of the cameras."""
+        return pixel_size(self.cameras, self.center)
 
     @cached_property
     def turntable(self) -> list[np.ndarray]:
         """Pictures [h, w, 3] uint8 from all around."""
-        orbit = turntable(self.cameras, self.options.frames)
+        orbit = turntable(self.cameras, self.options.frames, self.body)
         images = (
             self.renderer(self.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
             for frame in range(self.options.frames)
@@ -119,8 +160,10 @@ class Scene:
         return [to_uint8(image) for image in images]
 
 
-def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions) -> Scene:
-    """The scene of a batch of one subject.
+def exported_subject(
+    batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
+) -> ExportedSubject:
+    """The subject of a batch of one, in the frame that ``options`` choose.
 
     Raises:
         InputError: several subjects.
@@ -139,7 +182,7 @@ def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: 
         up = end
     depth, valid = prediction.depth[0].detach(), prediction.depth_valid[0] & batch.masks[0]
     valid = valid & depth.isfinite() & (depth > 0)
-    return Scene(
+    return ExportedSubject(
         name=batch.subjects[0] if batch.subjects else "subject",
         views=batch.views[0] if batch.views else tuple(map(str, range(batch.images.shape[1]))),
         gaussians=gaussians,
@@ -161,28 +204,3 @@ def scene_of(batch: Batch, prediction: Prediction, renderer: Renderer, options: 
 def file_name(view: str) -> str:
     """The name of a photograph as a part of a file's name."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
-
-
-def options_of(config: Mapping[str, Any], known: tuple[str, ...]) -> OutputOptions:
-    """The options of a verb's configuration: ``formats``, ``up`` and ``turntable``.
-
-    Args:
-        config: plain data.
-        known: the formats that there are; ``all`` stands for them.
-
-    Raises:
-        InputError: an unknown format, a value out of range, or a package that is not installed.
-    """
-    formats = config["formats"]
-    formats = [formats] if isinstance(formats, str) else formats
-    formats = known if "all" in formats else tuple(dict.fromkeys(formats))
-    for name in formats:
-        choice("formats", name, ("all", *known))
-        package, extra = PACKAGES.get(name, (None, None))
-        if package is not None and find_spec(package) is None:
-            hint = f"pip install 'ghgs-lit[{extra}]'"
-            raise InputError(f"formats: expected the package {package} for {name} ({hint}); found none")
-    table = config["turntable"]
-    frames = table["frames"]
-    require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
-    return OutputOptions(formats, config["up"], config["smooth"], frames, table["fps"])

@@ -1,18 +1,18 @@
-"""Finds out what is wrong with a calibration by trying what else its numbers could mean.
+"""Report on the cameras of a capture: other meanings of their numbers, tried one after another.
 
 Each :class:`Hypothesis` is another meaning; they are ranked by how well masks and cameras agree
-(:mod:`ghgs_lit.prediction.capture.consistency`).
+(:mod:`ghgs_lit.geometry.silhouettes`).
 """
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ghgs_lit.data.resampling import area_image, area_mask
-from ghgs_lit.data.silhouettes import Silhouette, extent, subject_place
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 from ghgs_lit.prediction.capture.calibration import (
     AXES,
     EXTRINSICS,
@@ -20,7 +20,6 @@ from ghgs_lit.prediction.capture.calibration import (
     Convention,
     StoredCamera,
 )
-from ghgs_lit.prediction.capture.consistency import agreements
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.photographs import Pixels
 
@@ -38,7 +37,7 @@ _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "kilometres"
 
 
 @dataclass(frozen=True)
-class View:
+class StoredView:
     """One photograph at a small size, its camera as stored, and what the camera's numbers mean."""
 
     name: str
@@ -50,40 +49,64 @@ class View:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What a calibration could mean.
+    """A meaning of a calibration, and how well masks and cameras agree with it.
 
     Attributes:
         says: in words.
         option: of the command line, which makes it so; empty: as it is, or nothing does.
         views: with this meaning.
         blames: the cameras that it says are wrong; empty: all, or none.
+        shares: by view, the share of the mask that lies in the hull of the others; empty before it is ranked.
     """
 
     says: str
     option: str
-    views: tuple[View, ...]
+    views: tuple[StoredView, ...]
     blames: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """A hypothesis with the agreement of each of its views."""
-
-    hypothesis: Hypothesis
-    shares: dict[str, float]
+    shares: dict[str, float] = field(default_factory=dict)
 
     @property
     def score(self) -> float:
+        """The agreement of the worst view."""
         return min(self.shares.values())
+
+    def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
+        """Masks with cameras, as this meaning has them.
+
+        Raises:
+            InputError: it has the photographs in another ratio of height and width.
+        """
+        white = np.uint8(255)
+        upright = [
+            folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in self.views
+        ]
+        return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in upright]
+
+    def ranked(self, folder: CaptureFolder) -> "Hypothesis":
+        """The same meaning with its :attr:`shares`, all 0 where no camera can have it."""
+        try:
+            shares = HullSearch().shares(self.silhouettes(folder))
+        except (InputError, np.linalg.LinAlgError):
+            shares = [0.0] * len(self.views)
+        return replace(self, shares={v.name: share for v, share in zip(self.views, shares, strict=True)})
+
+    def size(self, folder: CaptureFolder) -> float:
+        """The subject's largest extent in the user's unit; 0 where it is not known."""
+        try:
+            silhouettes = self.silhouettes(folder)
+        except InputError:
+            return 0.0
+        focus, _ = subject_sphere(silhouettes)
+        return float(np.median([s.extent(focus).max() for s in silhouettes]))
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is right or wrong with a calibration.
+    """The report on a calibration.
 
     Attributes:
         consistent: whether masks and cameras agree as they are.
-        lines: what was found, for people.
+        lines: the results, for people.
         option: of the command line, which mends it; empty where none does.
         ranking: all meanings that were tried, the best first.
         size: the subject's largest extent, in the user's unit, of the best meaning.
@@ -93,7 +116,7 @@ class Diagnosis:
     consistent: bool
     lines: tuple[str, ...]
     option: str
-    ranking: tuple[Ranked, ...]
+    ranking: tuple[Hypothesis, ...]
     size: float
     suspects: tuple[str, ...] = ()
 
@@ -105,29 +128,33 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         InputError: photographs or masks cannot be read.
     """
     views = small_views(folder, folder.instants[0] if instant is None else instant)
-    given = _rank(folder, Hypothesis("the calibration is right as it is", "", views))
+    given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
     twins = _twins(views)
     if twins:
         line = f"{' and '.join(twins)} have the same pose: one of them is a copy"
-        return Diagnosis(False, (line,), "", (given,), _size(folder, given), twins)
+        return Diagnosis(False, (line,), "", (given,), given.size(folder), twins)
     if given.score >= AGREES:
-        return _healthy(folder, given)
-    tried = [given, *(_rank(folder, h) for h in _for_all(views))]
-    best = max(tried, key=lambda r: r.score)
+        size = given.size(folder)
+        line = (
+            f"cameras and masks agree ({given.score:.0%} of each mask or more lies in the hull of the others)"
+        )
+        return Diagnosis(True, (line, _size_line(size)), "", (given,), size)
+    tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
+    best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:
         # One camera among right ones: with the best meaning for all.
         base = best if best.score > given.score + BETTER else given
-        tried += [_rank(folder, h) for h in _for_some(base.hypothesis)]
-        best = max(tried, key=lambda r: r.score)
-    tried.sort(key=lambda r: -r.score)
+        tried += [hypothesis.ranked(folder) for hypothesis in _for_some(base.views)]
+        best = max(tried, key=lambda hypothesis: hypothesis.score)
+    tried.sort(key=lambda hypothesis: -hypothesis.score)
     if best.score >= max(AGREES, given.score + BETTER):
         return _explained(folder, given, best, tried)
     return _unexplained(folder, given, tried)
 
 
-def small_views(folder: CaptureFolder, instant: str) -> tuple[View, ...]:
+def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
     """The photographs of an instant at a size at which many meanings can be tried."""
-    found = []
+    views = []
     for name, (camera, pixels, matte) in zip(folder.paths[instant], folder.decode(instant), strict=True):
         height, width = pixels.size
         scale = min(_SIDE / max(height, width), 1)
@@ -136,31 +163,11 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[View, ...]:
         known = camera.size or pixels.stored_size
         small = Pixels(area_image(np.ascontiguousarray(pixels.image), *size), None, pixels.turns)
         mask = area_mask(np.ascontiguousarray(matte > 127), *size)
-        found.append(View(name, replace(camera, size=known), small, mask, folder.convention))
-    return tuple(found)
+        views.append(StoredView(name, replace(camera, size=known), small, mask, folder.convention))
+    return tuple(views)
 
 
-def silhouettes_of(folder: CaptureFolder, views: Sequence[View]) -> list[Silhouette]:
-    """Masks with cameras, as a meaning has them.
-
-    Raises:
-        InputError: it has the photographs in another ratio of height and width.
-    """
-    white = np.uint8(255)
-    found = [folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in views]
-    return [Silhouette(p.mask, p.intrinsics, p.extrinsics) for p in found]
-
-
-def _rank(folder: CaptureFolder, hypothesis: Hypothesis) -> Ranked:
-    names = [view.name for view in hypothesis.views]
-    try:
-        shares = agreements(silhouettes_of(folder, hypothesis.views))
-    except (InputError, np.linalg.LinAlgError):
-        shares = np.zeros(len(names))
-    return Ranked(hypothesis, dict(zip(names, shares.tolist(), strict=True)))
-
-
-def _for_all(views: tuple[View, ...]) -> Iterator[Hypothesis]:
+def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     """Other meanings of all cameras."""
     given = views[0].convention
     for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, _likely_resize(views))):
@@ -187,14 +194,14 @@ def _plain(value: str | float) -> str:
     return value if isinstance(value, str) else f"{value:.4g}"
 
 
-def _likely_resize(views: Sequence[View]) -> float:
+def _likely_resize(views: Sequence[StoredView]) -> float:
     """The usual factor that brings the principal points nearest to the middle."""
     points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
     scale = 0.5 / max(float(np.median(points)), 0.01)
     return min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
 
 
-def _plausible(view: View) -> bool:
+def _plausible(view: StoredView) -> bool:
     """Whether the principal point lies near the middle."""
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
@@ -202,9 +209,8 @@ def _plausible(view: View) -> bool:
     return bool((share >= _MIDDLE[0]).all() and (share <= _MIDDLE[1]).all())
 
 
-def _for_some(base: Hypothesis) -> Iterator[Hypothesis]:
+def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     """Mistakes of one camera, and two cameras or masks that are exchanged."""
-    views = base.views
     for i, view in enumerate(views):
         for says, changed in _mistakes(view):
             mended = (*views[:i], changed, *views[i + 1 :])
@@ -223,48 +229,46 @@ def _for_some(base: Hypothesis) -> Iterator[Hypothesis]:
         yield Hypothesis(f"the cameras of {names} are exchanged", option, tuple(swapped), blames)
 
 
-def _mistakes(view: View) -> Iterator[tuple[str, View]]:
-    """What one camera alone may have wrong, and the view without it."""
+def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
+    """Usual mistakes of a single camera in words, each with the view after mending it."""
     given = view.convention
     for extrinsics, axes in itertools.product(EXTRINSICS, AXES):
         convention = replace(given, extrinsics=extrinsics, axes=axes)
         if convention != given:
             yield f"its extrinsics are {extrinsics} with axes of {axes}", replace(view, convention=convention)
-    for factor, says in ((0.001, "1000 times too long"), (1000.0, "1000 times too short")):
+
+    def with_camera(says: str, **changes: np.ndarray) -> tuple[str, StoredView]:
+        return says, replace(view, camera=replace(view.camera, **changes))
+
+    for factor, says in ((0.001, "long"), (1000.0, "short")):
         pose = view.camera.pose.copy()
         pose[:3, 3] *= factor
-        yield f"its translation is {says}", replace(view, camera=replace(view.camera, pose=pose))
-    middle = view.camera.intrinsics.copy()
+        yield with_camera(f"its translation is 1000 times too {says}", pose=pose)
+    intrinsics = view.camera.intrinsics.copy()
     sides = np.array(view.camera.size)[::-1] if given.intrinsics == "pixels" else 1.0
-    middle[:2, 2] = sides / 2 / given.resized
-    yield (
-        "its principal point should be near the middle",
-        replace(view, camera=replace(view.camera, intrinsics=middle)),
-    )
+    intrinsics[:2, 2] = sides / 2 / given.resized
+    yield with_camera("its principal point should be near the middle", intrinsics=intrinsics)
     for factor in (0.5, 2.0):
-        scaled = view.camera.intrinsics.copy()
-        scaled[:2] *= factor
-        yield (
-            f"its intrinsics are for photographs {1 / factor:g} times as large",
-            replace(view, camera=replace(view.camera, intrinsics=scaled)),
-        )
+        intrinsics = view.camera.intrinsics * [[factor], [factor], [1.0]]
+        says = f"its intrinsics are for photographs {1 / factor:g} times as large"
+        yield with_camera(says, intrinsics=intrinsics)
 
 
-def _masks_are_swapped(one: View, other: View) -> bool:
+def _masks_are_swapped(one: StoredView, other: StoredView) -> bool:
     """Whether the outlines of the masks follow edges of the other photograph rather than of their own."""
-    own = _contrast(one, one.mask) * _contrast(other, other.mask)
-    return _contrast(one, other.mask) * _contrast(other, one.mask) > own
+    as_given = _contrast(one, one.mask) * _contrast(other, other.mask)
+    return _contrast(one, other.mask) * _contrast(other, one.mask) > as_given
 
 
-def _contrast(view: View, mask: np.ndarray) -> float:
-    """Mean gradient of the photograph on the outline of a mask, of which it has most on its own."""
+def _contrast(view: StoredView, mask: np.ndarray) -> float:
+    """Mean gradient of the photograph on the outline of a mask, which is largest for its right mask."""
     grey = view.pixels.image.astype(np.float64).mean(-1)
     gradient = np.hypot(*np.gradient(grey))
     outline = np.hypot(*np.gradient(mask.astype(np.float64))) > 0
     return float(gradient[outline].mean()) if outline.any() else 0.0
 
 
-def _twins(views: Sequence[View]) -> tuple[str, ...]:
+def _twins(views: Sequence[StoredView]) -> tuple[str, ...]:
     """The first two cameras with the same pose."""
     for one, other in itertools.combinations(views, 2):
         if np.allclose(one.camera.pose, other.camera.pose, rtol=1e-6, atol=1e-9):
@@ -272,18 +276,8 @@ def _twins(views: Sequence[View]) -> tuple[str, ...]:
     return ()
 
 
-def _size(folder: CaptureFolder, ranked: Ranked) -> float:
-    """The subject's largest extent in the user's unit; 0 where it is not known."""
-    try:
-        silhouettes = silhouettes_of(folder, ranked.hypothesis.views)
-    except InputError:
-        return 0.0
-    focus, _ = subject_place(silhouettes)
-    return float(np.median([extent(s, focus).max() for s in silhouettes]))
-
-
 def _size_line(size: float) -> str:
-    """How large the subject is, and which unit would make it a person."""
+    """A line about the subject's size, with the unit in which it is a person's."""
     if PERSON[0] <= size <= PERSON[1]:
         return f"the subject is {size:.3g} units tall: a person in metres"
     unit = next((n for n, u in _UNITS.items() if PERSON[0] <= size * u <= PERSON[1]), None)
@@ -293,31 +287,26 @@ def _size_line(size: float) -> str:
     return f"the subject is {size:.4g} units tall, a person in {unit}: {option} makes it metres"
 
 
-def _healthy(folder: CaptureFolder, given: Ranked) -> Diagnosis:
-    size = _size(folder, given)
-    line = f"cameras and masks agree ({given.score:.0%} of each mask or more lies in the hull of the others)"
-    return Diagnosis(True, (line, _size_line(size)), "", (given,), size)
+def _explained(
+    folder: CaptureFolder, given: Hypothesis, best: Hypothesis, tried: list[Hypothesis]
+) -> Diagnosis:
+    """The diagnosis where another meaning fits."""
+    size = best.size(folder)
+    lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}", _size_line(size)]
+    if best.option:
+        lines.insert(1, f"try {best.option}")
+    return Diagnosis(False, tuple(lines), best.option, tuple(tried), size, best.blames)
 
 
-def _explained(folder: CaptureFolder, given: Ranked, best: Ranked, tried: list[Ranked]) -> Diagnosis:
-    """Another meaning fits."""
-    size, hypothesis = _size(folder, best), best.hypothesis
-    line = f"{hypothesis.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"
-    lines = [line, _size_line(size)]
-    if hypothesis.option:
-        lines.insert(1, f"try {hypothesis.option}")
-    return Diagnosis(False, tuple(lines), hypothesis.option, tuple(tried), size, hypothesis.blames)
-
-
-def _unexplained(folder: CaptureFolder, given: Ranked, tried: list[Ranked]) -> Diagnosis:
-    """No meaning fits: the camera without which the others agree, if there is one."""
-    base = max((r for r in tried if not r.hypothesis.blames), key=lambda r: r.score)
+def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesis]) -> Diagnosis:
+    """The diagnosis where no meaning fits: the camera without which the others agree, if there is one."""
+    base = max((h for h in tried if not h.blames), key=lambda h: h.score)
     base = base if base.score > given.score + BETTER else given
-    views = base.hypothesis.views
+    views = base.views
     without = {}
     for left_out in views if len(views) > 2 else ():
         rest = tuple(view for view in views if view is not left_out)
-        without[left_out.name] = _rank(folder, replace(base.hypothesis, views=rest))
+        without[left_out.name] = replace(base, views=rest).ranked(folder)
     fitting = [name for name, others in without.items() if others.score >= AGREES]
     best = max(without, key=lambda name: without[name].score, default=None)
     shares = ", ".join(f"{name} {share:.0%}" for name, share in base.shares.items())
@@ -326,6 +315,5 @@ def _unexplained(folder: CaptureFolder, given: Ranked, tried: list[Ranked]) -> D
         lines.append(f"{best} disagrees with the others, which agree by {without[best].score:.0%} without it")
     elif fitting:
         lines.append(f"{' or '.join(fitting)} disagrees with the others (three cameras cannot tell for sure)")
-    size = _size(folder, base)
     suspects = () if not fitting else (best,) if len(views) > 3 else tuple(fitting)
-    return Diagnosis(False, tuple(lines), "", tuple(tried), size, suspects)
+    return Diagnosis(False, tuple(lines), "", tuple(tried), base.size(folder), suspects)

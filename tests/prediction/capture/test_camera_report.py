@@ -5,9 +5,8 @@ import pytest
 from PIL import Image
 
 from ghgs_lit.data.resampling import area_mask
-from ghgs_lit.data.silhouettes import Silhouette
-from ghgs_lit.prediction.capture.consistency import agreements
-from ghgs_lit.prediction.capture.doctor import diagnose
+from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
+from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.drawing import camera_sheet
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from tests.helpers.figures import Figure
@@ -107,8 +106,8 @@ def test_agreement_is_the_share_of_a_mask_within_the_hull(tmp_path):
     middle = int(np.median(rows))
     figure.masks[1][:middle] = False
     figure.write(tmp_path)
-    capture = CaptureFolder(tmp_path, tmp_path / "cameras.json").read(tmp_path.name)
-    shares = agreements([coarse(photograph, 128) for photograph in capture.photographs])
+    photographs = CaptureFolder(tmp_path, tmp_path / "cameras.json").photographs(tmp_path.name)
+    shares = np.array(HullSearch().shares([coarse(photograph, 128) for photograph in photographs]))
     assert shares[1] == 1
     below = right.masks[[0, 2, 3], middle:].sum((1, 2)) / right.masks[[0, 2, 3]].sum((1, 2))
     assert shares[[0, 2, 3]] == pytest.approx(below, abs=0.12)
@@ -118,7 +117,7 @@ def test_the_picture_has_the_hull_on_the_mask_and_lines_through_the_body(tmp_pat
     """In a right capture a line runs through the mask of the other photograph."""
     figure = Figure()
     figure.write(tmp_path)
-    photographs = CaptureFolder(tmp_path, tmp_path / "cameras.json").read(tmp_path.name).photographs
+    photographs = CaptureFolder(tmp_path, tmp_path / "cameras.json").photographs(tmp_path.name)
     views = [coarse(photograph, 128) for photograph in photographs]
     picture = camera_sheet(figure.names, [p.image for p in photographs], views)
     assert picture.shape[1] == 4 * 96 + 3 * 2

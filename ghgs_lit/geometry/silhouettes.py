@@ -1,0 +1,151 @@
+"""Silhouette coherence: how much of each mask lies in the visual hull of the others.
+
+Where cameras and masks are right, the ray of every mask pixel passes a point that all other masks cover
+(Boyer 2006; Hernandez, Schmitt and Cipolla 2007). In NumPy, for silhouettes of any sizes; batches of masks of
+one size vote in :mod:`ghgs_lit.bounds.agreement`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """A mask with the camera of its cells.
+
+    Attributes:
+        mask: [h, w] bool, true where any pixel of a cell is.
+        intrinsics: [3, 3] float64 in cells, cell centres at +0.5.
+        extrinsics: [4, 4] float64, world to camera.
+    """
+
+    mask: np.ndarray
+    intrinsics: np.ndarray
+    extrinsics: np.ndarray
+
+    @property
+    def center(self) -> np.ndarray:
+        """The camera's centre [3] in the world."""
+        return -self.extrinsics[:3, :3].T @ self.extrinsics[:3, 3]
+
+    @cached_property
+    def grown(self) -> np.ndarray:
+        """The mask [h, w] with the cells beside it."""
+        return ndimage.binary_dilation(self.mask, np.ones((3, 3)))
+
+    def rays(self, cells: np.ndarray) -> np.ndarray:
+        """World directions [n, 3] of z 1 in the camera, through ``cells`` [n, 2] (column, row)."""
+        local = np.concatenate((cells, np.ones((len(cells), 1))), 1) @ np.linalg.inv(self.intrinsics).T
+        return local @ self.extrinsics[:3, :3]
+
+    def depths_around(self, point: np.ndarray, reach: float, count: int) -> np.ndarray:
+        """At most ``count`` z-depths above 0, up to ``reach`` before and behind a point [3]."""
+        middle = (self.extrinsics[:3, :3] @ point + self.extrinsics[:3, 3])[2]
+        depths = middle + reach * np.linspace(-1, 1, count)
+        return depths[depths > 0]
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Whether world points [..., 3] lie in the mask or in a cell beside it; false behind the camera.
+
+        Beyond the frame counts what is at its border: a mask that touches it goes on.
+        """
+        local = points @ self.extrinsics[:3, :3].T + self.extrinsics[:3, 3]
+        z = local[..., 2]
+        pixels = local @ self.intrinsics.T
+        cells = np.nan_to_num(np.floor(pixels[..., :2] / np.where(z > 0, z, 1)[..., None]))
+        row, column = (
+            cells[..., 1 - i].clip(0, side - 1).astype(int) for i, side in enumerate(self.mask.shape)
+        )
+        return self.grown[row, column] & (z > 0)
+
+    def extent(self, focus: np.ndarray) -> np.ndarray:
+        """Height and width [2] of the mask at the depth of ``focus`` [3], in world units."""
+        rows, columns = np.nonzero(self.mask)
+        cells = np.array([np.ptp(rows) + 1, np.ptp(columns) + 1]) if len(rows) else np.zeros(2)
+        depth = abs((self.extrinsics[:3, :3] @ focus + self.extrinsics[:3, 3])[2])
+        return cells * depth / self.intrinsics[[1, 0], [1, 0]]
+
+
+@dataclass(frozen=True)
+class HullSearch:
+    """How carefully a hull is looked for.
+
+    Attributes:
+        rays: cells of a mask that are tried, at most.
+        depths: points along each ray.
+        reach: range of depths around the subject's middle, in radii of the subject.
+        others: other silhouettes that a ray is looked up in, at most; None: all.
+        wrong: share of these that may say "outside".
+    """
+
+    rays: int = 300
+    depths: int = 96
+    reach: float = 1.25
+    others: int | None = None
+    wrong: float = 0.0
+
+    def shares(self, silhouettes: Sequence[Silhouette]) -> list[float]:
+        """Shares of each silhouette's cells whose rays meet the hull of the others; 0 where it is empty."""
+        count = len(silhouettes) if self.others is None else self.others + 1
+        spread = np.unique(np.linspace(0, len(silhouettes) - 1, count).round().astype(int))
+        focus, radius = subject_sphere(silhouettes)
+        shares = []
+        for i, one in enumerate(silhouettes):
+            cells = np.argwhere(one.mask)[:, ::-1] + 0.5
+            if len(cells):
+                cells = cells[np.unique(np.linspace(0, len(cells) - 1, self.rays).astype(int))]
+            meets = self.meets(one, cells, [silhouettes[j] for j in spread if j != i], focus, radius)
+            shares.append(float(meets.mean()) if len(meets) else 0.0)
+        return shares
+
+    def meets(
+        self,
+        one: Silhouette,
+        cells: np.ndarray,
+        others: Sequence[Silhouette],
+        focus: np.ndarray,
+        radius: float,
+    ) -> np.ndarray:
+        """Whether the rays of a silhouette meet the hull of ``others`` [n] bool.
+
+        Args:
+            one: the silhouette.
+            cells: [n, 2] (column, row), through which the rays pass.
+            others: that a point of the hull is covered by, but for a share of :attr:`wrong`.
+            focus, radius: of :func:`subject_sphere`.
+        """
+        depths = one.depths_around(focus, self.reach * radius, self.depths)
+        points = one.center + one.rays(cells)[:, None] * depths[:, None]
+        outside = np.zeros(points.shape[:2], int)
+        allowed = int(self.wrong * len(others))
+        for other in others:
+            open_points = outside <= allowed
+            outside[open_points] += ~other.covers(points[open_points])
+        return (outside <= allowed).any(1)
+
+
+def hull_in_view(silhouettes: Sequence[Silhouette], index: int) -> np.ndarray:
+    """Cells [h, w] bool of one silhouette in which the visual hull of the others is seen."""
+    one = silhouettes[index]
+    rows, columns = np.indices(one.mask.shape)
+    cells = np.stack((columns.ravel(), rows.ravel()), -1) + 0.5
+    others = [other for other in silhouettes if other is not one]
+    return HullSearch().meets(one, cells, others, *subject_sphere(silhouettes)).reshape(one.mask.shape)
+
+
+def subject_sphere(silhouettes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
+    """The subject's middle [3], and how far its parts may lie from there."""
+    rays, centers = [], np.stack([s.center for s in silhouettes])
+    for s in silhouettes:
+        rows, columns = np.nonzero(s.mask)
+        cells = np.array([[columns.mean(), rows.mean()]]) + 0.5 if len(rows) else np.zeros((1, 2))
+        ray = s.rays(cells)[0]
+        rays.append(ray / np.linalg.norm(ray))
+    # The point nearest to all rays: sum (I - r r^T) (x - c) = 0.
+    across = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
+    focus = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centers), rcond=None)[0]
+    return focus, float(max(np.linalg.norm(s.extent(focus)) for s in silhouettes))
