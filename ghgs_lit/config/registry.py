@@ -28,7 +28,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "encoder": {"vggt": "ghgs_lit.encoder.VGGTEncoder"},
     "depth_head": {"dpt": "ghgs_lit.heads.depth.DepthHead"},
     "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
-    "recalibration": {"semantic": "ghgs_lit.recalibration.Recalibration"},
+    "recalibration": {"semantic": "ghgs_lit.recalibration.RecalibrationOptions"},
     "gaussian_head": {"dpt": "ghgs_lit.heads.gaussian.GaussianHead"},
     "rounds": {"recurrent": "ghgs_lit.rounds.Rounds"},
     "renderer": {"splats": "ghgs_lit.rendering.Renderer"},

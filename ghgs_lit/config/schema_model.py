@@ -19,12 +19,6 @@ from ghgs_lit.config.kinds import (
 )
 
 MODEL: dict[str, Kind] = {
-    "bounds.cells": integer(least=8, most=512),
-    "bounds.dilation": number(least=0, below=0.5),
-    "bounds.margin": AMOUNT,
-    "bounds.resolution": integer(least=8, most=8192),
-    "bounds.samples": integer(least=2, most=4096),
-    "bounds.tolerance": integer(least=0),
     "compat.name": TEXT,
     "depth_head.consistency_depths": integer(least=0, most=4096),
     "depth_head.dpt.features": WIDTH | NULL,
@@ -89,13 +83,6 @@ MODEL: dict[str, Kind] = {
     "rounds.hidden": WIDTH,
     "rounds.reach": SHARE,
     "rounds.training_counts": list_of(COUNT),
-    "recalibration.k": COUNT,
-    "recalibration.neighborhood": TEXT,
-    "recalibration.neighbors": TEXT,
-    "recalibration.num_heads": WIDTH,
-    "recalibration.s_min": number(above=0, most=1),
-    "recalibration.similarity": TEXT,
-    "recalibration.tokens": TEXT,
     "skip.budget_db": number() | NULL,
     "skip.choices.*.budget_db": number() | NULL,
     "skip.choices.*.depth_pixels.*": TEXT,
@@ -110,6 +97,4 @@ MODEL: dict[str, Kind] = {
     "skip.name": TEXT,
     "skip.pixels": TEXT,
     "skip.tokens": TEXT,
-    "unprojection.border": integer(least=0),
-    "unprojection.tokens": TEXT,
 }
