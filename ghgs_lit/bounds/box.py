@@ -69,7 +69,7 @@ class SubjectBox(Options):
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
     def _valid(self, bounds: DepthBounds) -> DepthBounds:
-        """Bounds in front of the camera, at least :data:`MIN_THICKNESS` apart (widened about their middle)."""
+        """Bounds in front of the camera, widened about their middle where they are too near."""
         near, far = (x.nan_to_num(nan=0.0).clamp(max=_FARTHEST) for x in (bounds.near, bounds.far))
         missing = (MIN_THICKNESS - (far - near)).clamp(min=0) / 2
         near = (near - missing).clamp(min=MIN_DEPTH)

@@ -287,12 +287,6 @@ KINDS: dict[str, Kind] = {
     "logger.*.offline": FLAG,
     "logger.*.project": TEXT,
     "logger.*.version": ANY_TEXT | integer(least=0) | NULL,
-    "feature_cache.directory": PATH,
-    "feature_cache.dtype": TEXT,
-    "feature_cache.margin": integer(least=0),
-    "feature_cache.max_gb": POSITIVE | NULL,
-    "feature_cache.of": TEXT,
-    "feature_cache.tokens": TEXT,
     # evaluation; ghgs table takes one value in place of a list
     "evaluation.pictures": integer(least=0),
     "evaluation.split": TEXT,

@@ -21,9 +21,7 @@ def _attention(q: Tensor, k: Tensor, v: Tensor) -> int:
 
 
 #: Compiled kernels, which PyTorch cannot see: module, function, FLOPs from its arguments.
-KERNELS: tuple[tuple[ModuleType, str, Callable[..., int]], ...] = (
-    (encoder.cpu, "attend", _attention),
-)
+KERNELS: tuple[tuple[ModuleType, str, Callable[..., int]], ...] = ((encoder.cpu, "attend", _attention),)
 
 
 def _cpu_attention(query: tuple, key: tuple, value: tuple, *_: Any, **__: Any) -> int:
