@@ -75,19 +75,16 @@ class VGGTOptions(Options):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> "VGGTOptions":
-        fits, last = self.width % (4 * self.heads) == 0, self.depth - 1
+        fits = self.width % (4 * self.heads) == 0
         self.require(fits, "width", "a multiple of 4 * heads (rows and columns rotate)")
         if self.vit.kind == "dinov2":
-            self.require(
-                self.width % self.vit.heads == 0, "width", f"a multiple of vit.heads={self.vit.heads}"
-            )
-            fits = self.image_size % self.patch_size == 0
-            self.require(fits, "image_size", f"a multiple of {self.patch_size}")
-        layers = list(self.layers)
+            heads, patch = self.vit.heads, self.patch_size
+            self.require(self.width % heads == 0, "width", f"a multiple of vit.heads={heads}")
+            self.require(self.image_size % patch == 0, "image_size", f"a multiple of {patch}")
+        layers, last = list(self.layers), self.depth - 1
         fits = bool(layers) and sorted(set(layers)) == layers and layers[0] >= 0 and layers[-1] == last
-        self.require(
-            fits, "layers", f"ascending indices that end at the last of {self.depth} pairs of blocks"
-        )
+        expected = f"ascending indices that end at the last of {self.depth} pairs of blocks"
+        self.require(fits, "layers", expected)
         match = re.fullmatch(r"all|none|last_(\d+)", self.trainable)
         fits = match is not None and int(match[1] or 0) <= self.depth
         self.require(fits, "trainable", f"all, none or last_<n>, n up to {self.depth}")

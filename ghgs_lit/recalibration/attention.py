@@ -36,7 +36,7 @@ class SemanticAttention(nn.Module):
         num_heads: number of heads, each with C / 4 / num_heads channels.
         similarity: how the cosine s of two tokens' semantic features changes the logit:
             ``product`` multiplies by s (Eq. 3), ``product_clamped`` multiplies by max(s, 0) (the authors'
-            release), ``log`` adds log(max(s, :data:`S_MIN`)), which lowers the weight of dissimilar neighbours
+            release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar neighbours
             instead of pulling their logit to 0, ``none`` ignores it (s = 1).
 
     Raises:
