@@ -36,7 +36,7 @@ def _views(b: int, v: int, height: int, width: int, seed: int = 1):
 
 
 def _options(name: str) -> dict:
-    options = OmegaConf.to_container(composed("train", f"encoder={name}")["encoder"])
+    options = OmegaConf.to_container(composed("train", f"encoder={name}", "model=paper")["encoder"])
     assert options.pop("kind") == "vggt"
     return options
 
