@@ -23,7 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from recorder import Recorder, Stage, memory_gb, merged, reset_peak
 
-from ghgs_lit import encoder, recalibration
+from ghgs_lit import encoder
 from ghgs_lit.config import compose
 from ghgs_lit.diagnostics.benchmark.weights import random_model
 from ghgs_lit.encoder.packing import KeptPatches
@@ -163,9 +163,6 @@ def load_kernels(dtype: torch.dtype) -> float:
     x = torch.zeros(1, 16, 1024, 64, dtype=dtype)
     if encoder.cpu.is_supported(x, x):
         encoder.cpu.attend(*[x[:, :1, :1]] * 3)
-    row, place = torch.ones(1, 128), torch.zeros(1, 1, dtype=torch.int64)
-    recalibration.cpu.attend(row, row, row, 8, place, place == 0, row[:, :1], row[:, :1])
-    recalibration.cpu.cosines(row, place)
     return time.perf_counter() - start
 
 

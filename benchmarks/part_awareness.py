@@ -20,7 +20,7 @@ from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.semantic import SemanticBranch
+from ghgs_lit.encoder.semantic import SemanticBranch, SemanticOptions
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.training.pretext.labels import part_shares
 from ghgs_lit.training.pretext.measure import neighbor_shows_part
@@ -70,7 +70,7 @@ def of_checkpoint(path: str) -> Features:
     encoder = checkpoint["config"]["encoder"]
     if "bounds" in checkpoint["config"]:
         return of_model(GHGS.from_checkpoint(path))
-    branch = SemanticBranch.of(encoder["semantic"], encoder["patch_size"])
+    branch = SemanticOptions(**encoder["semantic"]).build(encoder["patch_size"])
     prefix, state = "encoder.semantic.", model_state(checkpoint)
     branch.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
     return of_branch(branch.eval())
@@ -100,7 +100,7 @@ def main() -> None:
     config = resolve(compose("pretext", ["data.batch_size=1", *(a for a in arguments if "=" in a)]))
     patch_size = config["encoder"]["patch_size"]
     torch.manual_seed(0)
-    untrained = SemanticBranch.of(config["encoder"]["semantic"], patch_size).eval()
+    untrained = SemanticOptions(**config["encoder"]["semantic"]).build(patch_size).eval()
     rows: dict[str, Features] = {
         "mean colour": colors(True, patch_size),
         "colours": colors(False, patch_size),

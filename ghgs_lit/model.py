@@ -190,7 +190,8 @@ class GHGS(nn.Module):
             with torch.device("meta") if name in empty else nullcontext():
                 return build(config[name], name, **extra)
 
-        encoder = stage("encoder")
+        skip = config.get("skip") or {}
+        encoder = stage("encoder", tokens=skip.get("tokens", "all"), margin=skip.get("margin", 1))
         return cls(
             stage("bounds"),
             encoder,
@@ -201,7 +202,7 @@ class GHGS(nn.Module):
             frame=options.get("frame", "world"),
             matte=options.get("matte"),
             check_inputs=options.get("check_inputs", True),
-            auto=auto_skip(config.get("skip") or {}),
+            auto=auto_skip(skip),
             rounds=stage("rounds", channels=config["gaussian_head"]["channels"])
             if "rounds" in config
             else None,

@@ -84,7 +84,7 @@ def token_pixels(mode, border, size=512):
     tokens = Tokens((latent,), latent, image, row, column, (1, 2, rows, rows), 14)
     inner = Batch(torch.zeros(*full.shape[:2], 3, *full.shape[2:]), full,
                   batch.cameras.cropped(-3, -3, size + 6, size + 6))  # fmt: skip
-    points = Unprojection(mode, border)(DepthMaps(padded, full, padded), tokens, inner)
+    points = Unprojection(tokens=mode, border=border)(DepthMaps(padded, full, padded), tokens, inner)
     cameras: Cameras = batch.cameras[0]
     pixel, _ = project(points.tokens, cameras.intrinsics[image], cameras.extrinsics[image])
     return pixel.reshape(2, rows, rows, 2)[0]

@@ -51,7 +51,7 @@ def attention(g):
 def recalibration(g):
     block = SemanticAttention(64, 2, "product_clamped")
     x, points, semantic = (torch.randn(300, n, generator=g) for n in (64, 3, 16))
-    near = nearest_neighbors(points, torch.zeros(300, dtype=torch.long), 8, "all")
+    near = nearest_neighbors(points, torch.zeros(300, dtype=torch.long), 8)
 
     @torch.no_grad()
     def ours(dtype):

@@ -19,7 +19,7 @@ from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.gaussian import GaussianHead
 from ghgs_lit.model import GHGS
-from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.recalibration import RecalibrationOptions
 from ghgs_lit.types import Batch, Cameras, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
@@ -56,8 +56,8 @@ def release_model(inputs, dtype):
         NoBounds(),
         GivenTokens(inputs),
         DepthHead(64, dpt, parameterization="inverse_linear"),
-        Unprojection("release", 3),
-        Recalibration(64, k=8, similarity="product_clamped", tokens="all"),
+        Unprojection(tokens="release", border=3),
+        RecalibrationOptions(k=8, similarity="product_clamped", tokens="all").build(64),
         GaussianHead(64, dpt, parameterization="release"),
         pad="multiple",
         frame="world",
@@ -269,7 +269,7 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
     assert config("model=paper")["bounds"]["kind"] == "box"
     assert config("model=paper", "bounds=hull")["bounds"]["kind"] == "hull"
     assert config("model=paper", "depth_head=hull")["depth_head"]["parameterization"] == "linear"
-    assert config("model=hull", "recalibration=paper")["recalibration"]["s_min"] == 0.01
+    assert config("model=hull", "recalibration=paper")["recalibration"]["k"] == 64
 
 
 @pytest.mark.parametrize("ablation", ["full", "neither"])

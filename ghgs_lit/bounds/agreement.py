@@ -46,8 +46,8 @@ def trusted_views(
     silent = torch.eye(masks.shape[1] + 1, dtype=torch.bool, device=masks.device)[1:] | ~voting[..., None]
     agreement = torch.where(silent, 1.0, explained).amin(1)
     best, suspect = agreement[:, 1:].max(1, keepdim=True)
-    found = agreement[:, :1]
-    wrong = (found < _SHARE) & (2 * (1 - best) < 1 - found) & (voting.sum(1, keepdim=True) > 2)
+    by_all = agreement[:, :1]
+    wrong = (by_all < _SHARE) & (2 * (1 - best) < 1 - by_all) & (voting.sum(1, keepdim=True) > 2)
     return voting & ~torch.zeros_like(voting).scatter(1, suspect, wrong)
 
 

@@ -4,83 +4,63 @@ The box is found by carving a coarse grid with the masks. Masks are dilated, bec
 Nothing here has a gradient.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor
 
-from ghgs_lit.bounds import cpu
-from ghgs_lit.bounds.agreement import RESOLUTION, trusted_views
+from ghgs_lit.bounds import agreement, cpu
 from ghgs_lit.bounds.rays import depths_in_box, pixel_axes, projection_matrices
 from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, silhouettes, votes_outside
-from ghgs_lit.errors import require
+from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
+#: Cells along the longer side of the masks that are searched, and along each side of the grid that is carved.
+RESOLUTION, CELLS = 160, 32
+
+#: Metres around the box; the least near, and the least far - near.
+MARGIN, MIN_DEPTH, MIN_THICKNESS = 0.03, 0.1, 0.02
+
 #: The largest bound, in metres: cameras of absurd sizes overflow.
 _FARTHEST = 1e6
 
 
-@dataclass(frozen=True)
-class SubjectBox:
+class SubjectBox(Options):
     """``bounds(batch) -> DepthBounds``: where each ray enters and leaves the subject's box.
 
     A ray that misses the box gets the range of depths of the whole box. Views with an empty mask do not vote,
     nor does one whose mask contradicts all others (:func:`ghgs_lit.bounds.agreement.trusted_views`).
-
-    Args:
-        dilation: of the masks, as a fraction of the image's longer side.
-        tolerance: a point counts as inside while at most this many views that see it say "outside".
-        resolution: cells along the longer side of the masks that are searched.
-        cells: cells along each side of the grid that is carved.
-        margin: around the box, in metres.
-        min_depth: least near, in metres.
-        min_thickness: least far - near, in metres.
     """
 
-    dilation: float = 0.02
-    tolerance: int = 0
-    resolution: int = 160
-    cells: int = 32
-    margin: float = 0.03
-    min_depth: float = 0.1
-    min_thickness: float = 0.02
-
-    least: ClassVar[dict[str, int]] = {"tolerance": 0, "margin": 0, "resolution": 8, "cells": 8}
-
-    def __post_init__(self) -> None:
-        require(0 <= self.dilation < 0.5, "bounds.dilation", "a fraction of the image", self.dilation)
-        for name, least in self.least.items():
-            value = getattr(self, name)
-            require(value >= least, f"bounds.{name}", f"{least} or more", value)
-        for name in ("min_depth", "min_thickness"):
-            require(getattr(self, name) > 0, f"bounds.{name}", "above 0", getattr(self, name))
+    group = "bounds"
+    dilation: float = Field(0.01, ge=0, lt=0.5)
+    """Dilation of the masks, a fraction of the image's longer side; 0.02 to 0.03 for noisy masks"""
+    tolerance: Index = 0
+    """Views that may say "outside" of a point that counts as inside"""
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> DepthBounds:
         """Bounds of all pixels; reads masks and cameras."""
         with torch.autocast(batch.masks.device.type, enabled=False):
-            coarse = silhouettes(batch.masks, batch.cameras, self.resolution, self.dilation)
+            coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, self.dilation)
             voting = self._voting(coarse)
             lower, upper = subject_box(
                 coarse.masks & voting[..., None, None],
                 coarse.cameras,
                 coarse.dilation,
                 self.tolerance,
-                self.cells,
             )
-            return self._within(batch, coarse, voting, lower - self.margin, upper + self.margin)
+            return self._within(batch, coarse, voting, lower - MARGIN, upper + MARGIN)
 
     def _voting(self, coarse: Silhouettes) -> Bool[Tensor, "B V"]:
-        few = silhouettes(coarse.masks, coarse.cameras, RESOLUTION, self.dilation)
+        few = silhouettes(coarse.masks, coarse.cameras, agreement.RESOLUTION, self.dilation)
         center = subject_center(few.masks, few.cameras)
         # Not the largest: a mask of noise would leave no sample within the subject.
         reach = _reach(few.masks, few.cameras, center).nanmedian(1).values
-        return trusted_views(few, center, reach, self.tolerance)
+        return agreement.trusted_views(few, center, reach, self.tolerance)
 
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
@@ -89,19 +69,19 @@ class SubjectBox:
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
     def _valid(self, bounds: DepthBounds) -> DepthBounds:
-        """Bounds in front of the camera, at least ``min_thickness`` apart (widened about their middle)."""
+        """Bounds in front of the camera, widened about their middle where they are too near."""
         near, far = (x.nan_to_num(nan=0.0).clamp(max=_FARTHEST) for x in (bounds.near, bounds.far))
-        missing = (self.min_thickness - (far - near)).clamp(min=0) / 2
-        near = (near - missing).clamp(min=self.min_depth)
-        return DepthBounds(near, torch.maximum(far + missing, near + self.min_thickness))
+        missing = (MIN_THICKNESS - (far - near)).clamp(min=0) / 2
+        near = (near - missing).clamp(min=MIN_DEPTH)
+        return DepthBounds(near, torch.maximum(far + missing, near + MIN_THICKNESS))
 
 
 def subject_box(
-    masks: Bool[Tensor, "B V h w"], cameras: Cameras, radius: int, tolerance: int = 0, cells: int = 32
+    masks: Bool[Tensor, "B V h w"], cameras: Cameras, radius: int, tolerance: int = 0
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
     """The axis-aligned box of the space that masks and cameras leave to the subject.
 
-    Carved twice: the second grid fills the box that the first one found. Where nothing is left (masks that
+    Carved twice: the second grid fills the box of the first one. Where nothing is left (masks that
     contradict one another) the box of the previous pass stays.
 
     Args:
@@ -109,7 +89,6 @@ def subject_box(
         cameras: [B, V], of the masks' size.
         radius: dilation of the masks in pixels.
         tolerance: how many views may say "outside" of a point that is kept.
-        cells: cells along each side of the grid.
 
     Returns:
         The corners with the smallest and with the largest coordinates, in metres.
@@ -119,28 +98,28 @@ def subject_box(
     lower, upper = center - reach, center + reach
     focal, voting = _focal_lengths(cameras).amax(-1), masks.flatten(2).any(-1)
     for _ in range(2):
-        cell = (upper - lower) / cells
+        cell = (upper - lower) / CELLS
         depth = _project_one((lower + upper) / 2, cameras)[1]
         # Half a cell's diagonal in pixels, for subjects that come up to 0.6 of the distance of their middle.
         pixels = focal * cell.norm(dim=-1, keepdim=True) / 2 / (0.6 * depth).clamp(min=NEAREST)
         grow = pixels.nan_to_num(nan=0.0).amax(1).clamp(max=max(masks.shape[-2:])).ceil().int()
         grown = dilate(masks, radius + grow[:, None, None, None])
-        kept = _carve(votes_outside(grown, voting), cameras, lower, cell, cells, tolerance)
-        found = kept.flatten(1).any(-1)[:, None]
+        kept = _carve(votes_outside(grown, voting), cameras, lower, cell, tolerance)
+        is_left = kept.flatten(1).any(-1)[:, None]
         # Along each axis, whether any cell of the slice is kept.
         slices = torch.stack([kept.any(axes) for axes in ((2, 3), (1, 3), (1, 2))], 1)
         first, last = first_and_last(slices)
         corner = lower
-        lower = torch.where(found, corner + first * cell, lower)
-        upper = torch.where(found, corner + (last + 1) * cell, upper)
+        lower = torch.where(is_left, corner + first * cell, lower)
+        upper = torch.where(is_left, corner + (last + 1) * cell, upper)
     return lower, upper
 
 
 def _carve(
-    outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, cells: int, tolerance: int
+    outside: Tensor, cameras: Cameras, lower: Tensor, cell: Tensor, tolerance: int
 ) -> Bool[Tensor, "B n n n"]:
     """Which cells of a grid at most ``tolerance`` views place outside the subject."""
-    steps = torch.arange(cells, device=lower.device, dtype=lower.dtype) + 0.5
+    steps = torch.arange(CELLS, device=lower.device, dtype=lower.dtype) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
     if cpu.is_supported(matrices, position):

@@ -4,11 +4,9 @@ The rays of the subject's pixels are marched through the subject's box, and what
 views allow is kept: the image-based visual hull (Matusik et al. 2000). Nothing here has a gradient.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from pydantic import Field
 from torch import Tensor
 
 from ghgs_lit.bounds import cpu
@@ -22,19 +20,14 @@ from ghgs_lit.types import Batch, Cameras, DepthBounds
 _DEPTHS = 1 << 23
 
 
-@dataclass(frozen=True)
 class VisualHull(SubjectBox):
     """``bounds(batch) -> DepthBounds``: where each ray of the subject enters and leaves the visual hull.
 
     Other pixels, and rays that miss the hull, keep their bounds in the box.
-
-    Args:
-        samples: depths that are tried along each ray; for the others see :class:`SubjectBox`.
     """
 
-    samples: int = 48
-
-    least: ClassVar[dict[str, int]] = {**SubjectBox.least, "samples": 2}
+    samples: int = Field(48, ge=2, le=4096)
+    """Depths that are tried along each ray"""
 
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor

@@ -1,10 +1,13 @@
 """Depths without bounds."""
 
+from ghgs_lit.config.options import Options
 from ghgs_lit.types import Batch
 
 
-class NoBounds:
+class NoBounds(Options):
     """The stage of a model whose depths are not bounded, as in the authors' release."""
+
+    group = "bounds"
 
     def __call__(self, batch: Batch) -> None:
         """None: there are no bounds."""

@@ -17,7 +17,7 @@ from ghgs_lit.cli.inputs import (
 from ghgs_lit.cli.methods import baselines_of, trained_method
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
-from ghgs_lit.encoder import open_cache
+from ghgs_lit.encoder import FeatureCacheOptions
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
@@ -40,7 +40,9 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
     if path is not None:
         methods["model"], found = trained_method(config, device)
         model = methods["model"].model
-        model.feature_cache = open_cache(config["feature_cache"], model.recalibration.tokens)
+        model.feature_cache = FeatureCacheOptions.read(config["feature_cache"], "feature_cache").build(
+            model.recalibration.tokens
+        )
         facts |= found
     methods |= baselines_of(config["baselines"], config, device)
     return methods, facts

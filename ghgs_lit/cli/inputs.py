@@ -34,8 +34,6 @@ FREE = (
     "model.pad",
     "recalibration.k",
     "recalibration.neighborhood",
-    "recalibration.neighbors",
-    "recalibration.s_min",
     "recalibration.similarity",
     "recalibration.tokens",
     "rounds.count",

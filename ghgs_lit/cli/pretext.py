@@ -11,7 +11,7 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.cli.train import build_trainer, fit, quiet, resume_step, run_job
 from ghgs_lit.config import build, resolve
-from ghgs_lit.encoder.semantic import SemanticBranch
+from ghgs_lit.encoder.semantic import SemanticOptions
 from ghgs_lit.errors import require
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import loggers
@@ -40,7 +40,7 @@ def pretrain(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> 
     data = build_data(config)
     fits = not any(side % patch_size for side in data.options.size)
     require(fits, "data.size", f"sides divisible by the patch size {patch_size}", list(data.options.size))
-    model = Pretext(SemanticBranch.of(options, patch_size))
+    model = Pretext(SemanticOptions.read(options, "encoder.semantic").build(patch_size))
     step = resume_step(config, model)
     module = PretextModule(model, build(config["optimizer"], "optimizer"), config)
     quiet()

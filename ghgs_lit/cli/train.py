@@ -17,7 +17,7 @@ from torch import nn
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
-from ghgs_lit.encoder import open_cache
+from ghgs_lit.encoder import FeatureCacheOptions
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
@@ -166,7 +166,8 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     data = build_data(config)
     model = GHGS.from_config(config)
     check_size(data, model)
-    model.feature_cache = open_cache(config.get("feature_cache"), model.recalibration.tokens)
+    cache = FeatureCacheOptions.read(config.get("feature_cache") or {}, "feature_cache")
+    model.feature_cache = cache.build(model.recalibration.tokens)
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")

@@ -1,6 +1,7 @@
 """The encode stage: VGGT's aggregator over patch tokens, of any size."""
 
-from ghgs_lit.encoder.cache import FeatureCache, PhotographCache, open_cache
+from ghgs_lit.encoder.cache import FeatureCache, FeatureCacheOptions, PhotographCache
 from ghgs_lit.encoder.encoder import VGGTEncoder
+from ghgs_lit.encoder.options import VGGTOptions
 
-__all__ = ["FeatureCache", "PhotographCache", "VGGTEncoder", "open_cache"]
+__all__ = ["FeatureCache", "FeatureCacheOptions", "PhotographCache", "VGGTEncoder", "VGGTOptions"]

@@ -1,15 +1,15 @@
 """Alternating attention inside each view and across all views (VGGT's aggregator)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, draw_normal_, run_block
+from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, run_block
+from ghgs_lit.encoder.options import VGGTOptions
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables
-from ghgs_lit.errors import require
 
 NORM_EPS = 1e-5
 
@@ -26,55 +26,24 @@ class Aggregator(nn.Module):
 
     Args:
         patch_embed: [n, i, H, W] images and :class:`KeptPatches` to [N, width] tokens of the kept patches.
-        patch_size: side of a patch in pixels.
-        width: channels of a token.
-        heads: attention heads of each block.
-        depth: number of pairs of blocks.
-        registers: register tokens of each view.
-        layers: indices of the pairs that are read out, ascending; the last pair must be among them.
-        layer_scale: initial value of LayerScale.
-        checkpointing: recompute activations in the backward pass instead of keeping them.
+        options: of the stage.
     """
 
-    def __init__(
-        self,
-        patch_embed: nn.Module,
-        patch_size: int,
-        width: int,
-        heads: int,
-        depth: int,
-        registers: int,
-        layers: Sequence[int],
-        layer_scale: float = 0.01,
-        checkpointing: bool = False,
-    ):
+    def __init__(self, patch_embed: nn.Module, options: VGGTOptions):
         super().__init__()
-        require(
-            width % (4 * heads) == 0,
-            "encoder.width",
-            "a multiple of 4 * heads (rows and columns rotate)",
-            width,
-        )
-        require(
-            len(layers) > 0
-            and sorted(set(layers)) == list(layers)
-            and layers[0] >= 0
-            and layers[-1] == depth - 1,
-            "encoder.layers",
-            f"ascending indices that end at the last of {depth} pairs of blocks",
-            list(layers),
-        )
-        self.patch_size, self.layers, self.checkpointing = patch_size, tuple(layers), checkpointing
-        self.special = 1 + registers
+        width, heads = options.width, options.heads
+        self.patch_size, self.layers = options.patch_size, options.layers
+        self.checkpointing = options.checkpointing
+        self.special = 1 + REGISTERS
         self.head_width = width // heads
         self.patch_embed = patch_embed
         self.camera_token = nn.Parameter(draw_normal_(torch.empty(1, 2, 1, width), 1e-6))
-        self.register_token = nn.Parameter(draw_normal_(torch.empty(1, 2, registers, width), 1e-6))
+        self.register_token = nn.Parameter(draw_normal_(torch.empty(1, 2, REGISTERS, width), 1e-6))
 
         def blocks() -> nn.ModuleList:
             return nn.ModuleList(
-                Block(width, heads, qk_norm=True, norm_eps=NORM_EPS, layer_scale=layer_scale)
-                for _ in range(depth)
+                Block(width, heads, qk_norm=True, norm_eps=NORM_EPS, layer_scale=options.layer_scale)
+                for _ in range(options.depth)
             )
 
         self.frame_blocks, self.global_blocks = blocks(), blocks()

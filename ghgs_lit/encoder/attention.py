@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.rope import Rotary, rotate
-from ghgs_lit.errors import require
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.parts import at_once, even_parts
 
@@ -23,13 +22,12 @@ class Attention(nn.Module):
 
     Args:
         width: channels of a token.
-        heads: number of heads.
+        heads: number of heads, a divisor of the width.
         qk_norm: normalise q and k over the channels of each head, before they are rotated.
     """
 
     def __init__(self, width: int, heads: int, qk_norm: bool):
         super().__init__()
-        require(width % heads == 0, "encoder.heads", f"a divisor of the width {width}", heads)
         self.heads = heads
         self.qkv = Linear(width, 3 * width)
         self.q_norm = nn.LayerNorm(width // heads) if qk_norm else nn.Identity()

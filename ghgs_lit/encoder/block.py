@@ -13,6 +13,9 @@ from ghgs_lit.encoder.rope import Rotary
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.parts import even_parts
 
+#: Register tokens of each view, of the ViT and of the aggregator.
+REGISTERS = 4
+
 #: Hidden values of the MLP that are held at once without a gradient (bounds memory).
 _HIDDEN = 1 << 23
 

@@ -6,24 +6,56 @@ input, which patches are kept, precision and device. Cameras are not among them:
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+import pathlib
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from ghgs_lit.config.options import Index, Options, Path, Positive
 from ghgs_lit.encoder.encoder import VGGTEncoder
 from ghgs_lit.encoder.feature_files import FeatureFiles, Stored, hashed
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Version of the files; raise it when older files must not be read any more.
 LAYOUT = 1
 PLACE = ("image", "row", "column")
+
+
+class FeatureCacheOptions(Options):
+    """Features of a frozen encoder on disk, for runs or epochs on the same photographs."""
+
+    group = "feature_cache"
+    directory: Path | None = None
+    """null: no cache"""
+    of: Literal["views", "photographs"] = "views"
+    """views: tokens, a file for each ordered choice of views | photographs: what the patch encoder gives for
+    each photograph, for any choice of views and blocks of the aggregator that learn"""
+    tokens: Literal["subject", "all"] = "subject"
+    """With of=views: subject, a fifth of the size, slightly different predictions | all: the same ones"""
+    margin: Index = 1
+    """Patches around the subject that are kept, with tokens=subject"""
+    dtype: Literal["float32", "float16", "bfloat16"] = "float32"
+    """Precision of the files"""
+    max_gb: Positive | None = 100
+    """Size of all files, 10^9 bytes; beyond it the oldest are deleted; null: no limit"""
+
+    def build(self, recalibrated: str = "subject") -> "FeatureCache | PhotographCache | None":
+        """The cache; None without a directory.
+
+        Args:
+            recalibrated: ``recalibration.tokens`` of the model; with ``all``, all tokens are kept.
+        """
+        if self.directory is None:
+            return None
+        if self.of == "photographs":
+            return PhotographCache(self.directory, self.dtype, self.max_gb)
+        tokens = "all" if recalibrated == "all" else self.tokens
+        return FeatureCache(self.directory, tokens, self.margin, self.dtype, self.max_gb)
 
 
 class FeatureCache(FeatureFiles):
@@ -39,15 +71,13 @@ class FeatureCache(FeatureFiles):
 
     def __init__(
         self,
-        directory: str | Path,
+        directory: str | pathlib.Path,
         tokens: str = "subject",
         margin: int = 1,
         dtype: str = "float32",
-        max_gb: float | int | None = None,
+        max_gb: float | None = None,
     ):
         super().__init__(directory, dtype, max_gb)
-        choice("feature_cache.tokens", tokens, ("subject", "all"))
-        require(isinstance(margin, int) and margin >= 0, "feature_cache.margin", "0 or more patches", margin)
         self.tokens, self.margin = tokens, margin
 
     @property
@@ -67,8 +97,8 @@ class FeatureCache(FeatureFiles):
         parts = []
         for b in range(len(images)):
             one = slice(b, b + 1)
-            own = None if bounds is None else DepthBounds(bounds.near[one], bounds.far[one])
-            inputs = images[one], masks[one], own, kept[one]
+            ends = None if bounds is None else DepthBounds(bounds.near[one], bounds.far[one])
+            inputs = images[one], masks[one], ends, kept[one]
             stored = self.stored(
                 self._key(encoder, *inputs), lambda inputs=inputs: self._made(encoder, *inputs)
             )
@@ -94,7 +124,7 @@ class FeatureCache(FeatureFiles):
         self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
     ) -> str:
         stored = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
-        facts = [LAYOUT, encoder.options, self.fingerprint(encoder), stored, *_precision(images)]
+        facts = [LAYOUT, encoder.options.facts, self.fingerprint(encoder), stored, *_precision(images)]
         inputs = [images, kept]
         reads_masks = encoder.mask_input or encoder.bounds_input or encoder.semantic is not None
         if reads_masks or self.tokens == "subject":
@@ -126,11 +156,11 @@ class PhotographCache(FeatureFiles):
         """As ``encoder.encode``, without a gradient of the patch tokens."""
         embed = encoder.aggregator.patch_embed
         _require_frozen(embed, "a frozen patch encoder (encoder.trainable=none or last_<n>)")
-        about = [encoder.options["vit"], encoder.patch_size]
+        about = [encoder.options.vit.model_dump(), encoder.patch_size]
 
         def patches(normalized: Float[Tensor, "n i H W"], _: KeptPatches) -> Float[Tensor, "N c"]:
             pairs = zip(normalized.split(1), kept.flatten(0, 1).split(1), strict=True)
-            return torch.cat([self._photograph(embed, image, own[None], about) for image, own in pairs])
+            return torch.cat([self._photograph(embed, image, grid[None], about) for image, grid in pairs])
 
         return encoder.encode(images, masks, bounds, kept, patches)
 
@@ -142,26 +172,6 @@ class PhotographCache(FeatureFiles):
 
         tensors, dtypes = self.stored(hashed(facts, [image, kept]), made)
         return tensors["patches"].to(image.device, getattr(torch, dtypes["patches"]))
-
-
-def open_cache(options: Mapping[str, Any] | None, recalibrated: str) -> FeatureCache | PhotographCache | None:
-    """The cache that the configuration describes.
-
-    Args:
-        options: the node ``feature_cache``; without a ``directory`` there is no cache.
-        recalibrated: ``recalibration.tokens`` of the model; with ``all``, all tokens are kept.
-
-    Raises:
-        InputError: an impossible option.
-    """
-    if not options or options["directory"] is None:
-        return None
-    options = dict(options)
-    of = options.pop("of", "views")
-    choice("feature_cache.of", of, ("views", "photographs"))
-    if of == "photographs":
-        return PhotographCache(options["directory"], options["dtype"], options.get("max_gb"))
-    return FeatureCache(**{**options, "tokens": "all" if recalibrated == "all" else options["tokens"]})
 
 
 def _require_frozen(module: nn.Module, expected: str) -> None:

@@ -1,17 +1,16 @@
 """The encode stage: photographs and masks to tokens."""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
+from ghgs_lit.encoder.options import VGGTOptions
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
-from ghgs_lit.encoder.semantic import SemanticBranch
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
@@ -22,10 +21,7 @@ from ghgs_lit.types import DepthBounds, Tokens
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
-#: Options of each kind of patch embedding (``encoder.vit``).
-VIT_OPTIONS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
-
-#: Choices of ``encoder.tokens`` that leave patches out.
+#: Choices of ``skip.tokens`` that leave patches out.
 KEPT = {"window": patches_in_window, "subject": patches_around_subject}
 
 
@@ -33,95 +29,36 @@ class VGGTEncoder(nn.Module):
     """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
 
     Args:
-        width: of the aggregator's tokens.
-        heads: of its attention.
-        depth: pairs of a frame block and a global block.
-        vit: ``{kind: conv}`` one convolution per patch; ``{kind: stem, channels}`` a small convolutional
-            stem; ``{kind: dinov2, depth, heads}`` a DINOv2 ViT with registers.
-        layers: indices of the pairs whose tokens are read out, ascending; the last pair must be among them.
-        patch_size: side of a patch in pixels.
-        registers: register tokens of each view.
-        image_size: side of the square image whose patch positions a DINOv2 ViT stores, in pixels.
-        mask_input: add the mask to the input channels.
-        bounds_input: add two maps of the depth bounds (:func:`relative_bounds`) to the input channels.
+        options: of the stage.
         tokens: ``all``, or patches of the background leave before the first block: ``window`` keeps those of
             the smallest rectangle that holds the subject, ``subject`` those with a pixel of the subject. They
             keep their place in the photograph; a view with an empty mask keeps its special tokens only.
         margin: patches around them that stay, too.
-        semantic: the semantic features: None, the patch tokens that enter the aggregator; or ``{width, depth,
-            heads, channels, parts}`` of a :class:`SemanticBranch`, which does not learn here.
-        layer_scale: initial value of the aggregator's LayerScale (0.01 as published).
-        trainable: ``all``, ``none``, or ``last_<n>`` for the last n pairs of blocks.
-        checkpointing: recompute activations in the backward pass instead of keeping them.
-        weights: what the semantic features learned from, the name of published weights or ``pretext``, or
-            None. A note for checkpoints and tables; nothing is loaded.
     """
 
-    def __init__(
-        self,
-        width: int,
-        heads: int,
-        depth: int,
-        vit: Mapping,
-        layers: Sequence[int],
-        patch_size: int = 14,
-        registers: int = 4,
-        image_size: int = 518,
-        mask_input: bool = False,
-        bounds_input: bool = False,
-        tokens: str = "all",
-        margin: int = 1,
-        semantic: Mapping[str, int] | None = None,
-        layer_scale: float = 0.01,
-        trainable: str = "all",
-        checkpointing: bool = False,
-        weights: str | None = None,
-    ):
+    def __init__(self, options: VGGTOptions, tokens: str = "all", margin: int = 1):
         super().__init__()
-        choice("encoder.tokens", tokens, ("all", *KEPT))
-        require(margin >= 0, "encoder.margin", "0 or more patches", margin)
-        #: All that the tokens depend on, the weights and the choice of tokens apart.
-        self.options: dict[str, Any] = {
-            "width": width,
-            "heads": heads,
-            "depth": depth,
-            "vit": dict(vit),
-            "layers": list(layers),
-            "patch_size": patch_size,
-            "registers": registers,
-            "mask_input": mask_input,
-            "bounds_input": bounds_input,
-        }
-        if semantic is not None:
-            self.options["semantic"] = dict(semantic)
-        self.tokens, self.margin = tokens, margin
-        self.weights = weights
-        self.patch_size, self.mask_input, self.bounds_input = patch_size, mask_input, bounds_input
-        self.dim_latent = 2 * width
-        mean, std = (*IMAGENET_MEAN, *[0.5] * mask_input), (*IMAGENET_STD, *[0.5] * mask_input)
-        channels = len(mean) + BOUNDS_CHANNELS * bounds_input
+        choice("skip.tokens", tokens, ("all", *KEPT))
+        require(margin >= 0, "skip.margin", "0 or more patches", margin)
+        self.options, self.tokens, self.margin = options, tokens, margin
+        self.patch_size, self.dim_latent = options.patch_size, 2 * options.width
+        self.mask_input, self.bounds_input = options.mask_input, options.bounds_input
+        extra = [0.5] * self.mask_input
         # No part of a checkpoint, so they need storage even in a model that is built on the meta device.
-        for name, values in (("mean", mean), ("std", std)):
-            constant = torch.tensor(values, device="cpu").view(-1, 1, 1)
+        for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
+            constant = torch.tensor((*values, *extra), device="cpu").view(-1, 1, 1)
             self.register_buffer(name, constant, persistent=False)
-        patch_embed = _patch_embedding(vit, channels, width, patch_size, image_size, registers, checkpointing)
-        self.aggregator = Aggregator(
-            patch_embed, patch_size, width, heads, depth, registers, layers, layer_scale, checkpointing
-        )
-        self._set_trainable(trainable, depth)
-        self.semantic = None
-        if semantic is not None:
-            self.semantic = SemanticBranch.of(semantic, patch_size).requires_grad_(False)
-        self.dim_semantic = width if self.semantic is None else self.semantic.parts
+        channels = len(self.mean) + BOUNDS_CHANNELS * self.bounds_input
+        self.aggregator = Aggregator(_patch_embedding(options, channels), options)
+        self._set_trainable(options.trainable, options.depth)
+        branch = options.semantic
+        self.semantic = None if branch is None else branch.build(options.patch_size).requires_grad_(False)
+        self.dim_semantic = options.width if branch is None else branch.parts
 
     def _set_trainable(self, trainable: str, depth: int) -> None:
         if trainable == "all":
             return
-        digits = trainable.removeprefix("last_")
-        count = 0 if trainable == "none" else int(digits) if digits.isdecimal() else -1
-        require(
-            0 <= count <= depth, "encoder.trainable", f"all, none or last_<n>, n up to {depth}", trainable
-        )
+        count = 0 if trainable == "none" else int(trainable.removeprefix("last_"))
         self.requires_grad_(False)
         for blocks in (self.aggregator.frame_blocks, self.aggregator.global_blocks):
             blocks[depth - count :].requires_grad_(True)
@@ -207,35 +144,13 @@ def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Floa
         yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 
 
-def _patch_embedding(
-    vit: Mapping,
-    in_channels: int,
-    width: int,
-    patch_size: int,
-    image_size: int,
-    registers: int,
-    checkpointing: bool,
-) -> nn.Module:
-    """Build what ``encoder.vit`` describes."""
-    kind, options = vit.get("kind"), {key: value for key, value in vit.items() if key != "kind"}
-    choice("encoder.vit.kind", kind, tuple(VIT_OPTIONS))
-    expected = ", ".join(VIT_OPTIONS[kind]) or "none"
-    require(
-        set(options) == set(VIT_OPTIONS[kind]),
-        f"encoder.vit ({kind})",
-        f"options: {expected}",
-        sorted(options),
-    )
-    if kind == "conv":
-        return PatchEmbed(in_channels, width, patch_size)
-    if kind == "stem":
-        return ConvStem(in_channels, width, patch_size, **options)
+def _patch_embedding(options: VGGTOptions, channels: int) -> nn.Module:
+    """What ``encoder.vit`` describes, for images of so many channels."""
+    vit, width, patch_size = options.vit, options.width, options.patch_size
+    if vit.kind == "conv":
+        return PatchEmbed(channels, width, patch_size)
+    if vit.kind == "stem":
+        return ConvStem(channels, width, patch_size, vit.channels)
     return VisionTransformer(
-        in_channels,
-        width,
-        patch_size=patch_size,
-        image_size=image_size,
-        registers=registers,
-        checkpointing=checkpointing,
-        **options,
+        channels, width, vit.depth, vit.heads, patch_size, options.image_size, options.checkpointing
     )

@@ -11,7 +11,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from ghgs_lit.errors import choice, require
 from ghgs_lit.files import write_atomically
 
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
@@ -28,14 +27,11 @@ class FeatureFiles:
 
     Args:
         directory: created where it does not exist.
-        dtype: of the files: ``float32``, ``float16`` or ``bfloat16``.
+        dtype: of the files, a key of :data:`DTYPES`.
         max_gb: size of all files, 10^9 bytes; beyond it the oldest are deleted. None: no limit.
     """
 
-    def __init__(self, directory: str | Path, dtype: str = "float32", max_gb: float | int | None = None):
-        choice("feature_cache.dtype", dtype, tuple(DTYPES))
-        valid = max_gb is None or (isinstance(max_gb, (int, float)) and max_gb > 0)
-        require(valid, "feature_cache.max_gb", "null or a positive number of gigabytes", max_gb)
+    def __init__(self, directory: str | Path, dtype: str = "float32", max_gb: float | None = None):
         self.directory, self.dtype = Path(directory), dtype
         self.limit = None if max_gb is None else int(1e9 * max_gb)
         self.hits = self.made = self.written = self.deleted = 0
@@ -63,19 +59,19 @@ class FeatureFiles:
     def stored(self, key: str, make: Callable[[], Stored]) -> Stored:
         """The content of the file of ``key``; where there is none, of a new one with what ``make`` gives."""
         path = self.directory / key[:2] / f"{key}.safetensors"
-        found = _read(path)
-        if found is not None:
+        content = _read(path)
+        if content is not None:
             self.hits += 1
-            return found
+            return content
         with torch.no_grad():
-            found = make()
-        size = _write(path, *found)
+            content = make()
+        size = _write(path, *content)
         self.written += size
         self._bytes += size
         self.made += 1
         if self.limit is not None and self._bytes > self.limit:
             self._delete_oldest(path)
-        return found
+        return content
 
     def in_files_dtype(self, tensors: dict[str, Tensor]) -> Stored:
         """Tensors as a file holds them, and their own dtypes."""

@@ -1,23 +1,45 @@
 """Semantic features F of encoders without published weights: which parts of a body a patch shows."""
 
-from collections.abc import Mapping
-
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from ghgs_lit.config.options import Options, Width
 from ghgs_lit.encoder.block import Block, draw_normal_, run_block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem
 from ghgs_lit.encoder.rope import rotary_tables
-from ghgs_lit.errors import require
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.projection import at_least_float32
 
 NORM_EPS = 1e-5
 
-#: Keys of ``encoder.semantic``.
-OPTIONS = ("width", "depth", "heads", "channels", "parts")
+
+class SemanticOptions(Options):
+    """A branch of blocks over single views, whose features tell parts of a body."""
+
+    group = "encoder.semantic"
+    width: Width
+    """Channels of the blocks; a multiple of 4 * heads"""
+    depth: int = Field(ge=1, le=1024)
+    """Number of blocks"""
+    heads: Width
+    """Attention heads of each block"""
+    channels: Width
+    """Channels of the stem after its first convolution"""
+    parts: Width
+    """Number of parts, which is that of a feature's channels"""
+
+    @model_validator(mode="after")
+    def _heads_rotate(self) -> "SemanticOptions":
+        fits = self.width % (4 * self.heads) == 0
+        self.require(fits, "width", "a multiple of 4 * heads (rows and columns rotate)")
+        return self
+
+    def build(self, patch_size: int) -> "SemanticBranch":
+        """The branch for patches of ``patch_size`` pixels."""
+        return SemanticBranch(self, patch_size)
 
 
 def features_of(log_shares: Float[Tensor, "N p"]) -> Float[Tensor, "N p"]:
@@ -33,41 +55,26 @@ class SemanticBranch(nn.Module):
     are equal, 0 where no part is shared.
 
     Attention is inside a view, among a learned token and the patches with a pixel of the subject. All
-    choices of ``encoder.tokens`` keep these, so features are those of the photograph and its mask, whatever
+    choices of ``skip.tokens`` keep these, so features are those of the photograph and its mask, whatever
     is kept beside them and whichever views there are.
 
     Args:
+        options: of the branch.
         patch_size: side of a patch in pixels.
-        width: of the blocks.
-        depth: number of blocks.
-        heads: attention heads of each block.
-        channels: of the stem (:class:`ConvStem`).
-        parts: number of parts, which is that of a feature's channels.
     """
 
-    def __init__(self, patch_size: int, width: int, depth: int, heads: int, channels: int, parts: int):
+    def __init__(self, options: SemanticOptions, patch_size: int):
         super().__init__()
-        expected = "a multiple of 4 * heads (rows and columns rotate)"
-        require(width % (4 * heads) == 0, "encoder.semantic.width", expected, width)
-        self.patch_size, self.parts, self.head_width = patch_size, parts, width // heads
-        self.stem = ConvStem(4, width, patch_size, channels)
+        width, heads, self.parts = options.width, options.heads, options.parts
+        self.patch_size, self.head_width = patch_size, width // heads
+        self.stem = ConvStem(4, width, patch_size, options.channels)
         self.token = nn.Parameter(draw_normal_(torch.empty(1, 1, width), 0.02))
         self.blocks = nn.ModuleList(
-            Block(width, heads, qk_norm=True, norm_eps=NORM_EPS, layer_scale=0.1) for _ in range(depth)
+            Block(width, heads, qk_norm=True, norm_eps=NORM_EPS, layer_scale=0.1)
+            for _ in range(options.depth)
         )
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
-        self.head = nn.Linear(width, parts)
-
-    @classmethod
-    def of(cls, options: Mapping[str, int], patch_size: int) -> "SemanticBranch":
-        """The branch that ``encoder.semantic`` describes.
-
-        Raises:
-            InputError: an option is missing, unknown or impossible (names it).
-        """
-        fits = set(options) == set(OPTIONS)
-        require(fits, "encoder.semantic", f"null or a mapping of {', '.join(OPTIONS)}", sorted(options))
-        return cls(patch_size, **options)
+        self.head = nn.Linear(width, self.parts)
 
     def subject(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
         """The patches that have features."""
@@ -99,7 +106,7 @@ class SemanticBranch(nn.Module):
     ) -> Float[Tensor, "N p"]:
         """Features of the patches in ``kept``; 0 (cosine 0 with all others) where there is no subject."""
         every = KeptPatches(kept, images.device)
-        own = KeptPatches(kept.to(masks.device) & self.subject(masks), images.device)
-        features = features_of(self.log_shares(images, masks, own))
-        places = torch.searchsorted(every.index, own.index)
+        shown = KeptPatches(kept.to(masks.device) & self.subject(masks), images.device)
+        features = features_of(self.log_shares(images, masks, shown))
+        places = torch.searchsorted(every.index, shown.index)
         return features.new_zeros(len(every.index), self.parts).index_copy(0, places, features)

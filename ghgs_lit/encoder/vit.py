@@ -7,10 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.block import Block, draw_normal_, run_block
+from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, run_block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import PatchEmbed
-from ghgs_lit.errors import require
 
 NORM_EPS = 1e-6
 
@@ -24,9 +23,8 @@ class VisionTransformer(nn.Module):
         depth: number of blocks.
         heads: attention heads of each block.
         patch_size: side of a patch in pixels.
-        image_size: side in pixels of the square image whose position embedding is stored; for other sizes
-            it is resampled.
-        registers: number of register tokens.
+        image_size: side in pixels of the square image whose position embedding is stored, a multiple of
+            ``patch_size``; for other sizes it is resampled.
         checkpointing: recompute activations in the backward pass instead of keeping them.
     """
 
@@ -38,18 +36,16 @@ class VisionTransformer(nn.Module):
         heads: int,
         patch_size: int,
         image_size: int,
-        registers: int,
         checkpointing: bool = False,
     ):
         super().__init__()
-        require(image_size % patch_size == 0, "encoder.image_size", f"a multiple of {patch_size}", image_size)
         self.patch_size = patch_size
-        self.special = 1 + registers
+        self.special = 1 + REGISTERS
         self.checkpointing = checkpointing
         self.patch_embed = PatchEmbed(in_channels, width, patch_size)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + (image_size // patch_size) ** 2, width))
-        self.register_tokens = nn.Parameter(torch.zeros(1, registers, width))
+        self.register_tokens = nn.Parameter(torch.zeros(1, REGISTERS, width))
         # Replaces masked patches in DINOv2's own training; kept so that its weights load strictly.
         self.mask_token = nn.Parameter(torch.zeros(1, width), requires_grad=False)
         self.blocks = nn.ModuleList(

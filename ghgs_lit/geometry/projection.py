@@ -15,17 +15,16 @@ def at_least_float32(tensor: Tensor) -> Tensor:
     return tensor if tensor.dtype in (torch.float32, torch.float64) else tensor.float()
 
 
-def pixel_centers(height: int, width: int, like: Tensor, stride: int = 1) -> Float[Tensor, "h w 2"]:
-    """Centres ``(u, v)`` of the cells of an image, in pixels.
+def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2"]:
+    """Centres ``(u, v)`` of the pixels of an image.
 
     Args:
-        height: of the image in pixels.
-        width: of the image in pixels.
+        height, width: of the image in pixels.
         like: gives device and dtype.
-        stride: side of a cell; 1 gives pixel centres, the patch size the centres of the patches.
     """
-    rows = (torch.arange(height // stride, device=like.device, dtype=like.dtype) + 0.5) * stride
-    columns = (torch.arange(width // stride, device=like.device, dtype=like.dtype) + 0.5) * stride
+    rows, columns = (
+        torch.arange(side, device=like.device, dtype=like.dtype) + 0.5 for side in (height, width)
+    )
     v, u = torch.meshgrid(rows, columns, indexing="ij")
     return torch.stack((u, v), dim=-1)
 
@@ -58,11 +57,9 @@ def unproject(
     )
 
 
-def unproject_maps(
-    depth: Float[Tensor, "*batch h w"], cameras: Cameras, stride: int = 1
-) -> Float[Tensor, "*batch h w 3"]:
-    """World points of a depth map in metres whose cells are ``stride`` pixels wide."""
-    centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth), stride)
+def unproject_maps(depth: Float[Tensor, "*batch h w"], cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
+    """World points of the pixels of a depth map in metres."""
+    centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth))
     return unproject(
         centers.expand(*depth.shape, 2),
         depth,

@@ -1,38 +1,33 @@
 """From depth maps to world points of pixels and of tokens (paper, section 3.2)."""
 
-from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, unproject, unproject_maps
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
 
-@dataclass(frozen=True)
-class Unprojection:
+class Unprojection(Options):
     """``unprojection(depth_maps, tokens, batch) -> Points``, without parameters, in float32 or wider.
 
-    Args:
-        tokens: where a token lies.
-            ``subject``: at the mean pixel and mean depth of the valid pixels of its patch. The mean of both
-            keeps the point on the surface: at a silhouette the patch's centre may lie beside the subject, and
-            the subject's depth there is a point that nothing occupies. A patch without a valid pixel lies at
-            its centre and mean depth, and is not valid.
-            ``release``: as in the authors' code, at a 2 x 2 sample of inverse depth and at the centres of a
-            grid over the image without its ``border``. Validity is that of ``subject``.
-        border: pixels on each side of the image that the grid of ``release`` leaves out.
+    The mean pixel and the mean depth together keep a token's point on the surface: at a silhouette the
+    patch's centre may lie beside the subject, and the subject's depth there is a point that nothing occupies.
+    A patch without a valid pixel lies at its centre and mean depth, and is not valid. As in the authors'
+    release, tokens lie at a 2 x 2 sample of inverse depth and at the centres of a grid over the image without
+    its border; they are valid where those of the subject are.
     """
 
-    tokens: str = "subject"
-    border: int = 0
-
-    def __post_init__(self) -> None:
-        choice("unprojection.tokens", self.tokens, ("subject", "release"))
-        require(self.border >= 0, "unprojection.border", "0 or more pixels", self.border)
+    group = "unprojection"
+    tokens: Literal["subject", "release"] = "subject"
+    """Where a token lies: subject, at the mean pixel and mean depth of the subject's pixels in its patch |
+    release, as in the authors' code, which scales intrinsics by 37 / 512 as if there were no border"""
+    border: Index = 0
+    """Pixels on each side of the image that the token grid of the release leaves out (512 + 2 x 3 = 518)"""
 
     def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> Points:
         locate = subject_tokens if self.tokens == "subject" else self._release_tokens

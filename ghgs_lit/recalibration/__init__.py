@@ -1,7 +1,7 @@
 """The recalibration stage: attention across views among tokens that are close in space."""
 
-from ghgs_lit.recalibration.attention import SIMILARITIES, SemanticAttention
-from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors
-from ghgs_lit.recalibration.recalibration import Recalibration
+from ghgs_lit.recalibration.attention import SemanticAttention
+from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors
+from ghgs_lit.recalibration.recalibration import Recalibration, RecalibrationOptions
 
-__all__ = ["MODES", "SIMILARITIES", "Neighbors", "Recalibration", "SemanticAttention", "nearest_neighbors"]
+__all__ = ["Neighbors", "Recalibration", "RecalibrationOptions", "SemanticAttention", "nearest_neighbors"]

@@ -2,21 +2,25 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.parts import even_parts
-from ghgs_lit.recalibration import cpu
 from ghgs_lit.recalibration.neighbors import Neighbors
 
-SIMILARITIES = ("product", "product_clamped", "log", "none")
+#: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
+Similarity = Literal["product", "product_clamped", "log", "none"]
+
+#: The least similarity with ``log``, whose logarithm would be infinite at 0.
+S_MIN = 0.01
 
 #: Tokens computed at once without a gradient; in half precision a smaller number is as fast on a CPU.
 _ROWS, _HALF_ROWS = 424, 256
@@ -32,22 +36,22 @@ class SemanticAttention(nn.Module):
         num_heads: number of heads, each with C / 4 / num_heads channels.
         similarity: how the cosine s of two tokens' semantic features changes the logit:
             ``product`` multiplies by s (Eq. 3), ``product_clamped`` multiplies by max(s, 0) (the authors'
-            release), ``log`` adds log(max(s, s_min)), which lowers the weight of dissimilar neighbours
+            release), ``log`` adds log(max(s, S_MIN)), which lowers the weight of dissimilar neighbours
             instead of pulling their logit to 0, ``none`` ignores it (s = 1).
-        s_min: lower limit of the similarity with ``log``.
+
+    Raises:
+        InputError: the heads do not divide C / 4.
     """
 
-    def __init__(self, dim: int, num_heads: int = 8, similarity: str = "product", s_min: float = 0.01):
+    def __init__(self, dim: int, num_heads: int = 8, similarity: Similarity = "product"):
         super().__init__()
-        choice("recalibration.similarity", similarity, SIMILARITIES)
-        require(0 < s_min <= 1, "recalibration.s_min", "within (0, 1]", s_min)
         require(
-            num_heads >= 1 and dim % (4 * num_heads) == 0,
+            dim % (4 * num_heads) == 0,
             "recalibration.num_heads",
             f"heads that divide a quarter of the token width ({dim} / 4)",
             num_heads,
         )
-        self.num_heads, self.similarity, self.s_min = num_heads, similarity, s_min
+        self.num_heads, self.similarity = num_heads, similarity
         inner = dim // 4
         self.norm1 = nn.LayerNorm(dim)
         self.q_proj = Linear(dim, inner)
@@ -86,14 +90,11 @@ class SemanticAttention(nn.Module):
             neighbors: of all ``n`` tokens.
             cosines: ``[n, k]``; None where ``similarity`` is ``none``.
         """
-        index, valid = neighbors.index[query], neighbors.valid[query]
+        row, near = slice(query, query + 1), neighbors.index[query]
         normed = self.norm1(x)
-        q = self.q_proj(normed[query]).unflatten(-1, (self.num_heads, -1))
-        k = self.k_proj(normed[index]).unflatten(-1, (self.num_heads, -1))
-        logits = at_least_float32(torch.einsum("ad,kad->ak", q * q.shape[-1] ** -0.5, k))[:, None]
-        if cosines is not None:
-            logits = self.apply_similarity(logits, cosines[query][None])
-        return logits[:, 0].masked_fill(~valid, float("-inf")).softmax(-1)
+        q, k = (at_least_float32(y)[None] for y in (self.q_proj(normed[query]), self.k_proj(normed[near])))
+        changes = self._factor_and_bias(None if cosines is None else cosines[row])
+        return self._weights(q, k, neighbors.valid[row], *(y.expand(1, len(near)) for y in changes))[0].T
 
     def apply_similarity(
         self, logits: Float[Tensor, "a m k"], cosines: Float[Tensor, "m k"]
@@ -135,9 +136,6 @@ class SemanticAttention(nn.Module):
     ) -> Float[Tensor, "m i"]:
         """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider."""
         with torch.autocast(q.device.type, enabled=False):
-            if cpu.is_supported(q, self.num_heads, neighbors.index.shape[1]):
-                changes = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
-                return cpu.attend(q, k, v, self.num_heads, neighbors.index, neighbors.valid, *changes)
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
                 return self._attend_gathered(q, k, v, neighbors, cosines)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))
@@ -157,25 +155,34 @@ class SemanticAttention(nn.Module):
         """
         factor, bias = (x.expand(neighbors.index.shape) for x in self._factor_and_bias(cosines))
 
-        def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, valid: Tensor, *change: Tensor) -> Tensor:
-            factor, bias = (x[..., None] for x in change)
-            near = (q[:, None] * k[index]).unflatten(-1, (self.num_heads, -1)).sum(-1)
-            logits = near * (q.shape[1] // self.num_heads) ** -0.5 * factor + bias
-            weights = logits.masked_fill(~valid[..., None], float("-inf")).softmax(1)
-            values = v[index].unflatten(-1, (self.num_heads, -1))
-            return (weights[..., None] * values).sum(1).flatten(1)
+        def attend(q: Tensor, k: Tensor, v: Tensor, index: Tensor, *others: Tensor) -> Tensor:
+            weights = self._weights(q, k[index], *others)
+            return (weights[..., None] * v[index].unflatten(-1, (self.num_heads, -1))).sum(1).flatten(1)
 
         rows = even_parts(len(q), _GATHERED // max(1, neighbors.index.shape[1] * q.shape[1]))
-        found = []
+        parts = []
         for part in rows:
             inputs = (q[part], k, v, *(x[part] for x in (neighbors.index, neighbors.valid, factor, bias)))
             again = len(rows) > 1 and torch.is_grad_enabled()
-            found.append(
+            parts.append(
                 checkpoint(attend, *inputs, use_reentrant=False, preserve_rng_state=False)
                 if again
                 else attend(*inputs)
             )
-        return found[0] if len(found) == 1 else torch.cat(found)
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
+
+    def _weights(
+        self,
+        q: Float[Tensor, "m i"],
+        k: Float[Tensor, "m k i"],
+        valid: Bool[Tensor, "m k"],
+        factor: Float[Tensor, "m k"],
+        bias: Float[Tensor, "m k"],
+    ) -> Float[Tensor, "m k a"]:
+        """Softmax weights of the neighbours of ``m`` tokens, whose keys are ``k``, in each head."""
+        products = (q[:, None] * k).unflatten(-1, (self.num_heads, -1)).sum(-1)
+        logits = products * (q.shape[1] // self.num_heads) ** -0.5 * factor[..., None] + bias[..., None]
+        return logits.masked_fill(~valid[..., None], float("-inf")).softmax(1)
 
     def _attend_dense(
         self,
@@ -204,7 +211,7 @@ class SemanticAttention(nn.Module):
         if cosines is None:
             return one, one * 0
         if self.similarity == "log":
-            return one, cosines.clamp(min=self.s_min).log()
+            return one, cosines.clamp(min=S_MIN).log()
         return (cosines.clamp(min=0) if self.similarity == "product_clamped" else cosines), one * 0
 
 

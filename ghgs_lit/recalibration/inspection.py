@@ -42,17 +42,16 @@ def attention_of(
         return None
     element = tokens.image // tokens.grid[1]
     chosen = (takes_part & (element == element[query])).nonzero()[:, 0]
-    place = int((chosen == query).nonzero())
+    row = int((chosen == query).nonzero())
     positions = recalibration.positions(tokens, points)[chosen]
     places = recalibration.places(tokens)
     near = nearest_neighbors(
         positions,
         tokens.image[chosen],
         recalibration.k,
-        recalibration.neighbors,
         None if places is None else places[chosen],
     )
-    block, valid = recalibration.block, near.valid[place]
+    block, valid = recalibration.block, near.valid[row]
     cosines = neighbor_cosines(tokens.semantic[chosen], near) if block.similarity != "none" else None
-    weights = [block.attention_weights(layer[chosen], place, near, cosines) for layer in tokens.latent]
-    return TokenAttention(query, chosen[near.index[place][valid]], torch.stack(weights)[..., valid])
+    weights = [block.attention_weights(layer[chosen], row, near, cosines) for layer in tokens.latent]
+    return TokenAttention(query, chosen[near.index[row][valid]], torch.stack(weights)[..., valid])

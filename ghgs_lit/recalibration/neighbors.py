@@ -9,11 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.parts import at_once, even_parts
-
-MODES = ("all", "other_views", "mixed")
 
 #: Number of distances that are held at once: bounds memory, and keeps a block in a CPU's cache. On a GPU they
 #: and their keys take 200 MB.
@@ -30,11 +27,11 @@ class Neighbors:
     @classmethod
     def join(cls, elements: Sequence["Neighbors"]) -> "Neighbors":
         """Those of all tokens of a batch, as indices among all of them; too few get invalid ones."""
-        k = max(found.index.shape[1] for found in elements)
-        starts = itertools.accumulate((len(found.index) for found in elements), initial=0)
+        k = max(element.index.shape[1] for element in elements)
+        starts = itertools.accumulate((len(element.index) for element in elements), initial=0)
         return cls(
             torch.cat([widened(e.index + start, k) for e, start in zip(elements, starts, strict=False)]),
-            torch.cat([widened(found.valid, k) for found in elements]),
+            torch.cat([widened(element.valid, k) for element in elements]),
         )
 
 
@@ -43,41 +40,32 @@ def nearest_neighbors(
     points: Float[Tensor, "n d"],
     view: Int[Tensor, " n"],
     k: int,
-    mode: str = "all",
     places: Int[Tensor, " n"] | None = None,
 ) -> Neighbors:
-    """The ``min(k, n)`` nearest points of each point, nearest first.
+    """The ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
 
     Distances are computed from differences in float32 or wider (the expansion into products would lose
     digits far from the origin).
 
     Args:
         points: positions of the tokens, of any dimension d.
-        view: the view of each token.
-        k: number of neighbours.
-        mode: ``all`` searches all views, the point itself included; ``other_views`` all views but the
-            query's own (where there is no such point, the query itself); ``mixed`` takes ``k // 2`` from the
-            query's own view, itself included, before the rest from other views; where one of the two has too
-            few, the other one fills up.
+        view: the view of each token; read with ``places``.
+        k: number of neighbours, at least 1.
         places: a number of each token's place, for points that have equal distances by construction. The
             place whose number is nearest to the query's comes first, so that opposite places alternate, and
             at each place the views take turns, the query's own first. None: ties by index.
     """
-    choice("recalibration.neighbors", mode, MODES)
-    require(k >= 1, "recalibration.k", "1 or more", k)
     points = at_least_float32(points)
     n = points.shape[0]
     k = min(k, n)
     views = 0 if places is None or n == 0 else int(view.max() - view.min()) + 1
     # Filled, not concatenated: small results between freed distances would keep that memory occupied.
     index = torch.empty(n, k, dtype=torch.int64, device=points.device)
-    valid = torch.empty_like(index, dtype=torch.bool)
     for rows in even_parts(n, at_once(points.device, _BLOCK, _GPU_BLOCK) // max(n, 1)):
         distance = torch.cdist(points[rows], points, compute_mode="donot_use_mm_for_euclid_dist")
         ranks = None if places is None else _turns(places, view, views, rows)
-        part = _nearest_to_block(distance, ranks, view, rows, k, mode)
-        index[rows], valid[rows] = part.index, part.valid
-    return Neighbors(index, valid)
+        index[rows] = _smallest(distance, ranks, k)
+    return Neighbors(index, torch.ones_like(index, dtype=torch.bool))
 
 
 def widened(table: Tensor, k: int) -> Tensor:
@@ -89,42 +77,6 @@ def _turns(places: Tensor, view: Tensor, views: int, block: slice) -> Int[Tensor
     """Ranks of tokens at equal distances from the queries of a block; see ``places``."""
     apart = places - places[block, None]
     return (2 * apart.abs() + (apart < 0)) * views + (view - view[block, None]) % views
-
-
-def _nearest_to_block(
-    distance: Tensor, ranks: Tensor | None, view: Tensor, block: slice, k: int, mode: str
-) -> Neighbors:
-    if mode == "all":
-        index = _smallest(distance, ranks, k)
-        return Neighbors(index, torch.ones_like(index, dtype=torch.bool))
-    same = view[block, None] == view
-    other = _allowed(distance, ranks, ~same, k)
-    if mode == "mixed":
-        return _shared(_allowed(distance, ranks, same, k), other, k)
-    alone = ~other.valid.any(1)
-    query = torch.arange(len(view), device=view.device)[block]
-    index = torch.where(alone[:, None], query[:, None], other.index)
-    first = torch.arange(index.shape[1], device=view.device) == 0
-    return Neighbors(index, other.valid | (alone[:, None] & first))
-
-
-def _shared(own: Neighbors, other: Neighbors, k: int) -> Neighbors:
-    """``k // 2`` of ``own`` and the rest of ``other``, and more of one where the other has too few."""
-    own_count, other_count = (found.valid.sum(1, keepdim=True) for found in (own, other))
-    from_own = torch.minimum(own_count, (k - other_count).clamp(min=k // 2))
-    place = torch.arange(k, device=from_own.device)
-    taken = torch.cat((place < from_own, place < k - from_own), dim=1)
-    # Both together have k points at least: exactly k are taken.
-    return Neighbors(
-        torch.cat((own.index, other.index), dim=1)[taken].view_as(own.index), torch.ones_like(own.valid)
-    )
-
-
-def _allowed(distance: Tensor, ranks: Tensor | None, mask: Tensor, k: int) -> Neighbors:
-    """The nearest points inside ``mask``; the distances of all others become NaN, which sorts last."""
-    distance = torch.where(distance.isnan(), float("inf"), distance)
-    index = _smallest(torch.where(mask, distance, float("nan")), ranks, k)
-    return Neighbors(index, mask.gather(1, index))
 
 
 def _smallest(distance: Float[Tensor, "m n"], ranks: Int[Tensor, "m n"] | None, k: int) -> Int[Tensor, "m k"]:

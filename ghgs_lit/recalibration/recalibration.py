@@ -1,62 +1,59 @@
 """Recalibration of latent embeddings by multi-view semantic consistency (paper, section 3.3)."""
 
 import dataclasses
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.config.options import Count, Options, Width
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.parts import at_once, even_parts
-from ghgs_lit.recalibration import cpu
-from ghgs_lit.recalibration.attention import SemanticAttention
-from ghgs_lit.recalibration.neighbors import MODES, Neighbors, nearest_neighbors, widened
+from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
+from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors, widened
 from ghgs_lit.types import Points, Tokens, true_places
 
 #: Number of cosines that are held at once (bounds memory).
 _COSINES, _GPU_COSINES = 1 << 21, 1 << 25
 
-NEIGHBORHOODS = ("xyz", "image_plane", "feature")
+
+class RecalibrationOptions(Options):
+    """Tokens to tokens by multi-view semantic consistency (paper, Eqs. 3 to 5)."""
+
+    group = "recalibration"
+    k: Count = 64
+    """Neighbours of each token; all tokens where there are fewer. 64 in the authors' release."""
+    num_heads: Width = 8
+    """Attention heads; they divide a quarter of the token width. 8 in the release."""
+    similarity: Similarity = "product"
+    """How the cosine s of semantic features acts on a logit: product (s times it: Eq. 3) | product_clamped
+    (max(s, 0) times it: the release) | log (adds log(max(s, 0.01))) | none (ablation: s = 1)"""
+    neighborhood: Literal["xyz", "image_plane"] = "xyz"
+    """Where distances are measured: xyz, between 3D points of tokens | image_plane, between centres of
+    tokens in pixels, as if all views were one (ablation: no unprojection)"""
+    tokens: Literal["subject", "all"] = "subject"
+    """Tokens that take part: subject, those with a point on the subject | all (the release)"""
+
+    def build(self, dim_latent: int) -> "Recalibration":
+        """The stage for tokens of width ``dim_latent``."""
+        return Recalibration(self, dim_latent)
 
 
 class Recalibration(nn.Module):
     """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward.
 
     Args:
+        options: of the stage.
         dim_latent: width of the tokens (from the encoder).
-        k: neighbours of a token, or all there are if they are fewer.
-        num_heads: see :class:`SemanticAttention`.
-        similarity: see :class:`SemanticAttention`.
-        s_min: see :class:`SemanticAttention`.
-        neighborhood: where distances are measured: ``xyz``, between token points; ``image_plane``, between
-            token centres in pixels, as if all views were one (the paper without
-            unprojection); ``feature``, between directions of the semantic features.
-        neighbors: from which views: ``all``, ``other_views`` or ``mixed`` (see :func:`nearest_neighbors`).
-        tokens: which tokens take part: ``subject``, those with a valid point, others pass unchanged; ``all``,
-            as in the release.
     """
 
-    def __init__(
-        self,
-        dim_latent: int,
-        k: int = 64,
-        num_heads: int = 8,
-        similarity: str = "product",
-        s_min: float = 0.01,
-        neighborhood: str = "xyz",
-        neighbors: str = "all",
-        tokens: str = "subject",
-    ):
+    def __init__(self, options: RecalibrationOptions, dim_latent: int):
         super().__init__()
-        require(isinstance(k, int) and k >= 1, "recalibration.k", "1 or more", k)
-        choice("recalibration.neighborhood", neighborhood, NEIGHBORHOODS)
-        choice("recalibration.neighbors", neighbors, MODES)
-        choice("recalibration.tokens", tokens, ("subject", "all"))
-        self.k, self.neighborhood, self.neighbors, self.tokens = k, neighborhood, neighbors, tokens
-        self.block = SemanticAttention(dim_latent, num_heads, similarity, s_min)
+        self.k, self.neighborhood, self.tokens = options.k, options.neighborhood, options.tokens
+        self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
 
     def forward(self, tokens: Tokens, points: Points) -> Tokens:
         """Tokens with recalibrated layers; the semantic features and the order stay.
@@ -77,7 +74,7 @@ class Recalibration(nn.Module):
         image = part(tokens.image)
         places = self.places(tokens)
         neighbors = [
-            nearest_neighbors(positions, views_of, self.k, self.neighbors, places_of)
+            nearest_neighbors(positions, views_of, self.k, places_of)
             for positions, views_of, places_of in zip(
                 part(self.positions(tokens, points)).split(counts),
                 image.split(counts),
@@ -92,11 +89,11 @@ class Recalibration(nn.Module):
         if takes_part.device.type != "cpu" and batch_size > 1:  # fewer calls
             neighbors = [Neighbors.join(neighbors)]
             k = neighbors[0].index.shape[1]
-            cosines = cosines and [torch.cat([widened(found, k) for found in cosines])]
+            cosines = cosines and [torch.cat([widened(element, k) for element in cosines])]
         layers = []
         for layer in tokens.latent:
-            found = self.block(part(layer), neighbors, cosines).to(layer.dtype)
-            layers.append(found if len(found) == len(layer) else layer.index_copy(0, chosen, found))
+            new = self.block(part(layer), neighbors, cosines).to(layer.dtype)
+            layers.append(new if len(new) == len(layer) else layer.index_copy(0, chosen, new))
         return dataclasses.replace(tokens, latent=tuple(layers))
 
     def takes_part(self, points: Points) -> Bool[Tensor, " N"]:
@@ -107,8 +104,6 @@ class Recalibration(nn.Module):
         """Position of each token in the space where neighbours are searched; see ``neighborhood``."""
         if self.neighborhood == "xyz":
             return points.tokens.detach()
-        if self.neighborhood == "feature":
-            return unit(tokens.semantic)
         # Half pixels are exact in float32, so that equal distances are equal numbers.
         return (torch.stack((tokens.row, tokens.column), dim=-1) + 0.5) * tokens.patch_size
 
@@ -129,8 +124,6 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
     """
     with torch.autocast(semantic.device.type, enabled=False):
         semantic = at_least_float32(semantic)
-        if cpu.is_supported(semantic, 1, neighbors.index.shape[1]):
-            return cpu.cosines(semantic, neighbors.index)
         # Allocated first: after the features it would keep their memory occupied once they are freed.
         cosines = semantic.new_empty(neighbors.index.shape)
         directions = unit(semantic)

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from ghgs_lit.bounds import SubjectBox, VisualHull
+from ghgs_lit.bounds.box import RESOLUTION
 from ghgs_lit.bounds.silhouettes import silhouettes
 from tests.helpers.scenes import make_batch
 
 
 def voting(batch):
     stage = SubjectBox()
-    coarse = silhouettes(batch.masks, batch.cameras, stage.resolution, stage.dilation)
+    coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, stage.dilation)
     return stage._voting(coarse).tolist()
 
 

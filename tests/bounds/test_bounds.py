@@ -43,12 +43,13 @@ def test_true_depth_is_within_the_bounds(stage, views, size):
 
 
 @pytest.mark.parametrize("resolution", [30, 50, 160])
-def test_a_coarse_search_stays_conservative(resolution):
+def test_a_coarse_search_stays_conservative(resolution, monkeypatch):
     """A low resolution of the search may widen the bounds, never cut the subject off."""
+    monkeypatch.setattr("ghgs_lit.bounds.box.RESOLUTION", resolution)
     batch = make_batch(1, 4, 112, 112)
-    near, far = near_and_far(VisualHull(resolution=resolution), batch)
+    near, far = near_and_far(VisualHull(), batch)
     assert inside(near, far, batch) == 1
-    box = near_and_far(SubjectBox(resolution=resolution), batch)
+    box = near_and_far(SubjectBox(), batch)
     assert (near >= box[0] - 0.0101).all()  # half the least thickness
     assert (far <= box[1] + 0.0201).all()
 
@@ -197,7 +198,7 @@ def test_no_bounds_are_none():
 
 @pytest.mark.parametrize(
     ("option", "key"),
-    [({"cells": 1}, "cells"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
+    [({"tolerance": -1}, "tolerance"), ({"samples": 1}, "samples"), ({"dilation": 0.9}, "dilation")],
 )
 def test_impossible_options_are_refused(option, key):
     """A bad value is found when the configuration is read, by its key."""

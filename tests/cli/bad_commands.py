@@ -181,8 +181,7 @@ NUMBERS = [
     ("train encoder.depth=4.0", 1, "encoder.depth: expected an integer", "found 4.0"),
     ("train encoder.mask_input=some", 1, "encoder.mask_input: expected true or false"),
     ("train recalibration.k=0", 1, "recalibration.k: expected an integer >= 1; found 0"),
-    ("train recalibration.s_min=0", 1, "recalibration.s_min: expected a number > 0", "found 0"),
-    ("train bounds.cells=100000", 1, "bounds.cells: expected", "<= 512"),
+    ("train bounds.samples=100000", 1, "bounds.samples: expected", "<= 4096"),
     ("train bounds.dilation=wide", 1, "bounds.dilation: expected a number", "found 'wide'"),
     ("train depth_head.start=1", 1, "depth_head.start: expected", "< 1", "found 1"),
     ("train gaussian_head.hidden=[16]", 1, "gaussian_head.hidden: expected a list of 2 values"),
@@ -220,7 +219,6 @@ NUMBERS = [
 
 NAMES = [
     ("train recalibration.similarity=cosine", 1, "recalibration.similarity: expected one of", "'cosine'"),
-    ("train recalibration.neighbors=some", 1, "recalibration.neighbors: expected one of", "'some'"),
     ("train depth_head.parameterization=sqrt", 1, "depth_head.parameterization: expected one of", "'sqrt'"),
     ("train depth_head.parameterization=inverse_linear", 1, "expected", "found"),
     ("train bounds=none", 1, "bounds: expected", "found"),

@@ -7,9 +7,10 @@ import os
 import pytest
 import torch
 
-from ghgs_lit.encoder import FeatureCache, PhotographCache, VGGTEncoder, open_cache
+from ghgs_lit.encoder import FeatureCache, FeatureCacheOptions, PhotographCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.types import DepthBounds
+from tests.helpers.encoders import make_encoder
 from tests.helpers.models import close, make_model
 from tests.helpers.scenes import make_batch
 
@@ -18,7 +19,7 @@ OPTIONS = {"width": 32, "heads": 2, "depth": 2, "layers": (0, 1), "vit": {"kind"
 
 def make(seed=0, **options):
     torch.manual_seed(seed)
-    return VGGTEncoder(**{**OPTIONS, "trainable": "none", **options})
+    return make_encoder(**{**OPTIONS, "trainable": "none", **options})
 
 
 def views(b=1, v=2, height=70, width=84, seed=1):
@@ -88,7 +89,7 @@ def test_whatever_changes_the_tokens_misses(tmp_path, change):
     elif change == "bounds":
         bounds.far[0, 1, 2, 3] += 1e-3
     elif change == "option":
-        cache, encoder.options["heads"] = FeatureCache(tmp_path), 4
+        cache, encoder.options = FeatureCache(tmp_path), encoder.options.replace(heads=4)
     elif change == "margin":
         cache = FeatureCache(tmp_path, margin=2)
     made = cache.made
@@ -223,7 +224,7 @@ def test_the_oldest_files_make_room(tmp_path):
 def test_impossible_options_are_refused(tmp_path, option):
     """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=f"feature_cache.{next(iter(option))}"):
-        FeatureCache(tmp_path, **option)
+        FeatureCacheOptions(directory=str(tmp_path), **option)
 
 
 def test_tokens_of_a_hit_need_no_encoder(tmp_path, monkeypatch):
@@ -245,7 +246,7 @@ def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, 
     options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "float32"}
     with torch.no_grad():
         expected = model(batch)
-        model.feature_cache = cache = open_cache(options, model.recalibration.tokens)
+        model.feature_cache = cache = FeatureCacheOptions(**options).build(model.recalibration.tokens)
         first, second = model(batch), model(batch)
     assert cache.tokens == kept
     assert (cache.hits, cache.made) == (1, 1)
@@ -256,8 +257,8 @@ def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, 
 def test_no_directory_is_no_cache():
     """Without a directory nothing is written, and a model has no cache of its own."""
     options = {"directory": None, "tokens": "subject", "margin": 1, "dtype": "float32"}
-    assert open_cache(options, "subject") is None
-    assert open_cache(None, "subject") is None
+    assert FeatureCacheOptions(**options).build() is None
+    assert FeatureCacheOptions().build() is None
     assert make_model("model=paper").feature_cache is None
 
 
@@ -321,8 +322,8 @@ def test_a_patch_encoder_that_learns_is_refused(tmp_path):
 def test_a_cache_is_of_views_or_of_photographs(tmp_path):
     """A typing error must not choose another cache."""
     options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "bfloat16", "max_gb": 2}
-    assert isinstance(open_cache({**options, "of": "views"}, "subject"), FeatureCache)
-    cache = open_cache({**options, "of": "photographs"}, "subject")
+    assert isinstance(FeatureCacheOptions(**options, of="views").build(), FeatureCache)
+    cache = FeatureCacheOptions(**options, of="photographs").build()
     assert (type(cache), cache.dtype, cache.limit) == (PhotographCache, "bfloat16", 2_000_000_000)
     with pytest.raises(InputError, match=r"feature_cache\.of: expected one of views, photographs"):
-        open_cache({**options, "of": "people"}, "subject")
+        FeatureCacheOptions(**options, of="people")

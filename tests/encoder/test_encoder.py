@@ -11,6 +11,8 @@ from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.errors import InputError
+from tests.helpers.configs import composed
+from tests.helpers.encoders import make_encoder
 
 CONF = Path(__file__).parents[2] / "conf"
 SMALL = {"width": 32, "heads": 2, "depth": 2, "layers": (0, 1), "vit": {"kind": "stem", "channels": 8}}
@@ -19,7 +21,7 @@ SMALL = {"width": 32, "heads": 2, "depth": 2, "layers": (0, 1), "vit": {"kind": 
 def _encoder(seed: int = 0, **options) -> VGGTEncoder:
     """A small encoder whose special tokens and LayerScales are large enough to matter."""
     torch.manual_seed(seed)
-    encoder = VGGTEncoder(**{**SMALL, **options})
+    encoder = make_encoder(**{**SMALL, **options})
     with torch.no_grad():
         for name, parameter in encoder.named_parameters():
             if "gamma" in name or "token" in name:
@@ -34,11 +36,7 @@ def _views(b: int, v: int, height: int, width: int, seed: int = 1):
 
 
 def _options(name: str) -> dict:
-    nodes = {
-        node: OmegaConf.load(CONF / node / f"{file}.yaml")
-        for node, file in (("encoder", name), ("skip", "none"))
-    }
-    options = OmegaConf.to_container(OmegaConf.create(nodes), resolve=True)["encoder"]
+    options = OmegaConf.to_container(composed("train", f"encoder={name}", "model=paper")["encoder"])
     assert options.pop("kind") == "vggt"
     return options
 
@@ -46,7 +44,7 @@ def _options(name: str) -> dict:
 @pytest.mark.parametrize(("name", "most"), [("vggt_nano", 1.2e6), ("vggt_small", 6.5e6)])
 def test_small_encoders_fit_their_size(name, most):
     """The small encoders must stay small and train in every parameter."""
-    encoder = VGGTEncoder(**_options(name))
+    encoder = make_encoder(**_options(name))
     assert sum(p.numel() for p in encoder.parameters()) < most
     assert len(encoder.aggregator.layers) == 4
     tokens = encoder(*_views(1, 2, 28, 42))
@@ -61,7 +59,7 @@ def test_every_shipped_size_builds():
     assert names == ["vggt_1b", "vggt_nano", "vggt_small"]
     with torch.device("meta"):
         for name in names:
-            VGGTEncoder(**_options(name))
+            make_encoder(**_options(name))
 
 
 @pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
@@ -200,7 +198,7 @@ def test_weights_can_be_assigned_to_a_model_without_storage():
     """Checkpoints are loaded without a second copy of the weights."""
     encoder = _encoder()
     with torch.device("meta"):
-        empty = VGGTEncoder(**SMALL)
+        empty = make_encoder(**SMALL)
     empty.load_state_dict(encoder.state_dict(), assign=True)
     images, masks = _views(1, 2, 28, 28)
     assert torch.equal(empty(images, masks).latent[1], encoder(images, masks).latent[1])
@@ -213,7 +211,7 @@ def test_special_tokens_are_drawn_near_zero(vit):
     """As published, and the semantic branch's token as wide as the weights of its blocks."""
     semantic = {"width": 32, "depth": 1, "heads": 2, "channels": 8, "parts": 5}
     torch.manual_seed(0)
-    encoder = VGGTEncoder(**{**SMALL, "vit": vit, "semantic": semantic})
+    encoder = make_encoder(**{**SMALL, "vit": vit, "semantic": semantic})
     tokens = {
         name: p for name, p in encoder.named_parameters() if "token" in name and "mask_token" not in name
     }
@@ -263,8 +261,18 @@ def test_bad_inputs_are_refused(shape, masks, message):
         ({"layers": (0, 2)}, "encoder.layers"),
         ({"layers": (0,)}, "encoder.layers"),
         ({"vit": {"kind": "resnet"}}, "encoder.vit.kind: expected one of conv, stem, dinov2; found 'resnet'"),
-        ({"vit": {"kind": "stem", "chanels": 8}}, r"encoder.vit \(stem\): expected options: channels"),
+        (
+            {"vit": {"kind": "stem", "chanels": 8}},
+            "encoder.vit key: .*found 'chanels'",
+        ),
+        ({"vit": {"kind": "stem"}}, "encoder.vit.channels: expected a number with kind=stem; found None"),
+        ({"vit": {"kind": "conv", "heads": 2}}, "encoder.vit.heads: expected null with kind=conv; found 2"),
         ({"vit": {"kind": "dinov2", "depth": 1, "heads": 2}, "image_size": 100}, "encoder.image_size"),
+        (
+            {"vit": {"kind": "dinov2", "depth": 1, "heads": 3}},
+            "a multiple of vit.heads=3; found 32",
+        ),
+        ({"patch_size": 0}, "encoder.patch_size: expected an integer >= 1 and <= 1024; found 0"),
         ({"trainable": "last_3"}, "encoder.trainable"),
         ({"trainable": "some"}, "encoder.trainable"),
     ],
@@ -272,4 +280,4 @@ def test_bad_inputs_are_refused(shape, masks, message):
 def test_impossible_options_are_refused(options, message):
     """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=message):
-        VGGTEncoder(**{**SMALL, **options})
+        make_encoder(**{**SMALL, **options})

@@ -9,6 +9,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
+from tests.helpers.encoders import make_encoder
 
 PATCH, ROWS, COLUMNS = 14, 5, 7
 VITS = [{"kind": "conv"}, {"kind": "stem", "channels": 8}, {"kind": "dinov2", "depth": 2, "heads": 2}]
@@ -18,7 +19,7 @@ def _encoder(vit=VITS[0], **options) -> VGGTEncoder:
     """A small encoder in float64 whose special tokens and LayerScales are large enough to matter."""
     torch.manual_seed(0)
     options = {"tokens": "subject", **options}
-    encoder = VGGTEncoder(width=32, heads=2, depth=2, layers=(0, 1), vit=vit, image_size=42, **options)
+    encoder = make_encoder(width=32, heads=2, depth=2, layers=(0, 1), vit=vit, image_size=42, **options)
     with torch.no_grad():
         for name, parameter in encoder.named_parameters():
             if "gamma" in name or "token" in name or "pos_embed" in name:
@@ -246,8 +247,8 @@ def test_gradients_are_finite_and_those_of_masked_attention(vit, checkpointing):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tokens": "person"}, "encoder.tokens: expected one of all, window, subject; found 'person'"),
-        ({"margin": -1}, "encoder.margin: expected 0 or more patches; found -1"),
+        ({"tokens": "person"}, "skip.tokens: expected one of all, window, subject; found 'person'"),
+        ({"margin": -1}, "skip.margin: expected 0 or more patches; found -1"),
     ],
 )
 def test_impossible_options_are_refused(options, message):

@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.encoder.block import REGISTERS
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
@@ -20,6 +20,7 @@ from ghgs_lit.heads.activations import split_activated
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
+from tests.helpers.encoders import make_encoder
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 CASES = json.loads((FIXTURES / "encoder_cases.json").read_text())
@@ -38,6 +39,12 @@ def _load(name: str) -> dict[str, dict[str, torch.Tensor]]:
 
 def _inputs(groups: dict, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     return {k: v.to(dtype) if v.is_floating_point() else v for k, v in groups["in"].items()}
+
+
+def _options(name: str) -> dict:
+    options = {**CASES[name]["options"]}
+    assert options.pop("registers") == REGISTERS
+    return options
 
 
 def _compare(name: str, groups: dict, dtype: torch.dtype, found: dict[str, torch.Tensor]) -> None:
@@ -61,7 +68,7 @@ def _names(prefix: str) -> list[str]:
 def test_vit(name, dtype):
     """The DINOv2 ViT reproduces the published architecture's numbers."""
     groups = _load(name)
-    vit = VisionTransformer(3, patch_size=14, **CASES[name]["options"])
+    vit = VisionTransformer(3, patch_size=14, **_options(name))
     vit.load_state_dict(groups["state"])
     vit.to(dtype)
     with torch.no_grad():
@@ -78,7 +85,7 @@ def test_vit(name, dtype):
 def test_encoder(name, dtype):
     """The aggregator reproduces the published numbers, and the encoder reads the right tokens out of it."""
     groups = _load(name)
-    encoder = VGGTEncoder(**CASES[name]["options"])
+    encoder = make_encoder(**_options(name))
     encoder.aggregator.load_state_dict(groups["state"])
     encoder.to(dtype)
     images = _inputs(groups, dtype)["images"]
@@ -160,7 +167,7 @@ def test_published_names_and_shapes():
     with gzip.open(FIXTURES / "encoder_keys.json.gz") as file:
         published = json.load(file)
     with torch.device("meta"):
-        encoder = VGGTEncoder(
+        encoder = make_encoder(
             width=1024,
             heads=16,
             depth=24,

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 import ghgs_lit.kernels.linear
-from ghgs_lit.encoder import VGGTEncoder, cpu
+from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.block import Block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables
@@ -16,6 +16,7 @@ from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.parts import even_parts
 from ghgs_lit.kernels.precision import has_bfloat16, precision_of
+from tests.helpers.encoders import make_encoder
 from tests.helpers.models import ATTRIBUTES, make_model
 from tests.helpers.scenes import make_batch
 
@@ -119,7 +120,7 @@ def test_the_whole_encoder_is_the_same_without_a_gradient(convolutions, kernels,
     torch.manual_seed(0)
     vit = {"kind": "dinov2", "depth": 2, "heads": 2}
     options = {"image_size": 28, "layer_scale": 0.5, "tokens": tokens, "margin": 0}
-    encoder = VGGTEncoder(width=64, heads=2, depth=3, layers=(0, 1, 2), vit=vit, **options)
+    encoder = make_encoder(width=64, heads=2, depth=3, layers=(0, 1, 2), vit=vit, **options)
     images, masks = torch.rand(2, 3, 3, 28, 42), torch.ones(2, 3, 28, 42, dtype=torch.bool)
     masks[0, 1, :, 14:] = masks[1, 2] = False
     expected = encoder(images, masks)
@@ -141,7 +142,7 @@ def test_frozen_blocks_record_no_gradient(monkeypatch, trainable, recorded):
         return forward(block, x, lengths, rotary)
 
     monkeypatch.setattr(Block, "forward", spy)
-    encoder = VGGTEncoder(
+    encoder = make_encoder(
         width=32, heads=2, depth=2, layers=(0, 1), vit={"kind": "conv"}, trainable=trainable
     )
     encoder(torch.rand(1, 2, 3, 28, 28), torch.ones(1, 2, 28, 28, dtype=torch.bool))
@@ -224,7 +225,7 @@ def test_checkpointing_keeps_fewer_bytes_and_the_same_gradients():
     for checkpointing in (False, True):
         torch.manual_seed(0)
         vit = {"kind": "dinov2", "depth": 3, "heads": 2}
-        encoder = VGGTEncoder(
+        encoder = make_encoder(
             width=32, heads=2, depth=4, layers=(1, 3), vit=vit, image_size=56, checkpointing=checkpointing
         )
         kept = []
@@ -247,7 +248,7 @@ def test_checkpointing_keeps_fewer_bytes_and_the_same_gradients():
 def test_tokens_in_half_precision_weights_pass_the_fast_path(convolutions, kernels):
     """An encoder with bfloat16 weights uses the kernels and stays close to float32."""
     torch.manual_seed(0)
-    encoder = VGGTEncoder(width=64, heads=2, depth=2, layers=(0, 1), vit={"kind": "conv"}, layer_scale=0.5)
+    encoder = make_encoder(width=64, heads=2, depth=2, layers=(0, 1), vit={"kind": "conv"}, layer_scale=0.5)
     images, masks = torch.rand(1, 2, 3, 56, 56), torch.ones(1, 2, 56, 56, dtype=torch.bool)
     with torch.no_grad():
         exact = encoder(images, masks).latent[1]

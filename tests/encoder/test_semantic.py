@@ -8,6 +8,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.training import Optimization
+from tests.helpers.encoders import make_encoder
 
 BRANCH = {"width": 16, "depth": 2, "heads": 2, "channels": 8, "parts": 6}
 SMALL = {"width": 32, "heads": 2, "depth": 1, "layers": (0,), "vit": {"kind": "stem", "channels": 8}}
@@ -16,7 +17,7 @@ SMALL = {"width": 32, "heads": 2, "depth": 1, "layers": (0,), "vit": {"kind": "s
 def make(**options) -> VGGTEncoder:
     """An encoder in float64 whose branch's token and LayerScales are large enough to matter."""
     torch.manual_seed(0)
-    encoder = VGGTEncoder(**{**SMALL, "semantic": BRANCH, **options}).double()
+    encoder = make_encoder(**{**SMALL, "semantic": BRANCH, **options}).double()
     with torch.no_grad():
         for name, parameter in encoder.semantic.named_parameters():
             if "gamma" in name or "token" in name:
@@ -130,14 +131,14 @@ def test_a_cached_feature_is_not_that_of_another_mask(tmp_path):
         ({"heads": 3}, "encoder.semantic.width: expected a multiple of 4"),
         (
             {"chanels": 8},
-            "encoder.semantic: expected null or a mapping of width, depth, heads, channels, parts",
+            "encoder.semantic key: expected one of channels, depth, heads, parts, width; found 'chanels'",
         ),
     ],
 )
 def test_impossible_options_are_refused(change, message):
     """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=message):
-        VGGTEncoder(**SMALL, semantic={**BRANCH, **change})
+        make_encoder(**SMALL, semantic={**BRANCH, **change})
 
 
 def test_half_precision_weights_run():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ghgs_lit.bounds import VisualHull
-from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.encoder import VGGTOptions
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.relative_depth import UNIT, relative_bounds, relative_depth
 from ghgs_lit.heads.depth import DepthHead
@@ -18,9 +18,9 @@ from tests.helpers.scenes import make_batch
 
 def make_encoder(**options):
     torch.manual_seed(0)
-    return VGGTEncoder(
+    return VGGTOptions(
         width=32, heads=2, depth=4, vit={"kind": "stem", "channels": 8}, layers=(0, 1, 2, 3), **options
-    )
+    ).build()
 
 
 def test_relative_maps_know_shape_and_not_distance():

@@ -3,22 +3,14 @@
 import numpy as np
 import torch
 
-from ghgs_lit.recalibration import Recalibration
+from ghgs_lit.recalibration import RecalibrationOptions
 from ghgs_lit.types import Points, Tokens
 
 
-def literal_neighbors(points, view, i, k, mode):
+def literal_neighbors(points, i, k):
     """Indices of the neighbours of point ``i``, computed from the definition in float64."""
     distance = np.linalg.norm(points.double().numpy() - points[i].double().numpy(), axis=1)
-    order = sorted(range(len(points)), key=lambda j: (np.float32(distance[j]), j))
-    own, other = ([j for j in order if (view[j] == view[i]) == same] for same in (True, False))
-    if mode == "all":
-        return order[:k]
-    if mode == "other_views":
-        return other[:k] or [i]
-    k = min(k, len(points))
-    from_own = min(len(own), max(k // 2, k - len(other)))
-    return own[:from_own] + other[: k - from_own]
+    return sorted(range(len(points)), key=lambda j: (np.float32(distance[j]), j))[:k]
 
 
 def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torch.float32):
@@ -48,4 +40,4 @@ def scene(counts=((4, 5, 3), (6, 2, 5)), dim=32, grid=(4, 4), seed=0, dtype=torc
 
 def make_stage(dim=32, k=4, num_heads=2, **options):
     torch.manual_seed(2)
-    return Recalibration(dim, k=k, num_heads=num_heads, **options)
+    return RecalibrationOptions(k=k, num_heads=num_heads, **options).build(dim)

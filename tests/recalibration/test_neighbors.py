@@ -5,42 +5,38 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from ghgs_lit.recalibration import nearest_neighbors
-from ghgs_lit.recalibration.neighbors import MODES, Neighbors
+from ghgs_lit.recalibration import Neighbors, nearest_neighbors
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("k", [1, 2, 3, 7, 64])
-def test_mixed_neighbors_are_never_too_few(k, dtype):
-    """``mixed`` with k = 1, one token, one view or fewer tokens than k gave NaN or dropped neighbours."""
-    for counts in ([1], [1, 1], [9], [3, 6], [1, 2, 40], [30, 30, 0, 4]):
-        view = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
-        points = torch.rand(len(view), 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
-        found = nearest_neighbors(points, view, k, "mixed")
-        assert found.index.shape == (len(view), min(k, len(view)))
-        assert found.valid.all()
-        for i, row in enumerate(found.index.tolist()):
-            assert row == literal_neighbors(points, view, i, k, "mixed")
+def test_neighbors_are_those_of_the_definition(k, dtype):
+    """From all views, the point itself among them; all of them where there are fewer."""
+    for count in (1, 2, 9, 43):
+        points = torch.rand(count, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
+        near = nearest_neighbors(points, torch.arange(count) % 3, k)
+        assert near.index.shape == (count, min(k, count))
+        assert near.valid.all()
+        for i, row in enumerate(near.index.tolist()):
+            assert row == literal_neighbors(points, i, k)
     tokens, points = scene(((1, 0, 0), (1, 2, 0)))
-    found = make_stage(neighbors="mixed", k=k)(tokens, points)
+    found = make_stage(k=k)(tokens, points)
     assert all(layer.isfinite().all() for layer in found.latent)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("mode", MODES)
-def test_ties_on_the_image_plane_favor_no_view_and_no_side(mode, dtype):
+def test_ties_on_the_image_plane_favor_no_view_and_no_side(dtype):
     """Views share their places there, so most distances are equal; lower views had a quarter more."""
     tokens, points = scene(((144, 144, 144, 144),), grid=(12, 12))
-    module = make_stage(neighborhood="image_plane", k=48, neighbors=mode)
+    module = make_stage(neighborhood="image_plane", k=48)
     position = module.positions(tokens, points).to(dtype)
-    near = nearest_neighbors(position, tokens.image, 48, mode, module.places(tokens))
+    near = nearest_neighbors(position, tokens.image, 48, module.places(tokens))
     inside = (tokens.row - 5.5).abs().maximum((tokens.column - 5.5).abs()) < 2
     index = near.index[inside]
     turn = (tokens.image[index] - tokens.image[inside, None]) % 4
     counts = [(turn == t).sum(1) for t in range(4)]
-    expected = {"all": [12] * 4, "other_views": [0, 16, 16, 16], "mixed": [24, 8, 8, 8]}[mode]
-    assert [c.float().mean().item() for c in counts] == expected
+    assert [c.float().mean().item() for c in counts] == [12] * 4
     assert all(c.min() == c.max() for c in counts)
     # The neighbours of one view lie around the query: within one place of balanced.
     offset = position[index] - position[inside, None]
@@ -49,9 +45,8 @@ def test_ties_on_the_image_plane_favor_no_view_and_no_side(mode, dtype):
         assert drift.abs().max() <= 3
     # Distances come first: nothing nearer is left out.
     distance = torch.cdist(position[inside], position)
-    if mode == "all":
-        farthest = distance.gather(1, index).amax(1)
-        assert torch.equal(farthest, distance.sort(1).values[:, 47])
+    farthest = distance.gather(1, index).amax(1)
+    assert torch.equal(farthest, distance.sort(1).values[:, 47])
 
 
 def test_neighbors_on_the_image_plane_are_those_of_whole_photographs():
@@ -91,13 +86,11 @@ def test_blocks_do_not_change_the_neighbors(monkeypatch):
     """Searching in blocks to save memory gives the same neighbours."""
     points = torch.rand(90, 3)
     view = torch.arange(90) % 3
-    for mode in MODES:
-        expected = nearest_neighbors(points, view, 7, mode)
-        monkeypatch.setattr("ghgs_lit.recalibration.neighbors._BLOCK", 1000)
-        found = nearest_neighbors(points, view, 7, mode)
-        assert torch.equal(found.index, expected.index)
-        assert torch.equal(found.valid, expected.valid)
-        monkeypatch.undo()
+    expected = nearest_neighbors(points, view, 7)
+    monkeypatch.setattr("ghgs_lit.recalibration.neighbors._BLOCK", 1000)
+    found = nearest_neighbors(points, view, 7)
+    assert torch.equal(found.index, expected.index)
+    assert torch.equal(found.valid, expected.valid)
 
 
 def test_fewer_points_than_k_and_none():
@@ -107,9 +100,8 @@ def test_fewer_points_than_k_and_none():
     assert nearest_neighbors(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), 4).index.shape[0] == 0
     for counts in (((0, 0, 0), (3, 0, 0)), ((0, 0, 0), (0, 0, 0))):
         tokens, points = scene(counts)
-        for neighbors in MODES:
-            found = make_stage(neighbors=neighbors, k=64)(tokens, points)
-            assert all(layer.isfinite().all() for layer in found.latent)
+        found = make_stage(k=64)(tokens, points)
+        assert all(layer.isfinite().all() for layer in found.latent)
 
 
 def test_points_of_all_sizes_have_neighbors():

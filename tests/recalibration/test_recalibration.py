@@ -1,6 +1,7 @@
 """The recalibration stage: attention against the equations and the release, options."""
 
 import dataclasses
+from typing import get_args
 
 import pytest
 import torch
@@ -8,20 +9,17 @@ import torch.nn.functional as F
 
 import ghgs_lit.recalibration.recalibration as stage
 from ghgs_lit.errors import InputError
-from ghgs_lit.recalibration import (
-    SIMILARITIES,
-    SemanticAttention,
-    nearest_neighbors,
-)
-from ghgs_lit.recalibration.neighbors import MODES
+from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
+from ghgs_lit.recalibration.attention import S_MIN, Similarity
 from ghgs_lit.recalibration.recalibration import neighbor_cosines
 from tests.helpers.scenes import CASES, fixture
 from tests.helpers.tokens import literal_neighbors, make_stage, scene
 
+SIMILARITIES = get_args(Similarity)
 FIXTURES = ["sc3d_n200", "sc3d_b2_n150", "sc3d_small_variance"]
 
 
-def literal_attention(block, x, points, semantic, view, k, mode):
+def literal_attention(block, x, points, semantic, k):
     """Eqs. 3 to 5 and the residual network for one element, one query and one head at a time."""
     normed = block.norm1(x)
     q, key, v = (
@@ -29,7 +27,7 @@ def literal_attention(block, x, points, semantic, view, k, mode):
     )
     rows = []
     for i in range(len(x)):
-        near = literal_neighbors(points, view, i, k, mode)
+        near = literal_neighbors(points, i, k)
         heads = []
         for a in range(block.num_heads):
             scores = []
@@ -39,7 +37,7 @@ def literal_attention(block, x, points, semantic, view, k, mode):
                 score = {
                     "product": score * s,
                     "product_clamped": score * s.clamp(min=0),
-                    "log": score + s.clamp(min=block.s_min).log(),
+                    "log": score + s.clamp(min=S_MIN).log(),
                     "none": score,
                 }[block.similarity]
                 scores.append(score)
@@ -72,12 +70,11 @@ def test_attention_matches_the_release(name, dtype):
     torch.testing.assert_close(out.double(), expected["out"], atol=bounds["out"], rtol=0)
 
 
-@pytest.mark.parametrize("neighbors", MODES)
 @pytest.mark.parametrize("similarity", SIMILARITIES)
-def test_recalibration_is_the_literal_equations(similarity, neighbors):
+def test_recalibration_is_the_literal_equations(similarity):
     """Every option equals Eqs. 3 to 5 written as loops."""
     tokens, points = scene()
-    module = make_stage(similarity=similarity, neighbors=neighbors).double()
+    module = make_stage(similarity=similarity).double()
     tokens = dataclasses.replace(tokens, latent=tuple(t.double() for t in tokens.latent))
     found = module(tokens, points)
     for layer, before in zip(found.latent, tokens.latent, strict=True):
@@ -89,9 +86,7 @@ def test_recalibration_is_the_literal_equations(similarity, neighbors):
                 before[at],
                 points.tokens[at],
                 tokens.semantic[at],
-                tokens.image[at],
                 4,
-                neighbors,
             )
         torch.testing.assert_close(layer, expected, atol=1e-6, rtol=0)  # cosines are float32
 
@@ -138,21 +133,18 @@ def test_order_of_the_views_does_not_matter():
         tokens, latent=tuple(t[index] for t in tokens.latent), semantic=tokens.semantic[index]
     )
     moved = dataclasses.replace(points, tokens=points.tokens[index], tokens_valid=points.tokens_valid[index])
-    for neighbors in MODES:
-        expected = make_stage(neighbors=neighbors)(tokens, points)
-        found = make_stage(neighbors=neighbors)(swapped, moved)
-        torch.testing.assert_close(found.latent[1], expected.latent[1][index], atol=1e-5, rtol=0)
+    expected, found = make_stage()(tokens, points), make_stage()(swapped, moved)
+    torch.testing.assert_close(found.latent[1], expected.latent[1][index], atol=1e-5, rtol=0)
 
 
 def test_neighborhoods():
     """Only ``xyz`` reads the points; token centres on the image plane are the same in all views."""
     tokens, points = scene(((16, 16, 16),))
-    outputs = {name: make_stage(neighborhood=name)(tokens, points) for name in stage.NEIGHBORHOODS}
+    outputs = {name: make_stage(neighborhood=name)(tokens, points) for name in ("xyz", "image_plane")}
     far = dataclasses.replace(points, tokens=points.tokens.flip(0))
     for name, before in outputs.items():
         after = make_stage(neighborhood=name)(tokens, far)
         assert torch.equal(after.latent[0], before.latent[0]) == (name != "xyz")
-    assert not torch.equal(outputs["image_plane"].latent[0], outputs["feature"].latent[0])
     position = make_stage(neighborhood="image_plane").positions(tokens, points)
     assert torch.equal(position[:16], position[16:32])
     assert position.min() == 1.0  # pixels: half a patch
@@ -193,7 +185,7 @@ def test_dissimilar_neighbors_lose_their_weight_in_log_only():
 def test_blocks_of_queries_change_nothing(monkeypatch):
     """Computing a part of the tokens at a time gives the same result."""
     tokens, points = scene()
-    module = make_stage(neighbors="mixed")
+    module = make_stage()
     expected = module(tokens, points)
     monkeypatch.setattr("ghgs_lit.recalibration.attention._ROWS", 5)
     with torch.no_grad():
@@ -216,11 +208,10 @@ def test_autocast_keeps_neighbors_and_the_kind_of_the_tokens():
     [
         ({"k": 0}, "recalibration.k"),
         ({"similarity": "cosine"}, "recalibration.similarity: expected one of product"),
-        ({"neighborhood": "uv"}, "recalibration.neighborhood"),
-        ({"neighbors": "some"}, "recalibration.neighbors"),
+        ({"neighborhood": "feature"}, "recalibration.neighborhood: expected one of xyz, image_plane"),
+        ({"neighbors": "all"}, "recalibration key: expected one of .*found 'neighbors'"),
         ({"tokens": "most"}, "recalibration.tokens"),
         ({"num_heads": 5}, "recalibration.num_heads"),
-        ({"s_min": 0.0}, "recalibration.s_min"),
     ],
 )
 def test_impossible_options_are_refused(options, key):
@@ -235,7 +226,7 @@ def test_gathered_neighbors_give_what_a_product_of_all_tokens_gives(similarity, 
     torch.manual_seed(0)
     block = SemanticAttention(64, 2, similarity).double()
     inputs = [torch.randn(40, 16, dtype=torch.float64, requires_grad=True) for _ in range(3)]
-    near = nearest_neighbors(torch.rand(40, 3), torch.arange(40) % 3, 9, "other_views")
+    near = nearest_neighbors(torch.rand(40, 3), torch.arange(40) % 3, 9)
     near.valid[:, 5:] = False
     cosines = None if similarity == "none" else torch.rand(40, 9, dtype=torch.float64) * 2 - 1
 

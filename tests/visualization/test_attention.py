@@ -28,12 +28,12 @@ def seen(model, batch):
 @pytest.mark.parametrize(
     "overrides",
     [
-        [f"recalibration.similarity={s}", f"recalibration.neighbors={n}", f"recalibration.tokens={t}"]
-        for s, n, t in [
-            ("product", "all", "subject"),
-            ("product_clamped", "other_views", "subject"),
-            ("log", "mixed", "subject"),
-            ("none", "all", "all"),
+        [f"recalibration.similarity={s}", f"recalibration.tokens={t}"]
+        for s, t in [
+            ("product", "subject"),
+            ("product_clamped", "subject"),
+            ("log", "subject"),
+            ("none", "all"),
         ]
     ],
     ids=lambda o: o[0].split("=")[1],

@@ -13,27 +13,15 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
-from ghgs_lit import encoder, recalibration
+from ghgs_lit import encoder
 
 
 def _attention(q: Tensor, k: Tensor, v: Tensor) -> int:
     return 4 * math.prod(q.shape) * k.shape[-2]
 
 
-def _attention_to_neighbors(q: Tensor, k: Tensor, v: Tensor, heads: int, index: Tensor, *_: Any) -> int:
-    return 4 * q.numel() * index.shape[1]
-
-
-def _cosines(features: Tensor, index: Tensor) -> int:
-    return 2 * features.numel() * index.shape[1]
-
-
 #: Compiled kernels, which PyTorch cannot see: module, function, FLOPs from its arguments.
-KERNELS: tuple[tuple[ModuleType, str, Callable[..., int]], ...] = (
-    (encoder.cpu, "attend", _attention),
-    (recalibration.cpu, "attend", _attention_to_neighbors),
-    (recalibration.cpu, "cosines", _cosines),
-)
+KERNELS: tuple[tuple[ModuleType, str, Callable[..., int]], ...] = ((encoder.cpu, "attend", _attention),)
 
 
 def _cpu_attention(query: tuple, key: tuple, value: tuple, *_: Any, **__: Any) -> int:

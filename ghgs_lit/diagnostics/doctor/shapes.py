@@ -22,7 +22,6 @@ from ghgs_lit.bounds import cpu as bounds
 from ghgs_lit.encoder import cpu as encoder
 from ghgs_lit.geometry import chamfer
 from ghgs_lit.geometry import cpu as geometry
-from ghgs_lit.recalibration import cpu as recalibration
 
 _INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 
@@ -117,8 +116,6 @@ def _sweep(colors, masks, near, *rest):
 #: Shapes of what compiled kernels give: module, function, stand-in.
 _RESULTS: tuple[tuple[ModuleType, str, Callable], ...] = (
     (encoder, "attend", lambda q, k, v: v.new_empty(q.transpose(1, 2).shape)),
-    (recalibration, "attend", lambda q, *_: q.new_empty(q.shape)),
-    (recalibration, "cosines", lambda features, index: features.new_empty(index.shape)),
     (geometry, "sweep", _sweep),
     (chamfer, "nearest", lambda queries, references: torch.zeros(len(queries), dtype=torch.long)),
 )
@@ -146,6 +143,6 @@ def without_kernels(compiled: bool) -> Iterator[None]:
         for module, name, result in _RESULTS:
             stack.enter_context(replaced(module, name, result))
         if not compiled:
-            for module in (bounds, encoder, geometry, recalibration):
+            for module in (bounds, encoder, geometry):
                 stack.enter_context(replaced(module, "is_supported", lambda *_: False))
         yield

@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit import encoder, recalibration
+from ghgs_lit import encoder
 from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES, differences, partners, relative_difference
 from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
 from ghgs_lit.diagnostics.benchmark.measure import Job, Times, order, time_jobs
@@ -158,21 +158,14 @@ def test_flops_of_products_attention_and_compiled_kernels():
 
 def test_flops_count_the_calls_of_the_compiled_kernels(monkeypatch):
     """The kernels are called through their module, by which the count sees them; afterwards it does not."""
-    for module, name in (
-        (encoder.cpu, "attend"),
-        (recalibration.cpu, "attend"),
-        (recalibration.cpu, "cosines"),
-    ):
-        monkeypatch.setattr(module, name, lambda *_: None)
-    rows, index = torch.rand(6, 32), torch.zeros(6, 4, dtype=torch.long)
+    monkeypatch.setattr(encoder.cpu, "attend", lambda *_: None)
+    heads = [torch.rand(1, 2, 8, 16)] * 3
     with FlopsProbe() as probe:
         probe.begin("kernels")
-        encoder.cpu.attend(*[torch.rand(1, 2, 8, 16)] * 3)
-        recalibration.cpu.attend(rows, rows, rows, 2, index, index == 0, index, index)
-        recalibration.cpu.cosines(rows, index)
+        encoder.cpu.attend(*heads)
         probe.end("kernels")
-    recalibration.cpu.cosines(rows, index)
-    assert probe.flops == {"kernels": 4 * 2 * 8 * 8 * 16 + 4 * 6 * 4 * 32 + 2 * 6 * 4 * 32}
+    encoder.cpu.attend(*heads)
+    assert probe.flops == {"kernels": 4 * 2 * 8 * 8 * 16}
 
 
 def test_memory_of_a_stage_counts_for_the_stages_around_it_alone():

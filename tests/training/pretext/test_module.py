@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.encoder.semantic import SemanticBranch
+from ghgs_lit.encoder.semantic import SemanticOptions
 from ghgs_lit.errors import InputError
 from ghgs_lit.training.pretext.module import Pretext, cross_entropy
 from tests.helpers.bodies import body_batch
@@ -12,7 +12,7 @@ from tests.helpers.bodies import body_batch
 
 def branch(parts=16):
     torch.manual_seed(0)
-    return SemanticBranch(14, width=32, depth=1, heads=2, channels=8, parts=parts)
+    return SemanticOptions(width=32, depth=1, heads=2, channels=8, parts=parts).build(14)
 
 
 def test_patches_without_a_part_do_not_count():

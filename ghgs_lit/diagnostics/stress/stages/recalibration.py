@@ -7,7 +7,7 @@ from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values
 from ghgs_lit.encoder.cpu.attention import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
-from ghgs_lit.recalibration import SemanticAttention, cpu, nearest_neighbors
+from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.recalibration.neighbors import Neighbors
 from ghgs_lit.recalibration.recalibration import neighbor_cosines
 
@@ -25,38 +25,18 @@ def _point_inputs(family: str, g: Generator) -> Values:
 
 
 def _distances(v: Values) -> Values:
-    """Distances, in float64, of the neighbours that are found, by mode; -1 where there is none."""
-    found = {}
-    for mode in ("all", "other_views", "mixed"):
-        each = []
-        for points, view in zip(v["points"], v["view"], strict=True):
-            near, exact = nearest_neighbors(points, view, _K, mode), points.double()
-            distance = (exact[near.index] - exact[:, None]).norm(dim=-1)
-            each.append(torch.where(near.valid, distance, -1.0))
-        found[mode] = torch.stack(each)
-    return found
+    """Distances, in float64, of the neighbours that are found."""
+    each = []
+    for points, view in zip(v["points"], v["view"], strict=True):
+        near, exact = nearest_neighbors(points, view, _K), points.double()
+        each.append((exact[near.index] - exact[:, None]).norm(dim=-1))
+    return {"all": torch.stack(each)}
 
 
 def _distances_slowly(v: Values) -> Values:
     """Every difference, sorted."""
     distance = (v["points"][:, :, None] - v["points"][:, None]).norm(dim=-1)
-    same = v["view"][:, :, None] == v["view"][:, None]
-    k = min(_K, distance.shape[-1])
-    other = torch.where(same, torch.inf, distance).sort(-1).values[..., :k]
-    alone = other.isinf().all(-1)
-    other = torch.where(other.isinf(), -1.0, other)
-    other[..., 0] = torch.where(alone, 0.0, other[..., 0])
-    own, foreign = (torch.where(m, distance, torch.inf).sort(-1).values for m in (same, ~same))
-    from_own = torch.minimum(same.sum(-1), torch.clamp(k - (~same).sum(-1), min=k // 2))
-    place = torch.arange(distance.shape[-1])
-    parts = [torch.where(place < count[..., None], part, torch.inf) for part, count in
-             ((own, from_own), (foreign, k - from_own))]  # fmt: skip
-    mixed = torch.empty_like(distance[..., :k])
-    for n in range(len(distance)):
-        for q in range(distance.shape[1]):
-            row = torch.cat([part[n, q][part[n, q].isfinite()] for part in parts])
-            mixed[n, q] = row[:k]
-    return {"all": distance.sort(-1).values[..., :k], "other_views": other, "mixed": mixed}
+    return {"all": distance.sort(-1).values[..., :_K]}
 
 
 def _neighbor_table(family: str, g: Generator, count: int, k: int) -> Values:
@@ -78,12 +58,6 @@ def _cosine_inputs(family: str, g: Generator) -> Values:
 def _cosines(v: Values) -> Values:
     pairs = zip(v["features"], v["index"], v["valid"], strict=True)
     return {"cosines": torch.stack([neighbor_cosines(f, Neighbors(i, m)) for f, i, m in pairs])}
-
-
-def _kernel_cosines(v: Values) -> Values:
-    return {
-        "cosines": torch.stack([cpu.cosines(f, i) for f, i in zip(v["features"], v["index"], strict=True)])
-    }
 
 
 def _cosines_slowly(v: Values) -> Values:
@@ -125,19 +99,6 @@ def _attention(v: Values) -> Values:
                 *(v[name] for name in ("q", "k", "v", "index", "valid", "cosines")), strict=True
             )
         ]
-        found[name] = torch.stack(each)
-    return found
-
-
-def _kernel_attention(v: Values) -> Values:
-    found = {}
-    for name, block in _BLOCKS.items():
-        each = []
-        for q, k, value, index, valid, cosines in zip(
-            *(v[name] for name in ("q", "k", "v", "index", "valid", "cosines")), strict=True
-        ):
-            changes = (x.expand(index.shape).float() for x in block._factor_and_bias(cosines))
-            each.append(cpu.attend(q, k, value, 2, index, valid, *changes))
         found[name] = torch.stack(each)
     return found
 
@@ -207,19 +168,9 @@ STAGES = (
         "a product of two unit vectors of 16 components", _cosines_slowly,
     ),
     Stage(
-        "cosine kernel", ("features", "neighbors"), _cosine_inputs, _kernel_cosines, 20,
-        "as cosine", _cosines_slowly, dtypes=_FLOAT32, no_dtype=_KERNEL,
-    ),
-    Stage(
         "attention", ("features", "neighbors"), _attention_inputs, _attention, 50,
         f"logits of sums of 16 products, whose error the softmax multiplies by their size. {_HUGE}",
         _attention_slowly, gradients=("q", "k", "v"), seeds=48, sizes=_products,
-        silent="an infinite logit is a weight of 1, and a token that nobody attends to has no effect",
-    ),
-    Stage(
-        "attention kernel", ("features", "neighbors"), _attention_inputs, _kernel_attention, 100,
-        "as attention; exponentials by a polynomial of relative error 2 eps", _attention_slowly,
-        dtypes=_FLOAT32, no_dtype=_KERNEL, seeds=48,
         silent="an infinite logit is a weight of 1, and a token that nobody attends to has no effect",
     ),
     *((Stage(
