@@ -19,12 +19,10 @@ from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.config.settings import from_config
 from ghgs_lit.diagnostics.benchmark import report, scaling
-from ghgs_lit.diagnostics.benchmark.board import write_board
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
-from ghgs_lit.diagnostics.benchmark.page import to_page
 from ghgs_lit.diagnostics.benchmark.peers import tables_of as tables_of_peers
-from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling, save_png
+from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling
 from ghgs_lit.diagnostics.benchmark.presets import (
     KNOBS,
     YARDSTICK,
@@ -34,11 +32,10 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     presets_of,
     readers_of_skip,
 )
+from ghgs_lit.diagnostics.output import print_tables, save_figure
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.measure import decisions_of
-from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.training.loggers import hyperparameters
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.reading import SHIPPED
 
@@ -195,22 +192,16 @@ def _weights(config: dict[str, Any], cases: list[Case]) -> str:
 
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
     """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
-    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
     if content["task"] == "peers":
         tables = tables_of_peers(rows)
-        report.print_tables(tables)
-        return report.write_numbers(directory, {**content, "provenance": source}, tables)
-    if content["task"] == "presets":
-        tables, drawing = report.tables_of(rows), draw_presets(rows, *words)
+    elif content["task"] == "presets":
+        tables = report.tables_of(rows)
+        save_figure(draw_presets(rows, *words), directory / "benchmark.png")
     else:
-        fits = content["fits"]
-        tables, drawing = scaling.tables_of(rows, fits), draw_scaling(rows, fits, *words)
-    report.print_tables(tables)
+        tables = scaling.tables_of(rows, content["fits"])
+        save_figure(draw_scaling(rows, content["fits"], *words), directory / "benchmark.png")
+    print_tables(tables)
     print(*content.get("decisions", []), sep="\n", flush=True)
-    png = drawing.png()
-    save_png(png, directory / "benchmark.png")
-    notes = report.notes_of(content)
-    write_text_atomically(directory / "benchmark.html", to_page(drawing, tables, notes))
-    write_board(directory, rows, png, hyperparameters(config, choices(), overrides()))
+    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
     return report.write_numbers(directory, {**content, "provenance": source}, tables)

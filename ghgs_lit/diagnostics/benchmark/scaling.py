@@ -5,13 +5,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from ghgs_lit.diagnostics.benchmark.measure import Job, Progress, Record, inspect, time_jobs
 from ghgs_lit.diagnostics.benchmark.presets import Case
-from ghgs_lit.diagnostics.benchmark.report import Table, stage_row
+from ghgs_lit.diagnostics.benchmark.report import stage_row, totals
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER
+from ghgs_lit.diagnostics.output import Tables, pivoted, texts
 from ghgs_lit.errors import require
 from ghgs_lit.runs.results import Row
 
@@ -91,7 +93,7 @@ def study(
             for case in cases:
                 work, *_ = inspect(case, batch, device, count_flops)
                 jobs.append(Job(case, [batch], count))
-                records.append(Record(case, {}, work))
+                records.append(Record(case, work))
                 values.append(value)
                 progress(f"{axis} {value}")
         timed = time_jobs(jobs, warmup, repeats, device, progress) if jobs else []
@@ -111,36 +113,24 @@ def fits_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     Expected are the exponent of the FLOPs of the same runs and, of threads, -1; None where there are none.
     """
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        if row["stage"] != OTHER:
-            groups.setdefault((row["axis"], row["preset"], row["stage"]), []).append(row)
+    frame = pd.DataFrame([row for row in rows if row["stage"] != OTHER])
     fits = []
-    for (axis, preset, stage), own in groups.items():
-        values = [row["value"] for row in own]
-        found = exponent(values, [row["seconds"] for row in own])
-        expected = _IDEAL_THREADS if axis == "threads" else exponent(values, [row["flops"] for row in own])
+    for (axis, preset, stage), group in frame.groupby(["axis", "preset", "stage"], sort=False):
+        values, flops = list(group.value), [None if pd.isna(n) else n for n in group.flops]
+        expected = _IDEAL_THREADS if axis == "threads" else exponent(values, flops)
         about = {"axis": axis, "preset": preset, "stage": stage}
-        fits.append({**about, "exponent": found, "expected": expected})
+        fits.append({**about, "exponent": exponent(values, list(group.seconds)), "expected": expected})
     return fits
 
 
-def tables_of(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]]) -> list[Table]:
+def tables_of(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]]) -> Tables:
     """Seconds of whole passes along each axis, then all exponents."""
-    tables = []
-    for axis in dict.fromkeys(row["axis"] for row in rows):
-        own = [row for row in rows if row["axis"] == axis and row["stage"] == "total"]
-        values = list(dict.fromkeys(row["value"] for row in own))
-        seconds = {(row["preset"], row["value"]): f"{row['seconds']:.3f}" for row in own}
-        presets = dict.fromkeys(row["preset"] for row in own)
-        lines = tuple((preset, *(seconds[preset, value] for value in values)) for preset in presets)
-        tables.append(Table(f"Seconds by {axis}", ("preset", *(f"{value:g}" for value in values)), lines))
-    lines = tuple(
-        (fit["axis"], fit["preset"], fit["stage"], _number(fit["exponent"]), _number(fit["expected"]))
-        for fit in fits
-    )
-    return [*tables, Table("Exponents", ("axis", "preset", "stage", "fitted", "expected"), lines)]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    frame = pd.DataFrame(totals(rows))
+    frame = frame.assign(value=frame.value.map("{:g}".format))
+    tables = {
+        f"Seconds by {axis}": pivoted(group, "preset", "value", "seconds", "{:.3f}")
+        for axis, group in frame.groupby("axis", sort=False)
+    }
+    columns = {name: (name, "{}") for name in ("axis", "preset", "stage")}
+    columns |= {"fitted": ("exponent", "{:.2f}"), "expected": ("expected", "{:.2f}")}
+    return {**tables, "Exponents": texts(pd.DataFrame(fits), columns)}

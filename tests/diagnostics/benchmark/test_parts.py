@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit import encoder, recalibration
+from ghgs_lit import encoder
 from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES, differences, partners, relative_difference
 from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
 from ghgs_lit.diagnostics.benchmark.measure import Job, Times, order, time_jobs
@@ -142,8 +142,8 @@ def test_gaussians_are_compared_by_their_pixel(model, scene):
     assert [len(index) for index in partners(gaussians, nothing)] == [0, 0]
 
 
-def test_flops_of_products_attention_and_compiled_kernels():
-    """Work must not vanish from the count because a compiled kernel does it."""
+def test_flops_of_products_and_attention():
+    """PyTorch counts no attention of a CPU itself."""
     q = torch.rand(1, 2, 32, 16)
     with torch.no_grad(), FlopsProbe() as probe:
         for stage, run in {
@@ -156,23 +156,15 @@ def test_flops_of_products_attention_and_compiled_kernels():
     assert probe.flops == {"product": 2 * 5 * 7 * 3, "pytorch": 4 * 2 * 32 * 32 * 16}
 
 
-def test_flops_count_the_calls_of_the_compiled_kernels(monkeypatch):
-    """The kernels are called through their module, by which the count sees them; afterwards it does not."""
-    for module, name in (
-        (encoder.cpu, "attend"),
-        (recalibration.cpu, "attend"),
-        (recalibration.cpu, "cosines"),
-    ):
-        monkeypatch.setattr(module, name, lambda *_: None)
-    rows, index = torch.rand(6, 32), torch.zeros(6, 4, dtype=torch.long)
+def test_flops_count_the_calls_of_the_compiled_kernel(monkeypatch):
+    """The kernel is called through its module, by which the count sees it; afterwards it does not."""
+    monkeypatch.setattr(encoder.cpu, "attend", lambda *_: None)
     with FlopsProbe() as probe:
-        probe.begin("kernels")
+        probe.begin("kernel")
         encoder.cpu.attend(*[torch.rand(1, 2, 8, 16)] * 3)
-        recalibration.cpu.attend(rows, rows, rows, 2, index, index == 0, index, index)
-        recalibration.cpu.cosines(rows, index)
-        probe.end("kernels")
-    recalibration.cpu.cosines(rows, index)
-    assert probe.flops == {"kernels": 4 * 2 * 8 * 8 * 16 + 4 * 6 * 4 * 32 + 2 * 6 * 4 * 32}
+        probe.end("kernel")
+    encoder.cpu.attend(*[torch.rand(1, 2, 8, 16)] * 3)
+    assert probe.flops == {"kernel": 4 * 2 * 8 * 8 * 16}
 
 
 def test_memory_of_a_stage_counts_for_the_stages_around_it_alone():
