@@ -19,7 +19,7 @@ def failures(name, family, run, dtype="float32"):
     stage = STAGES[name]
     reference = stage.reference or stage.run
     broken = dataclasses.replace(stage, run=run, reference=reference)
-    return sum(cell.failures for cell in measure(broken, family, range(3), [dtype]))
+    return sum(row["failures"] for row in measure(broken, family, range(3), [dtype]))
 
 
 def test_the_full_run_is_large_and_no_stage_dominates():
@@ -68,7 +68,7 @@ def test_a_value_that_vanishes_is_caught(family):
     """A stage that hides NaN or infinity must say why."""
     stage = STAGES["unit vectors"]
     hide = dataclasses.replace(stage, run=lambda v: {"unit": stage.run(v)["unit"].nan_to_num()}, gradients=())
-    assert measure(hide, family, range(3), ["float32"])[0].failures == 3
+    assert measure(hide, family, range(3), ["float32"])[0]["failures"] == 3
 
 
 def test_a_run_goes_on_where_it_was_interrupted(tmp_path, capsys):
