@@ -10,7 +10,6 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 from omegaconf import DictConfig
-from rich.progress import Progress
 
 from ghgs_lit.cli.benchmark_peers import peers
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
@@ -139,14 +138,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     if batches[0].targets is None:
         raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")
     metrics = build(config["metrics"], "metrics").to(device)
-    timing = config["timing"]
-    total = len(cases) * (len(batches) + timing["warmup"] + timing["repeats"])
-    with Progress() as bar:
-        task = bar.add_task("presets", total=total)
-        records = record_cases(
-            cases, batches, metrics, device,
-            **timing, progress=lambda label: bar.update(task, advance=1, description=label),
-        )  # fmt: skip
+    records = record_cases(cases, batches, metrics, device, **config["timing"])
     rows = report.rows_of(records)
     _, views, _, height, width = batches[0].images.shape
     subjects = sum(len(batch.images) for batch in batches)
@@ -168,14 +160,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
 def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
     """Measure how cost grows, on analytic scenes."""
     axes = from_config(scaling.Axes, "scaling", config["scaling"])
-    timing = config["timing"]
-    total = scaling.passes(len(cases), axes, timing["warmup"] + timing["repeats"])
-    with Progress() as bar:
-        task = bar.add_task("scaling", total=total)
-        rows, fits = scaling.study(
-            cases, axes, device, **timing,
-            progress=lambda label: bar.update(task, advance=1, description=label),
-        )  # fmt: skip
+    rows, fits = scaling.study(cases, axes, device, **config["timing"])
     base = ", ".join(f"{name} {value:g}" for name, value in axes.base.items())
     about = f"{_weights(config, cases)}; an ellipsoid, elsewhere {base}"
     random_weights = config["checkpoint"] is None

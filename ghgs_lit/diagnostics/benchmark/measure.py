@@ -18,11 +18,9 @@ from ghgs_lit.diagnostics.benchmark.stages import SecondsProbe, forward
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.prediction.export.ply import write_ply
+from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Prediction, Rendering
-
-#: Called after each forward pass with the name of what ran.
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -86,9 +84,7 @@ def order(turn: int, count: int) -> list[int]:
     return [(turn + number) % count for number in range(count)]
 
 
-def time_jobs(
-    jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device, progress: Progress
-) -> list[dict[str, Times]]:
+def time_jobs(jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device) -> list[dict[str, Times]]:
     """Time jobs in interleaved rounds.
 
     Args:
@@ -96,13 +92,12 @@ def time_jobs(
         warmup: rounds that do not count.
         repeats: rounds that count, at least 1.
         device: where the models are.
-        progress: called after each job.
 
     Returns:
         For each job the seconds of each stage, means over its batches.
     """
     seconds: list[dict[str, list[float]]] = [{} for _ in jobs]
-    for turn in range(-warmup, repeats):
+    for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(jobs)):
             job, probe = jobs[number], SecondsProbe(device)
             with threads(job.threads):
@@ -110,7 +105,6 @@ def time_jobs(
                     forward(job.case.model, job.case.renderer, batch, probe)
             for stage, value in probe.seconds().items() if turn >= 0 else ():
                 seconds[number].setdefault(stage, []).append(value / len(job.batches))
-            progress(job.case.label)
     return [{stage: Times.of(values) for stage, values in stages.items()} for stages in seconds]
 
 
@@ -162,7 +156,6 @@ def record_cases(
     warmup: int,
     repeats: int,
     count_flops: bool,
-    progress: Progress,
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times.
 
@@ -173,11 +166,10 @@ def record_cases(
         device: where the models are.
         warmup, repeats: as for :func:`time_jobs`.
         count_flops: whether FLOPs are counted, which takes one more forward pass.
-        progress: called after each forward pass but those for the FLOPs.
     """
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work(None, {}, {})) for case in cases]
-    for batch in batches:
+    for batch in track(batches, "errors"):
         for record, mine in zip(records, works, strict=True):
             work, *result = inspect(record.case, batch, device, count_flops)
             if record.case.is_yardstick:
@@ -187,8 +179,7 @@ def record_cases(
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
             record.metrics += _metrics(record.case, batch, *result, metrics, device)
-            progress(record.case.label)
-    times = time_jobs([Job(case, batches) for case in cases], warmup, repeats, device, progress)
+    times = time_jobs([Job(case, batches) for case in cases], warmup, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work, record.times = Work.of(mine), seconds
     return records

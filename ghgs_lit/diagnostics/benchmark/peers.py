@@ -5,13 +5,13 @@ from typing import Any
 
 import pandas as pd
 import torch
-from rich.progress import Progress
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.diagnostics.output import Tables, texts
 from ghgs_lit.evaluation.measure import Method, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.runs.journal import Journal
+from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row, summarize
 
 #: What rows with the same protocol agree in.
@@ -64,15 +64,12 @@ def measure_peers(
         for name in methods
     }
     journal.say_done(list(keys.values()), "measurements")
-    with Progress() as bar:
-        task, batch = bar.add_task("peers", total=len(keys)), None
-        for (count, subject, name), key in keys.items():
-            bar.update(task, description=f"{count} views, {subject}, {name}")
-            if key not in journal:
-                if batch is None or (batch.subjects, batch.images.shape[1]) != ((subject,), count):
-                    batch = data.evaluation_batch(subject, split, count, list(targets.values()))
-                journal.add(key, measure(methods[name], name, [batch], metrics, device))
-            bar.advance(task)
+    batch = None
+    for (count, subject, name), key in track(keys.items(), "views, subjects and methods"):
+        if key not in journal:
+            if batch is None or (batch.subjects, batch.images.shape[1]) != ((subject,), count):
+                batch = data.evaluation_batch(subject, split, count, list(targets.values()))
+            journal.add(key, measure(methods[name], name, [batch], metrics, device))
     return [row for key in keys.values() for row in journal[key]]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from ghgs_lit.diagnostics.benchmark.measure import Job, Progress, Record, inspect, time_jobs
+from ghgs_lit.diagnostics.benchmark.measure import Job, Record, inspect, time_jobs
 from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.report import stage_row, totals
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
@@ -68,7 +68,6 @@ def study(
     warmup: int,
     repeats: int,
     count_flops: bool,
-    progress: Progress,
 ) -> tuple[list[Row], list[dict[str, Any]]]:
     """Measure cases along all axes.
 
@@ -78,7 +77,6 @@ def study(
         device: where the models are.
         warmup, repeats: rounds of each axis, in which all its values and cases are interleaved.
         count_flops: whether FLOPs are counted.
-        progress: called after each forward pass but those for the FLOPs.
 
     Returns:
         Rows as of presets with ``axis`` and ``value``, and the exponents of :func:`fits_of`.
@@ -95,17 +93,11 @@ def study(
                 jobs.append(Job(case, [batch], count))
                 records.append(Record(case, work))
                 values.append(value)
-                progress(f"{axis} {value}")
-        timed = time_jobs(jobs, warmup, repeats, device, progress) if jobs else []
+        timed = time_jobs(jobs, warmup, repeats, device) if jobs else []
         for record, times, value in zip(records, timed, values, strict=True):
             record.times = times
             rows += [stage_row(record, stage, {"axis": axis, "value": value}) for stage in times]
     return rows, fits_of(rows)
-
-
-def passes(cases: int, axes: Axes, rounds: int) -> int:
-    """Number of times that :func:`study` calls ``progress``."""
-    return cases * (1 + rounds) * sum(len(getattr(axes, axis)) for axis in AXES)
 
 
 def fits_of(rows: Sequence[Row]) -> list[dict[str, Any]]:

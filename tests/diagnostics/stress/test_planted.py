@@ -11,7 +11,7 @@ import pytest
 
 from ghgs_lit.bounds.agreement import trusted_views
 from ghgs_lit.diagnostics.stress.measure import measure
-from ghgs_lit.diagnostics.stress.stages import STAGES
+from ghgs_lit.diagnostics.stress.stages import STAGES, heads
 from ghgs_lit.geometry import projection, rotations, sampling, vectors
 from ghgs_lit.geometry.padding import Padding
 from ghgs_lit.heads.activations import CONFIDENCES
@@ -128,6 +128,13 @@ def test_a_confidence_without_its_limit_is_reported(monkeypatch):
     """exp(100) is infinite in float32, and is not in float64."""
     monkeypatch.setitem(CONFIDENCES, "expp1", lambda c: 1 + c.exp())
     assert failures("depth activation", "saturated", "float32") > 0
+
+
+def test_a_norm_without_its_epsilon_is_reported(monkeypatch):
+    """Tokens of 0 have no direction."""
+    for head in heads._HEADS.values():
+        monkeypatch.setattr(head.norm, "eps", 0.0)
+    assert failures("dense head", "zero_features", "float32") > 0
 
 
 def test_tiles_from_back_to_front_are_reported(monkeypatch):
