@@ -1,7 +1,6 @@
 """How cost grows: with the subject's share of the frame, views, image size, batch and threads."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,35 +21,6 @@ AXES = ("share", "views", "size", "batch", "threads")
 _IDEAL_THREADS = -1.0
 
 
-@dataclass(frozen=True)
-class Axes:
-    """Values along each axis; elsewhere everything is as in ``base``.
-
-    Args:
-        share: parts of the frame that the subject covers.
-        views: numbers of input views.
-        size: sides of the photographs in pixels.
-        batch: numbers of elements.
-        threads: of PyTorch.
-        base: one value of each, but of the threads.
-    """
-
-    share: Sequence[float]
-    views: Sequence[int]
-    size: Sequence[int]
-    batch: Sequence[int]
-    threads: Sequence[int]
-    base: Mapping[str, Any]
-
-    def __post_init__(self) -> None:
-        for name in AXES:
-            values = getattr(self, name)
-            is_list = isinstance(values, Sequence) and not isinstance(values, str)
-            require(is_list and all(v > 0 for v in values), f"scaling.{name}", "a list above 0", values)
-        require(set(self.base) == set(AXES[:-1]), "scaling.base", ", ".join(AXES[:-1]), sorted(self.base))
-        require(any(getattr(self, name) for name in AXES), "scaling", "an axis with values", "none")
-
-
 def exponent(values: Sequence[float], costs: Sequence[float | None]) -> float | None:
     """The exponent p of ``cost = c value^p``, by least squares of the logarithms.
 
@@ -63,7 +33,7 @@ def exponent(values: Sequence[float], costs: Sequence[float | None]) -> float | 
 
 def study(
     cases: Sequence[Case],
-    axes: Axes,
+    axes: Mapping[str, Any],
     device: torch.device,
     warmup: int,
     repeats: int,
@@ -73,7 +43,8 @@ def study(
 
     Args:
         cases: what is measured.
-        axes: where.
+        axes: by the names of :data:`AXES` the values along each; ``base`` has one of each but the threads,
+            for the other axes.
         device: where the models are.
         warmup, repeats: rounds of each axis, in which all its values and cases are interleaved.
         count_flops: whether FLOPs are counted.
@@ -81,11 +52,12 @@ def study(
     Returns:
         Rows as of presets with ``axis`` and ``value``, and the exponents of :func:`fits_of`.
     """
+    require(any(axes[axis] for axis in AXES), "scaling", "an axis with values", "none")
     rows: list[Row] = []
     for axis in AXES:
         jobs, records, values = [], [], []
-        for value in getattr(axes, axis):
-            setting = {**axes.base, axis: value}
+        for value in axes[axis]:
+            setting = {**axes["base"], axis: value}
             count = setting.pop("threads", None)
             batch = ellipsoid_batch(**setting).to(device)
             for case in cases:

@@ -17,6 +17,7 @@ from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
 from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import RENDER, TOTAL, watched
+from ghgs_lit.diagnostics.benchmark.weights import filled_model
 from ghgs_lit.diagnostics.doctor.shapes import Shapes
 from ghgs_lit.encoder import cpu as encoder
 from ghgs_lit.geometry import chamfer
@@ -117,7 +118,8 @@ def estimate(
         training: whether a loss and its gradients are computed, too.
     """
     shapes, flops = Shapes(), FlopsProbe()
-    model = _model(config, shapes).train(training)
+    model = filled_model(config, lambda _, parameter: shapes.of(parameter.shape))
+    model.train(training).check_inputs = False
     batch, needs = _batch(scene, shapes), _Needs(shapes, flops)
     half = precision != "float32"
     # Tensors without values are on the CPU, whatever the device.
@@ -171,20 +173,6 @@ def _kernels(device: str) -> Iterator[None]:
         yield
 
 
-def _model(config: Mapping[str, Any], shapes: Shapes) -> GHGS:
-    """A model whose weights have no values."""
-    with torch.device("meta"):
-        model = GHGS.from_config(config)
-    model.check_inputs = False
-    for module in model.modules():
-        for name, p in module._parameters.items():
-            if p is not None:
-                with shapes.world:
-                    empty = torch.empty(p.shape, dtype=p.dtype)
-                module._parameters[name] = nn.Parameter(empty, requires_grad=p.requires_grad)
-    return model
-
-
 def _batch(scene: Scene, shapes: Shapes) -> Batch:
     """A batch whose masks and cameras have values, and nothing else."""
     batch = ellipsoid_batch(scene.share, scene.views, scene.size, scene.batch)
@@ -192,8 +180,8 @@ def _batch(scene: Scene, shapes: Shapes) -> Batch:
     return dataclasses.replace(
         batch,
         images=empty(batch.images),
-        depths=empty(torch.zeros(batch.masks.shape)),
-        body_vertices=[empty(torch.zeros(_VERTICES, 3)) for _ in range(scene.batch)],
+        depths=shapes.of(batch.masks.shape),
+        body_vertices=[shapes.of((_VERTICES, 3)) for _ in range(scene.batch)],
         targets=Targets(
             empty(batch.images[:, target]), batch.masks[:, target], batch.targets.cameras[:, target]
         ),

@@ -5,6 +5,7 @@ broken. So such a pass does all operations, with their shapes, in no memory; wha
 """
 
 import weakref
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -38,6 +39,11 @@ class Shapes(TorchDispatchMode):
     def empty(self, tensor: Tensor) -> Tensor:
         """A tensor of the same shape, dtype and device without values."""
         return self.world.from_tensor(tensor)
+
+    def of(self, shape: Sequence[int]) -> Tensor:
+        """A tensor of float32 without values."""
+        with self.world:
+            return torch.empty(shape)
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         kwargs = kwargs or {}
