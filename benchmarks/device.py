@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -23,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
+from ghgs_lit.kernels.watching import Inputs, Watcher
 from ghgs_lit.losses import Losses
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import Optimization
@@ -32,18 +34,18 @@ from tests.helpers.pretend_device import DEVICE, Log, pretend_device
 Counts = dict[str, tuple[int, int, int]]
 
 
-class CountingProbe:
-    """Calls and waits of each stage (a probe of ``ghgs_lit.diagnostics.benchmark.stages``)."""
+class CountingProbe(Watcher):
+    """Calls and waits of each stage."""
 
     def __init__(self, log: Log):
         self.log = log
         self.counts: Counts = {}
         self._open: list[tuple[int, int, int]] = []
 
-    def begin(self, stage: str) -> None:
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
         self._open.append(self._so_far())
 
-    def end(self, stage: str) -> None:
+    def end(self, stage: str, result: Any = None) -> None:
         numbers = zip(self.counts.get(stage, (0, 0, 0)), self._so_far(), self._open.pop(), strict=True)
         self.counts[stage] = tuple(old + now - before for old, now, before in numbers)
 

@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 
 import torch
-from rich.progress import Progress
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from literal import write_out
@@ -68,13 +67,8 @@ def main() -> None:
     device = torch.device("cpu")
     batch = person(resolve(cfg), options.share)
     cases = variants(cfg, options.presets.split(","), device)
-    with Progress() as bar:
-        task = bar.add_task("full size", total=len(cases) * options.repeats)
-        works = [inspect(case, batch, device, count_flops=True)[0] for case in cases]
-        jobs = [Job(case, [batch]) for case in cases]
-        times = time_jobs(
-            jobs, 0, options.repeats, device, lambda name: bar.update(task, advance=1, description=name)
-        )
+    works = [inspect(case, batch, device, count_flops=True)[0] for case in cases]
+    times = time_jobs([Job(case, [batch]) for case in cases], 0, options.repeats, device)
     report(cases, works, times, batch, options)
 
 

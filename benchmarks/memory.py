@@ -19,7 +19,7 @@ from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL
 from ghgs_lit.diagnostics.benchmark.weights import random_model
-from ghgs_lit.diagnostics.doctor.estimate import Scene, estimate_prediction, estimate_training
+from ghgs_lit.diagnostics.doctor.estimate import Scene, estimate
 from ghgs_lit.model import GHGS
 
 #: Blocks above this size go back to the system when they are freed.
@@ -70,9 +70,9 @@ def compare(overrides: list[str], size: int, views: int, batch: int, training: b
     """Bytes by estimate and by measurement, weights and moments included."""
     config = resolve(compose("train", overrides))
     scene = Scene(0.15, views, (size, size), batch)
-    estimate = (estimate_training if training else estimate_prediction)(config, scene, "cpu", "float32")
+    needed = estimate(config, scene, "cpu", "float32", training)
     measured = (measured_training if training else measured_prediction)(config, scene)
-    return {"estimated": estimate.bytes, "measured": estimate.held + measured, "held": estimate.held}
+    return {"estimated": needed.bytes, "measured": needed.held + measured, "held": needed.held}
 
 
 def main() -> None:

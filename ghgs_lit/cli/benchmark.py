@@ -10,21 +10,17 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 from omegaconf import DictConfig
-from rich.progress import Progress
 
 from ghgs_lit.cli.benchmark_peers import peers
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
-from ghgs_lit.config.settings import from_config
 from ghgs_lit.diagnostics.benchmark import report, scaling
-from ghgs_lit.diagnostics.benchmark.board import write_board
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
-from ghgs_lit.diagnostics.benchmark.page import to_page
 from ghgs_lit.diagnostics.benchmark.peers import tables_of as tables_of_peers
-from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling, save_png
+from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling
 from ghgs_lit.diagnostics.benchmark.presets import (
     KNOBS,
     YARDSTICK,
@@ -34,11 +30,10 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     presets_of,
     readers_of_skip,
 )
+from ghgs_lit.diagnostics.output import print_tables, save_figure
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.evaluation.measure import decisions_of
-from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.provenance import provenance
-from ghgs_lit.training.loggers import hyperparameters
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.reading import SHIPPED
 
@@ -80,16 +75,9 @@ def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
         given: overrides that were asked for.
 
     Raises:
-        InputError: a value out of range, or an option that has no effect beside the others.
+        InputError: an option that has no effect beside the others.
     """
-    timing = config["timing"]
-    for key, least in (("warmup", 0), ("repeats", 1)):
-        value = timing[key]
-        require(isinstance(value, int) and value >= least, f"timing.{key}", f"at least {least}", value)
-    names = config["presets"]
-    require(isinstance(names, list) and bool(names), "presets", "a list with a name", names)
-    count = config["threads"]
-    require(count is None or (isinstance(count, int) and count >= 1), "threads", "at least 1, or null", count)
+    require(bool(config["presets"]), "presets", "a list with a name", config["presets"])
     for key in ("vs", "knobs") if config["task"] == "peers" else ():
         require(config[key] is None, key, "null with task=peers", config[key])
     if config["checkpoint"] is None:
@@ -142,14 +130,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     if batches[0].targets is None:
         raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")
     metrics = build(config["metrics"], "metrics").to(device)
-    timing = config["timing"]
-    total = len(cases) * (len(batches) + timing["warmup"] + timing["repeats"])
-    with Progress() as bar:
-        task = bar.add_task("presets", total=total)
-        records = record_cases(
-            cases, batches, metrics, device,
-            **timing, progress=lambda label: bar.update(task, advance=1, description=label),
-        )  # fmt: skip
+    records = record_cases(cases, batches, metrics, device, **config["timing"])
     rows = report.rows_of(records)
     _, views, _, height, width = batches[0].images.shape
     subjects = sum(len(batch.images) for batch in batches)
@@ -170,16 +151,8 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
 
 def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
     """Measure how cost grows, on analytic scenes."""
-    axes = from_config(scaling.Axes, "scaling", config["scaling"])
-    timing = config["timing"]
-    total = scaling.passes(len(cases), axes, timing["warmup"] + timing["repeats"])
-    with Progress() as bar:
-        task = bar.add_task("scaling", total=total)
-        rows, fits = scaling.study(
-            cases, axes, device, **timing,
-            progress=lambda label: bar.update(task, advance=1, description=label),
-        )  # fmt: skip
-    base = ", ".join(f"{name} {value:g}" for name, value in axes.base.items())
+    rows, fits = scaling.study(cases, config["scaling"], device, **config["timing"])
+    base = ", ".join(f"{name} {value:g}" for name, value in config["scaling"]["base"].items())
     about = f"{_weights(config, cases)}; an ellipsoid, elsewhere {base}"
     random_weights = config["checkpoint"] is None
     return {"about": about, "random_weights": random_weights, "rows": rows, "fits": fits, "broken": []}
@@ -195,22 +168,16 @@ def _weights(config: dict[str, Any], cases: list[Case]) -> str:
 
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
     """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
-    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
     if content["task"] == "peers":
         tables = tables_of_peers(rows)
-        report.print_tables(tables)
-        return report.write_numbers(directory, {**content, "provenance": source}, tables)
-    if content["task"] == "presets":
-        tables, drawing = report.tables_of(rows), draw_presets(rows, *words)
+    elif content["task"] == "presets":
+        tables = report.tables_of(rows)
+        save_figure(draw_presets(rows, *words), directory / "benchmark.png")
     else:
-        fits = content["fits"]
-        tables, drawing = scaling.tables_of(rows, fits), draw_scaling(rows, fits, *words)
-    report.print_tables(tables)
+        tables = scaling.tables_of(rows, content["fits"])
+        save_figure(draw_scaling(rows, content["fits"], *words), directory / "benchmark.png")
+    print_tables(tables)
     print(*content.get("decisions", []), sep="\n", flush=True)
-    png = drawing.png()
-    save_png(png, directory / "benchmark.png")
-    notes = report.notes_of(content)
-    write_text_atomically(directory / "benchmark.html", to_page(drawing, tables, notes))
-    write_board(directory, rows, png, hyperparameters(config, choices(), overrides()))
+    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
     return report.write_numbers(directory, {**content, "provenance": source}, tables)

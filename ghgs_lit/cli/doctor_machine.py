@@ -1,6 +1,5 @@
 """``ghgs doctor task=machine``: what there is, what is missing, and what the configuration needs."""
 
-import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -16,23 +15,12 @@ from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.config import resolve
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.diagnostics.benchmark.stages import RENDER, TOTAL
-from ghgs_lit.diagnostics.doctor.estimate import (
-    BACKWARD,
-    LOSS,
-    Pass,
-    Scene,
-    estimate_prediction,
-    estimate_training,
-)
+from ghgs_lit.diagnostics.doctor.estimate import BACKWARD, LOSS, Pass, Scene, estimate, parameters
 from ghgs_lit.diagnostics.doctor.machine import machine_lines, memory_of_host, missing_extras
-from ghgs_lit.diagnostics.doctor.needs import needs
 from ghgs_lit.model import STAGES
 
 #: Of the products, by ``trainer.precision``.
 _PRECISIONS = {"bf16-mixed": "bfloat16", "16-mixed": "float16"}
-
-#: What a key that makes memory smaller changes in a configuration.
-Change = Callable[[dict], None]
 
 
 def run(cfg: DictConfig) -> None:
@@ -66,7 +54,7 @@ def run(cfg: DictConfig) -> None:
 
 def predicted(config: Mapping[str, Any], kind: str) -> Pass:
     """A prediction of one subject in float32."""
-    return estimate_prediction(config, _scene(config), kind, "float32")
+    return estimate(config, _scene(config), kind, "float32")
 
 
 def trained(config: Mapping[str, Any], kind: str) -> Pass:
@@ -78,7 +66,7 @@ def trained(config: Mapping[str, Any], kind: str) -> Pass:
         targets=config["targets"]["per_step"],
     )
     precision = _PRECISIONS.get(str(config["trainer"]["precision"]), "float32")
-    return estimate_training(config, scene, kind, precision)
+    return estimate(config, scene, kind, precision, training=True)
 
 
 def _scene(config: Mapping[str, Any]) -> Scene:
@@ -92,27 +80,18 @@ def _free(device: torch.device) -> int:
 
 def _table(config: Mapping[str, Any], prediction: Pass, step: Pass) -> Table:
     """Parameters, products and memory by stage."""
-    table = Table(box=None)
-    heads = (
-        "stage",
-        "parameters",
-        "trained",
-        "prediction: GFLOP",
-        "memory",
-        "training step: GFLOP",
-        "memory",
-    )
-    for name in heads:
-        table.add_column(name, justify="left" if name == "stage" else "right")
-    sizes = {n.stage: (f"{n.parameters:,}", f"{n.trained:,}") for n in needs(config)}
+    table = Table("stage", box=None)
+    for name in ("parameters", "trained", "prediction: GFLOP", "memory", "training step: GFLOP", "memory"):
+        table.add_column(name, justify="right")
+    sizes = parameters(config)
     sizes[TOTAL] = sizes["model"]
     for name in (*STAGES, RENDER, LOSS, BACKWARD, TOTAL):
-        cells = []
-        for found in (prediction, step):
-            known = name in found.peaks
-            gigaflops = f"{found.flops[name] / 1e9:,.1f}" if known else ""
-            cells += [gigaflops, decimal(found.held + found.peaks[name]) if known else ""]
-        table.add_row(name, *sizes.get(name, ("", "")), *cells)
+        cells = [f"{number:,}" for number in sizes[name]] if name in sizes else ["", ""]
+        for need in (prediction, step):
+            known = name in need.peaks
+            cells.append(f"{need.flops[name] / 1e9:,.1f}" if known else "")
+            cells.append(decimal(need.held + need.peaks[name]) if known else "")
+        table.add_row(name, *cells)
     return table
 
 
@@ -130,38 +109,42 @@ def advice(config: Mapping[str, Any], kind: str, prediction: Pass, step: Pass, f
 
 
 def _smaller(
-    config: Mapping[str, Any], kind: str, estimate: Callable[[Mapping, str], Pass], free: int
+    config: Mapping[str, Any], kind: str, again: Callable[[Mapping, str], Pass], free: int
 ) -> list[str]:
     """One line for each key that lowers the memory, and one for all of them together."""
-    lines, together = [], copy.deepcopy(dict(config))
-    for key, change in _changes(config, estimate is trained).items():
-        alone = copy.deepcopy(dict(config))
-        change(alone)
-        change(together)
-        lines.append(_line(key, estimate(alone, kind), free))
-    return [*lines, _line("all of them", estimate(together, kind), free)] if lines else lines
+    savings = _savings(config, again is trained)
+    if savings:
+        savings["all of them"] = {k: v for values in savings.values() for k, v in values.items()}
+    lines = []
+    for key, values in savings.items():
+        need = again(_changed(config, values), kind).bytes
+        lines.append(f"  {key}: {decimal(need)}, {'fits' if need < free else 'does not fit'}")
+    return lines
 
 
-def _line(key: str, found: Pass, free: int) -> str:
-    return f"  {key}: {decimal(found.bytes)}, {'fits' if found.bytes < free else 'does not fit'}"
+def _changed(config: Mapping[str, Any], values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The configuration with other values of ``<node>.<name>``."""
+    for key, value in values.items():
+        node, name = key.split(".")
+        config = {**config, node: {**config[node], name: value}}
+    return config
 
 
-def _changes(config: Mapping[str, Any], training: bool) -> dict[str, Change]:
-    """Keys that the configuration does not use yet."""
-    encoder = config["encoder"]
-    found: dict[str, Change] = {}
-    if config["skip"]["tokens"] == "all" and not config["skip"].get("choices"):
-        found["skip=fast"] = lambda c: c["skip"].update(tokens="subject")
-    if not training:
-        return found
-    if not encoder["checkpointing"] and encoder["trainable"] != "none":
-        found["encoder.checkpointing=true"] = lambda c: c["encoder"].update(checkpointing=True)
-    if str(config["trainer"]["precision"]) not in _PRECISIONS:
-        found["trainer.precision=bf16-mixed"] = lambda c: c["trainer"].update(precision="bf16-mixed")
-    size = config["data"]["batch_size"]
-    if size > 1:
-        key = f"data.batch_size=1 trainer.accumulate_grad_batches={size}"
-        found[key] = lambda c: c["data"].update(batch_size=1)
-    if encoder["trainable"] != "none":
-        found["encoder.trainable=none"] = lambda c: c["encoder"].update(trainable="none")
-    return found
+def _savings(config: Mapping[str, Any], training: bool) -> dict[str, dict[str, Any]]:
+    """What lowers the memory and is not used yet, as it is said on the command line, and what it sets."""
+    encoder, size = config["encoder"], config["data"]["batch_size"]
+    learns = training and encoder["trainable"] != "none"
+    precise = training and str(config["trainer"]["precision"]) not in _PRECISIONS
+    whole = config["skip"]["tokens"] == "all" and not config["skip"].get("choices")
+    savings = {
+        "skip=fast": (whole, {"skip.tokens": "subject"}),
+        "encoder.checkpointing=true": (
+            learns and not encoder["checkpointing"], {"encoder.checkpointing": True},
+        ),
+        "trainer.precision=bf16-mixed": (precise, {"trainer.precision": "bf16-mixed"}),
+        f"data.batch_size=1 trainer.accumulate_grad_batches={size}": (
+            training and size > 1, {"data.batch_size": 1},
+        ),
+        "encoder.trainable=none": (learns, {"encoder.trainable": "none"}),
+    }  # fmt: skip
+    return {key: values for key, (helps, values) in savings.items() if helps}

@@ -2,14 +2,15 @@
 
 import sys
 
+import pandas as pd
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.table import Table
 
 from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.diagnostics.output import pivoted, print_tables
 from ghgs_lit.diagnostics.stress import report
 from ghgs_lit.diagnostics.stress.run import processes, run_tasks, tasks_of
+from ghgs_lit.errors import require
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.training.replay import replay
 
@@ -21,17 +22,17 @@ def run(cfg: DictConfig) -> None:
     if config["dump"] is not None:
         return _replay(config["dump"])
     tasks = tasks_of(config["stages"], config["families"], config["dtypes"], config["quick"])
+    require(bool(tasks), "families", "a family that one of the stages has", config["families"])
     rows = run_tasks(tasks, directory / "cells.jsonl", processes(config["workers"]))
     _print(rows)
     source = provenance(config, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))
     failed = [row for row in rows if row["failures"]]
     for row in failed:
-        found = "no bound" if row["error"] is None else f"{row['error']:.3g}"
-        place = f"{row['stage']}, {row['family']}, {row['dtype']}"
+        cell = f"{row['stage']}, {row['family']}, {row['dtype']}"
         print(
-            f"ghgs stress: {place}: expected an error of at most {row['budget']:g}; found {found} in"
-            f" {row['failures']} of {row['cases']} cases ({row['worst']})",
+            f"ghgs stress: {cell}: expected an error of at most {row['budget']:g}; found"
+            f" {report.bounded(row['error'])} in {row['failures']} of {row['cases']} cases ({row['worst']})",
             file=sys.stderr,
         )
     if failed:
@@ -49,19 +50,10 @@ def _replay(path: str) -> None:
 
 def _print(rows: list[report.Row]) -> None:
     """The worst error of each stage, by dtype."""
-    found = report.summary(rows)
-    worst = {(row["stage"], row["dtype"]): row for row in found["worst"]}
-    dtypes = list(dict.fromkeys(row["dtype"] for row in rows))
-    table = Table(
-        "stage", "cases", "budget", *dtypes, title=f"{found['cases']} cases, {found['failures']} failures"
-    )
-    for stage in dict.fromkeys(row["stage"] for row in rows):
-        own = [row for row in rows if row["stage"] == stage]
-        cells = []
-        for dtype in dtypes:
-            row = worst.get((stage, dtype))
-            cells.append(
-                "-" if row is None else "no bound" if row["error"] is None else f"{row['error']:.2g}"
-            )
-        table.add_row(stage, str(sum(row["cases"] for row in own)), f"{own[0]['budget']:g}", *cells)
-    Console(width=max(Console().width, 100)).print(table)
+    worst = pd.DataFrame([{**row, "error": report.bounded(row["error"])} for row in report.worst_of(rows)])
+    table = pivoted(worst, "stage", "dtype", "error", "{}")
+    stages = pd.DataFrame(rows).groupby("stage", sort=False)
+    table.insert(1, "cases", list(stages.cases.sum()))
+    table.insert(2, "budget", [f"{budget:g}" for budget in stages.budget.first()])
+    cases, failures = (sum(row[name] for row in rows) for name in ("cases", "failures"))
+    print_tables({f"{cases} cases, {failures} failures": table})

@@ -2,6 +2,7 @@
 
 import math
 
+import pandas as pd
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
@@ -38,14 +39,11 @@ def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], 
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
         return torch.arange(n), torch.arange(n)
-    width = 1 + max((int(g.pixel.max()) for g in (found, expected) if len(g)), default=0)
-    keys, order = (expected.image * width + expected.pixel).sort(stable=True)
-    wanted = found.image * width + found.pixel
-    place = torch.searchsorted(keys, wanted).clamp(max=max(len(keys) - 1, 0))
-    known: Bool[Tensor, " n"] = (
-        keys[place] == wanted if len(keys) else torch.zeros_like(wanted, dtype=torch.bool)
-    )
-    return known.nonzero()[:, 0], order[place[known]]
+    frames = [pd.DataFrame({"image": g.image.cpu(), "pixel": g.pixel.cpu()}) for g in (found, expected)]
+    frames = [frame.rename_axis(name).reset_index() for frame, name in zip(frames, ("a", "b"), strict=True)]
+    both = frames[0].merge(frames[1], on=["image", "pixel"])
+    device = found.means.device
+    return tuple(torch.tensor(both[name].to_numpy().copy(), device=device) for name in ("a", "b"))
 
 
 def differences(

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from ghgs_lit.diagnostics.benchmark.error import differences
@@ -17,11 +18,9 @@ from ghgs_lit.diagnostics.benchmark.stages import SecondsProbe, forward
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.prediction.export.ply import write_ply
+from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Prediction, Rendering
-
-#: Called after each forward pass with the name of what ran.
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,8 @@ class Times:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> "Times":
-        if len(seconds) == 1:
-            return cls(seconds[0], seconds[0], seconds[0])
-        low, _, high = statistics.quantiles(seconds, n=4, method="inclusive")
-        return cls(statistics.median(seconds), low, high)
+        low, median, high = np.quantile(seconds, (0.25, 0.5, 0.75)).tolist()
+        return cls(median, low, high)
 
 
 @dataclass(frozen=True)
@@ -61,13 +58,13 @@ class Work:
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
         """Of several batches: the mean, and the largest peak."""
+        flops = None if works[0].flops is None else _merged([work.flops for work in works], statistics.fmean)
+        peaks = _merged([work.peaks for work in works], max)
+        return cls(flops, peaks, _merged([work.counts for work in works], statistics.fmean))
 
-        def mean(dicts: Sequence[dict[str, float]]) -> dict[str, float]:
-            return {name: statistics.fmean(found[name] for found in dicts) for name in dicts[0]}
 
-        flops = None if works[0].flops is None else mean([work.flops for work in works])
-        peaks = {name: max(work.peaks[name] for work in works) for name in works[0].peaks}
-        return cls(flops, peaks, mean([work.counts for work in works]))
+def _merged(numbers: Sequence[dict[str, float]], merge: Callable[..., float]) -> dict[str, float]:
+    return {name: merge(one[name] for one in numbers) for name in numbers[0]}
 
 
 @dataclass
@@ -75,8 +72,8 @@ class Record:
     """All that is known about a case; ``differences`` are the largest of all batches."""
 
     case: Case
-    times: dict[str, Times]
     work: Work
+    times: dict[str, Times] = field(default_factory=dict)
     differences: dict[str, float] = field(default_factory=dict)
     metrics: list[Row] = field(default_factory=list)
 
@@ -87,9 +84,7 @@ def order(turn: int, count: int) -> list[int]:
     return [(turn + number) % count for number in range(count)]
 
 
-def time_jobs(
-    jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device, progress: Progress
-) -> list[dict[str, Times]]:
+def time_jobs(jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device) -> list[dict[str, Times]]:
     """Time jobs in interleaved rounds.
 
     Args:
@@ -97,27 +92,20 @@ def time_jobs(
         warmup: rounds that do not count.
         repeats: rounds that count, at least 1.
         device: where the models are.
-        progress: called after each job.
 
     Returns:
         For each job the seconds of each stage, means over its batches.
     """
     seconds: list[dict[str, list[float]]] = [{} for _ in jobs]
-    for turn in range(-warmup, repeats):
+    for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(jobs)):
-            job = jobs[number]
-            found: dict[str, float] = {}
+            job, probe = jobs[number], SecondsProbe(device)
             with threads(job.threads):
                 for batch in job.batches:
-                    probe = SecondsProbe(device)
                     forward(job.case.model, job.case.renderer, batch, probe)
-                    for stage, value in probe.seconds().items():
-                        found[stage] = found.get(stage, 0.0) + value / len(job.batches)
-            if turn >= 0:
-                for stage, value in found.items():
-                    seconds[number].setdefault(stage, []).append(value)
-            progress(job.case.label)
-    return [{stage: Times.of(values) for stage, values in own.items()} for own in seconds]
+            for stage, value in probe.seconds().items() if turn >= 0 else ():
+                seconds[number].setdefault(stage, []).append(value / len(job.batches))
+    return [{stage: Times.of(values) for stage, values in stages.items()} for stages in seconds]
 
 
 @contextmanager
@@ -168,7 +156,6 @@ def record_cases(
     warmup: int,
     repeats: int,
     count_flops: bool,
-    progress: Progress,
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times.
 
@@ -179,26 +166,22 @@ def record_cases(
         device: where the models are.
         warmup, repeats: as for :func:`time_jobs`.
         count_flops: whether FLOPs are counted, which takes one more forward pass.
-        progress: called after each forward pass but those for the FLOPs.
     """
-    records = [Record(case, {}, Work(None, {}, {})) for case in cases]
     works: list[list[Work]] = [[] for _ in cases]
-    for batch in batches:
-        for record, own in zip(records, works, strict=True):
-            work, *found = inspect(record.case, batch, device, count_flops)
+    records = [Record(case, Work(None, {}, {})) for case in cases]
+    for batch in track(batches, "errors"):
+        for record, mine in zip(records, works, strict=True):
+            work, *result = inspect(record.case, batch, device, count_flops)
             if record.case.is_yardstick:
-                yardstick = found
-            own.append(work)
-            for name, value in differences(found, yardstick, batch.masks).items():
+                yardstick = result
+            mine.append(work)
+            for name, value in differences(result, yardstick, batch.masks).items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
-            record.metrics += _metrics(record.case, batch, *found, metrics, device)
-            progress(record.case.label)
-    for record, own in zip(records, works, strict=True):
-        record.work = Work.of(own)
-    jobs = [Job(case, batches) for case in cases]
-    for record, times in zip(records, time_jobs(jobs, warmup, repeats, device, progress), strict=True):
-        record.times = times
+            record.metrics += _metrics(record.case, batch, *result, metrics, device)
+    times = time_jobs([Job(case, batches) for case in cases], warmup, repeats, device)
+    for record, mine, seconds in zip(records, works, times, strict=True):
+        record.work, record.times = Work.of(mine), seconds
     return records
 
 

@@ -3,8 +3,11 @@
 import ctypes
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
+
+from ghgs_lit.kernels.watching import Inputs, Watcher
 
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -27,8 +30,8 @@ def return_free_memory() -> None:
         trim(0)
 
 
-class PeakProbe:
-    """A probe (:mod:`ghgs_lit.diagnostics.benchmark.stages`) that finds the peak memory of each stage.
+class PeakProbe(Watcher):
+    """The peak memory of each stage.
 
     ``peaks`` are bytes in addition to what was held when the first stage began: weights and photographs do
     not count. Stages may lie inside one another. On systems without Linux's counters there are no peaks.
@@ -40,40 +43,46 @@ class PeakProbe:
         self._open: list[str] = []
         self._base = 0
 
-    def begin(self, stage: str) -> None:
-        if not self._available:
-            return
-        if self._open:
-            self._note()
-        else:
-            self._base = self._held()
-        self._reset()
-        self._open.append(stage)
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        if self.is_available:
+            if self._open:
+                self._note()
+            else:
+                self._base = self.held()
+            self.reset()
+            self._open.append(stage)
 
-    def end(self, stage: str) -> None:
-        if self._available:
+    def end(self, stage: str, result: Any = None) -> None:
+        if self.is_available:
             self._note()
             self._open.pop()
-            self._reset()
-
-    @property
-    def _available(self) -> bool:
-        return self.device.type == "cuda" or os.access(_CLEAR, os.W_OK)
+            self.reset()
 
     def _note(self) -> None:
         """The peak since the last reset counts for all stages that are open."""
-        is_cuda = self.device.type == "cuda"
-        peak = torch.cuda.max_memory_allocated(self.device) if is_cuda else memory_bytes("VmHWM")
+        peak = self.peak() - self._base
         for stage in self._open:
-            self.peaks[stage] = max(self.peaks.get(stage, 0), peak - self._base)
+            self.peaks[stage] = max(self.peaks.get(stage, 0), peak)
 
-    def _held(self) -> int:
+    @property
+    def is_available(self) -> bool:
+        """Whether the system has counters whose peak can be reset."""
+        return self.device.type == "cuda" or os.access(_CLEAR, os.W_OK)
+
+    def held(self) -> int:
+        """Bytes now."""
         if self.device.type == "cuda":
             return torch.cuda.memory_allocated(self.device)
         return_free_memory()
         return memory_bytes("VmRSS")
 
-    def _reset(self) -> None:
+    def peak(self) -> int:
+        """Most bytes since the last :meth:`reset`."""
+        is_cuda = self.device.type == "cuda"
+        return torch.cuda.max_memory_allocated(self.device) if is_cuda else memory_bytes("VmHWM")
+
+    def reset(self) -> None:
+        """Forget the peak."""
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self.device)
         else:

@@ -1,21 +1,32 @@
 """A model beside what a user would pick instead: the same people and targets, error and seconds a subject."""
 
-import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import pandas as pd
 import torch
-from rich.progress import Progress
 
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.diagnostics.benchmark.report import Table
+from ghgs_lit.diagnostics.output import Tables, texts
 from ghgs_lit.evaluation.measure import Method, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.runs.journal import Journal
-from ghgs_lit.runs.results import Row, by_protocol, summarize
+from ghgs_lit.runs.progress import track
+from ghgs_lit.runs.results import Row, summarize
 
-#: Errors of the table, with their decimals.
-SHOWN = {"psnr": 2, "psnr_box": 2, "ssim": 4, "flip": 4, "depth_error_mm": 1}
+#: What rows with the same protocol agree in.
+_PROTOCOL = ["method", "views", "targets"]
+#: Headings of a table, with columns and formats.
+_COLUMNS = {
+    "views": ("views", "{}"),
+    "method": ("method", "{}"),
+    "psnr": ("psnr", "{:.2f}"),
+    "psnr_box": ("psnr_box", "{:.2f}"),
+    "ssim": ("ssim", "{:.4f}"),
+    "flip": ("flip", "{:.4f}"),
+    "depth_error_mm": ("depth_error_mm", "{:.1f}"),
+    "s a subject": ("seconds", "{:.2f}"),
+}
 
 
 def measure_peers(
@@ -53,15 +64,12 @@ def measure_peers(
         for name in methods
     }
     journal.say_done(list(keys.values()), "measurements")
-    with Progress() as bar:
-        task, batch = bar.add_task("peers", total=len(keys)), None
-        for (count, subject, name), key in keys.items():
-            bar.update(task, description=f"{count} views, {subject}, {name}")
-            if key not in journal:
-                if batch is None or (batch.subjects, batch.images.shape[1]) != ((subject,), count):
-                    batch = data.evaluation_batch(subject, split, count, list(targets.values()))
-                journal.add(key, measure(methods[name], name, [batch], metrics, device))
-            bar.advance(task)
+    batch = None
+    for (count, subject, name), key in track(keys.items(), "views, subjects and methods"):
+        if key not in journal:
+            if batch is None or (batch.subjects, batch.images.shape[1]) != ((subject,), count):
+                batch = data.evaluation_batch(subject, split, count, list(targets.values()))
+            journal.add(key, measure(methods[name], name, [batch], metrics, device))
     return [row for key in keys.values() for row in journal[key]]
 
 
@@ -70,29 +78,14 @@ def peer_rows(rows: Sequence[Row]) -> list[Row]:
 
     The first subject of a run also waits for kernels to be loaded.
     """
-    found = by_protocol(rows)
-    result = []
-    for mean in summarize(rows):
-        own = found[mean["method"], mean["views"], mean["targets"]].values()
-        result.append({**mean, "seconds": statistics.median(subject[0]["seconds"] for subject in own)})
-    return result
+    subjects = pd.DataFrame(rows).groupby([*_PROTOCOL, "subject"]).seconds.first()
+    seconds = subjects.groupby(_PROTOCOL).median()
+    return [
+        {**mean, "seconds": float(seconds[*(mean[key] for key in _PROTOCOL)])} for mean in summarize(rows)
+    ]
 
 
-def tables_of(rows: Sequence[Row]) -> list[Table]:
+def tables_of(rows: Sequence[Row]) -> Tables:
     """A table for each protocol: number of views and method with errors and seconds a subject."""
-    shown = {name: digits for name, digits in SHOWN.items() if any(name in row for row in rows)}
-    header = ("views", "method", *shown, "s a subject")
-    tables = []
-    for protocol in dict.fromkeys(row["targets"] for row in rows):
-        lines = tuple(
-            (
-                str(row["views"]),
-                row["method"],
-                *("-" if row.get(n) is None else f"{row[n]:.{digits}f}" for n, digits in shown.items()),
-                f"{row['seconds']:.2f}",
-            )
-            for row in rows
-            if row["targets"] == protocol
-        )
-        tables.append(Table(f"Targets: {protocol}", header, lines))
-    return tables
+    groups = pd.DataFrame(rows).groupby("targets", sort=False)
+    return {f"Targets: {protocol}": texts(group, _COLUMNS) for protocol, group in groups}

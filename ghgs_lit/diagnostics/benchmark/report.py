@@ -1,33 +1,43 @@
 """The rows of a benchmark, what its budgets say, and its tables."""
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table as RichTable
+import pandas as pd
 
 from ghgs_lit.diagnostics.benchmark.machine import in_words
 from ghgs_lit.diagnostics.benchmark.measure import Record
-from ghgs_lit.diagnostics.benchmark.stages import NAMES, TOTAL
+from ghgs_lit.diagnostics.benchmark.stages import TOTAL
+from ghgs_lit.diagnostics.output import Tables, document, pivoted, texts
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.results import Row, plain, summarize
 
 #: Means of a case that its row ``total`` has beside PSNR, where they are known.
 ERRORS = ("psnr_box", "ssim", "ssim_box", "flip", "flip_box", "lpips", "depth_error_mm")
 
-
-@dataclass(frozen=True)
-class Table:
-    """A table of texts."""
-
-    title: str
-    header: tuple[str, ...]
-    lines: tuple[tuple[str, ...], ...]
+#: Headings of the table of cases, with columns and formats.
+_COLUMNS = {
+    "preset": ("preset", "{}"),
+    "s (quartiles)": ("quartiles", "{}"),
+    "speed-up": ("speed_up", "{:.2f}"),
+    "peak MB": ("peak_mb", "{:.0f}"),
+    "GFLOP": ("gflop", "{:.2f}"),
+    "tokens": ("tokens", "{:.0f}"),
+    "points": ("points", "{:.0f}"),
+    "Gaussians": ("gaussians", "{:.0f}"),
+    "PLY MB": ("ply_mb", "{:.2f}"),
+    "max rel diff": ("max_rel_diff", "{:.1e}"),
+    "PSNR": ("psnr", "{:.2f}"),
+    "loss dB": ("psnr_loss_db", "{:+.3f}"),
+    "psnr_box": ("psnr_box", "{:.2f}"),
+    "ssim": ("ssim", "{:.4f}"),
+    "flip": ("flip", "{:.4f}"),
+    "depth_error_mm": ("depth_error_mm", "{:.1f}"),
+    "budget dB": ("budget_db", "{:.3f}"),
+    "budget": ("budget", "{}"),
+}
 
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
@@ -68,10 +78,7 @@ def stage_row(record: Record, stage: str, about: Mapping[str, Any]) -> Row:
         "seconds_high": times.high,
         "peak_bytes": work.peaks.get(stage),
         "flops": None if work.flops is None else work.flops.get(stage),
-        "max_rel_diff": None,
-        "psnr": None,
-        "psnr_loss_db": None,
-        "budget_db": None,
+        **dict.fromkeys(("max_rel_diff", "psnr", "psnr_loss_db", "budget_db")),
         **about,
     }
 
@@ -86,15 +93,15 @@ def broken_budgets(rows: Sequence[Row]) -> list[str]:
 
 def _broken(row: Row) -> list[str]:
     said = []
-    limit, found = row["max_rel_diff_budget"], row["max_rel_diff"]
-    if limit is not None and not found <= limit:
-        said.append(f"expected max_rel_diff up to {limit:g}; found {found:g}")
+    limit, difference = row["max_rel_diff_budget"], row["max_rel_diff"]
+    if limit is not None and not difference <= limit:
+        said.append(f"expected max_rel_diff up to {limit:g}; found {difference:g}")
     missing = row["differences"]["unmatched"]
     if limit is not None and missing > 0:
         said.append(f"expected the Gaussians of none; found {missing:.2%} others")
-    limit, found = row["budget_db"], row["psnr_loss_db"]
-    if row["trained"] and limit is not None and not found <= limit:
-        said.append(f"expected a loss up to {limit:g} dB of PSNR; found {found:.3g}")
+    limit, loss = row["budget_db"], row["psnr_loss_db"]
+    if row["trained"] and limit is not None and not loss <= limit:
+        said.append(f"expected a loss up to {limit:g} dB of PSNR; found {loss:.3g}")
     return said
 
 
@@ -103,76 +110,26 @@ def totals(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if row["stage"] == TOTAL]
 
 
-def tables_of(rows: Sequence[Row]) -> list[Table]:
+def tables_of(rows: Sequence[Row]) -> Tables:
     """Cases with their cost and error, then the seconds of their stages."""
-    whole = totals(rows)
-    yardsticks: dict[str, float] = {}
-    for row in whole:
-        yardsticks.setdefault(row["model"], row["seconds"])
-    lines = []
-    for row in whole:
-        promises = row["max_rel_diff_budget"] is not None
-        promises |= row["trained"] and row["budget_db"] is not None
-        kept = "broken" if _broken(row) else "kept" if promises else "-"
-        lines.append(
-            (
-                row["preset"],
-                f"{row['seconds']:.3f} ({row['seconds_low']:.3f} to {row['seconds_high']:.3f})",
-                f"{yardsticks[row['model']] / row['seconds']:.2f}",
-                _scaled(row["peak_bytes"], 1e6, 0),
-                _scaled(row["flops"], 1e9, 2),
-                *(f"{row[name]:.0f}" for name in ("tokens", "points", "gaussians")),
-                _scaled(row["ply_bytes"], 1e6, 2),
-                f"{row['max_rel_diff']:.1e}",
-                f"{row['psnr']:.2f}",
-                f"{row['psnr_loss_db']:+.3f}",
-                *(_scaled(row.get(name), 1, digits) for name, digits in _SHOWN.items()),
-                _scaled(row["budget_db"], 1, 3),
-                kept,
-            )
-        )
-    header = ("preset", "s (quartiles)", "speed-up", "peak MB", "GFLOP", "tokens", "points", "Gaussians")
-    header += ("PLY MB", "max rel diff", "PSNR", "loss dB", *_SHOWN, "budget dB", "budget")
-    return [Table("Presets", header, tuple(lines)), _stages(rows)]
+    whole = pd.DataFrame(totals(rows))
+    times = whole[["seconds", "seconds_low", "seconds_high"]].itertuples(index=False)
+    cases = whole.assign(
+        quartiles=["{:.3f} ({:.3f} to {:.3f})".format(*quartiles) for quartiles in times],
+        speed_up=whole.groupby("model").seconds.transform("first") / whole.seconds,
+        peak_mb=whole.peak_bytes.astype(float) / 1e6,
+        gflop=whole.flops.astype(float) / 1e9,
+        ply_mb=whole.ply_bytes / 1e6,
+        budget=[_kept(row) for row in totals(rows)],
+    )
+    stages = pivoted(pd.DataFrame(rows), "stage", "preset", "seconds", "{:.4f}")
+    return {"Presets": texts(cases, _COLUMNS), "Seconds by stage": stages}
 
 
-#: Further errors of the table, with their decimals.
-_SHOWN = {"psnr_box": 2, "ssim": 4, "flip": 4, "depth_error_mm": 1}
-
-
-def _stages(rows: Sequence[Row]) -> Table:
-    presets = list(dict.fromkeys(row["preset"] for row in rows))
-    seconds = {(row["preset"], row["stage"]): row["seconds"] for row in rows}
-    lines = [
-        (stage, *(f"{seconds[preset, stage]:.4f}" for preset in presets))
-        for stage in NAMES
-        if (presets[0], stage) in seconds
-    ]
-    return Table("Seconds by stage", ("stage", *presets), tuple(lines))
-
-
-def _scaled(value: float | None, unit: float, digits: int) -> str:
-    return "-" if value is None else f"{value / unit:.{digits}f}"
-
-
-def to_markdown(tables: Sequence[Table], notes: Sequence[str]) -> str:
-    """Tables below the ``notes``."""
-    lines = ["# Benchmark", "", *(f"{note}\n" for note in notes)]
-    for table in tables:
-        lines += [f"## {table.title}", "", f"| {' | '.join(table.header)} |"]
-        lines += ["|" + "---|" * len(table.header)]
-        lines += [f"| {' | '.join(line)} |" for line in table.lines] + [""]
-    return "\n".join(lines)
-
-
-def print_tables(tables: Sequence[Table]) -> None:
-    """Print the tables; a line that wraps is better than a number that is cut."""
-    for table in tables:
-        printed = RichTable(*table.header, title=table.title)
-        for line in table.lines:
-            printed.add_row(*line)
-        needed = Console(width=1000).measure(printed).maximum
-        Console(width=max(Console().width, needed)).print(printed)
+def _kept(row: Row) -> str:
+    """What became of the promises of a case."""
+    promises = row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
+    return "broken" if _broken(row) else "kept" if promises else "-"
 
 
 def notes_of(content: Mapping[str, Any]) -> list[str]:
@@ -183,17 +140,9 @@ def notes_of(content: Mapping[str, Any]) -> list[str]:
     return notes + content.get("decisions", []) + [f"Budget broken: {said}." for said in content["broken"]]
 
 
-def write_numbers(directory: Path, content: Mapping[str, Any], tables: Sequence[Table]) -> Path:
-    """Write ``benchmark.csv``, ``benchmark.md`` and ``benchmark.json``; returns the path of the last."""
-    rows = [{name: value for name, value in row.items() if name != "differences"} for row in content["rows"]]
-    text = io.StringIO()
-    writer = csv.DictWriter(
-        text, list(dict.fromkeys(name for row in rows for name in row)), restval="", lineterminator="\n"
-    )
-    writer.writeheader()
-    writer.writerows(plain(rows))
-    write_text_atomically(directory / "benchmark.csv", text.getvalue())
-    write_text_atomically(directory / "benchmark.md", to_markdown(tables, notes_of(content)))
+def write_numbers(directory: Path, content: Mapping[str, Any], tables: Tables) -> Path:
+    """Write ``benchmark.md`` and ``benchmark.json``; returns the path of the last."""
+    write_text_atomically(directory / "benchmark.md", document("Benchmark", notes_of(content), tables))
     path = directory / "benchmark.json"
     write_text_atomically(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
     return path

@@ -1,52 +1,24 @@
 """How cost grows: with the subject's share of the frame, views, image size, batch and threads."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
-from ghgs_lit.diagnostics.benchmark.measure import Job, Progress, Record, inspect, time_jobs
+from ghgs_lit.diagnostics.benchmark.measure import Job, Record, inspect, time_jobs
 from ghgs_lit.diagnostics.benchmark.presets import Case
-from ghgs_lit.diagnostics.benchmark.report import Table, stage_row
+from ghgs_lit.diagnostics.benchmark.report import stage_row, totals
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER
+from ghgs_lit.diagnostics.output import Tables, pivoted, texts
 from ghgs_lit.errors import require
 from ghgs_lit.runs.results import Row
 
 AXES = ("share", "views", "size", "batch", "threads")
 #: The exponent of threads that share all work evenly; those of other axes are the FLOPs'.
 _IDEAL_THREADS = -1.0
-
-
-@dataclass(frozen=True)
-class Axes:
-    """Values along each axis; elsewhere everything is as in ``base``.
-
-    Args:
-        share: parts of the frame that the subject covers.
-        views: numbers of input views.
-        size: sides of the photographs in pixels.
-        batch: numbers of elements.
-        threads: of PyTorch.
-        base: one value of each, but of the threads.
-    """
-
-    share: Sequence[float]
-    views: Sequence[int]
-    size: Sequence[int]
-    batch: Sequence[int]
-    threads: Sequence[int]
-    base: Mapping[str, Any]
-
-    def __post_init__(self) -> None:
-        for name in AXES:
-            values = getattr(self, name)
-            is_list = isinstance(values, Sequence) and not isinstance(values, str)
-            require(is_list and all(v > 0 for v in values), f"scaling.{name}", "a list above 0", values)
-        require(set(self.base) == set(AXES[:-1]), "scaling.base", ", ".join(AXES[:-1]), sorted(self.base))
-        require(any(getattr(self, name) for name in AXES), "scaling", "an axis with values", "none")
 
 
 def exponent(values: Sequence[float], costs: Sequence[float | None]) -> float | None:
@@ -61,49 +33,43 @@ def exponent(values: Sequence[float], costs: Sequence[float | None]) -> float | 
 
 def study(
     cases: Sequence[Case],
-    axes: Axes,
+    axes: Mapping[str, Any],
     device: torch.device,
     warmup: int,
     repeats: int,
     count_flops: bool,
-    progress: Progress,
 ) -> tuple[list[Row], list[dict[str, Any]]]:
     """Measure cases along all axes.
 
     Args:
         cases: what is measured.
-        axes: where.
+        axes: by the names of :data:`AXES` the values along each; ``base`` has one of each but the threads,
+            for the other axes.
         device: where the models are.
         warmup, repeats: rounds of each axis, in which all its values and cases are interleaved.
         count_flops: whether FLOPs are counted.
-        progress: called after each forward pass but those for the FLOPs.
 
     Returns:
         Rows as of presets with ``axis`` and ``value``, and the exponents of :func:`fits_of`.
     """
+    require(any(axes[axis] for axis in AXES), "scaling", "an axis with values", "none")
     rows: list[Row] = []
     for axis in AXES:
         jobs, records, values = [], [], []
-        for value in getattr(axes, axis):
-            setting = {**axes.base, axis: value}
+        for value in axes[axis]:
+            setting = {**axes["base"], axis: value}
             count = setting.pop("threads", None)
             batch = ellipsoid_batch(**setting).to(device)
             for case in cases:
                 work, *_ = inspect(case, batch, device, count_flops)
                 jobs.append(Job(case, [batch], count))
-                records.append(Record(case, {}, work))
+                records.append(Record(case, work))
                 values.append(value)
-                progress(f"{axis} {value}")
-        timed = time_jobs(jobs, warmup, repeats, device, progress) if jobs else []
+        timed = time_jobs(jobs, warmup, repeats, device) if jobs else []
         for record, times, value in zip(records, timed, values, strict=True):
             record.times = times
             rows += [stage_row(record, stage, {"axis": axis, "value": value}) for stage in times]
     return rows, fits_of(rows)
-
-
-def passes(cases: int, axes: Axes, rounds: int) -> int:
-    """Number of times that :func:`study` calls ``progress``."""
-    return cases * (1 + rounds) * sum(len(getattr(axes, axis)) for axis in AXES)
 
 
 def fits_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -111,36 +77,24 @@ def fits_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     Expected are the exponent of the FLOPs of the same runs and, of threads, -1; None where there are none.
     """
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        if row["stage"] != OTHER:
-            groups.setdefault((row["axis"], row["preset"], row["stage"]), []).append(row)
+    frame = pd.DataFrame([row for row in rows if row["stage"] != OTHER])
     fits = []
-    for (axis, preset, stage), own in groups.items():
-        values = [row["value"] for row in own]
-        found = exponent(values, [row["seconds"] for row in own])
-        expected = _IDEAL_THREADS if axis == "threads" else exponent(values, [row["flops"] for row in own])
+    for (axis, preset, stage), group in frame.groupby(["axis", "preset", "stage"], sort=False):
+        values, flops = list(group.value), [None if pd.isna(n) else n for n in group.flops]
+        expected = _IDEAL_THREADS if axis == "threads" else exponent(values, flops)
         about = {"axis": axis, "preset": preset, "stage": stage}
-        fits.append({**about, "exponent": found, "expected": expected})
+        fits.append({**about, "exponent": exponent(values, list(group.seconds)), "expected": expected})
     return fits
 
 
-def tables_of(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]]) -> list[Table]:
+def tables_of(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]]) -> Tables:
     """Seconds of whole passes along each axis, then all exponents."""
-    tables = []
-    for axis in dict.fromkeys(row["axis"] for row in rows):
-        own = [row for row in rows if row["axis"] == axis and row["stage"] == "total"]
-        values = list(dict.fromkeys(row["value"] for row in own))
-        seconds = {(row["preset"], row["value"]): f"{row['seconds']:.3f}" for row in own}
-        presets = dict.fromkeys(row["preset"] for row in own)
-        lines = tuple((preset, *(seconds[preset, value] for value in values)) for preset in presets)
-        tables.append(Table(f"Seconds by {axis}", ("preset", *(f"{value:g}" for value in values)), lines))
-    lines = tuple(
-        (fit["axis"], fit["preset"], fit["stage"], _number(fit["exponent"]), _number(fit["expected"]))
-        for fit in fits
-    )
-    return [*tables, Table("Exponents", ("axis", "preset", "stage", "fitted", "expected"), lines)]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
+    frame = pd.DataFrame(totals(rows))
+    frame = frame.assign(value=frame.value.map("{:g}".format))
+    tables = {
+        f"Seconds by {axis}": pivoted(group, "preset", "value", "seconds", "{:.3f}")
+        for axis, group in frame.groupby("axis", sort=False)
+    }
+    columns = {name: (name, "{}") for name in ("axis", "preset", "stage")}
+    columns |= {"fitted": ("exponent", "{:.2f}"), "expected": ("expected", "{:.2f}")}
+    return {**tables, "Exponents": texts(pd.DataFrame(fits), columns)}

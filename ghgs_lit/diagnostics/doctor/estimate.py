@@ -1,24 +1,30 @@
-"""What a configuration needs: operations, and the memory of prediction and of a training step, by stage.
-
-Nothing is computed and no memory is taken for it (:mod:`ghgs_lit.diagnostics.doctor.shapes`).
-"""
+"""What a configuration needs, by stage: parameters, operations, memory; none is taken for the estimate."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
+from unittest import mock
 
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.bounds import cpu as bounds
 from ghgs_lit.config import build
+from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
+from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.stages import RENDER, TOTAL, Probe, inside, watched
-from ghgs_lit.diagnostics.doctor.shapes import Shapes, without_kernels
+from ghgs_lit.diagnostics.benchmark.stages import RENDER, TOTAL, watched
+from ghgs_lit.diagnostics.benchmark.weights import filled_model
+from ghgs_lit.diagnostics.doctor.shapes import Shapes
+from ghgs_lit.encoder import cpu as encoder
+from ghgs_lit.geometry import chamfer
+from ghgs_lit.geometry import cpu as geometry
+from ghgs_lit.kernels.watching import Inputs, Watcher, inside
 from ghgs_lit.losses import Losses
-from ghgs_lit.model import GHGS
+from ghgs_lit.model import GHGS, HEADS
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, Targets
 
 #: Stages of a training step after the prediction.
@@ -29,15 +35,8 @@ _VERTICES = 10475
 
 @dataclass(frozen=True)
 class Scene:
-    """Photographs of a subject.
-
-    Args:
-        share: part of the frame that the subject covers.
-        views: number of photographs of each element.
-        size: height and width in pixels.
-        batch: number of elements.
-        targets: photographs of each element that are rendered in a training step.
-    """
+    """Photographs of a subject that covers ``share`` of the frame: ``views`` of each of ``batch`` elements,
+    of ``size`` (height, width), and ``targets`` that are rendered in a training step."""
 
     share: float
     views: int
@@ -46,7 +45,7 @@ class Scene:
     targets: int = 1
 
 
-@dataclass
+@dataclass(frozen=True)
 class Pass:
     """A prediction or a training step.
 
@@ -56,9 +55,9 @@ class Pass:
         held: bytes of weights and, in training, of the optimizer's moments.
     """
 
-    flops: dict[str, int] = field(default_factory=dict)
-    peaks: dict[str, int] = field(default_factory=dict)
-    held: int = 0
+    flops: dict[str, int]
+    peaks: dict[str, int]
+    held: int
 
     @property
     def bytes(self) -> int:
@@ -66,133 +65,127 @@ class Pass:
         return self.held + self.peaks[TOTAL]
 
 
-class _Probe:
-    """FLOPs and peaks of stages (a probe of :mod:`ghgs_lit.diagnostics.benchmark.stages`)."""
+def parameters(config: Mapping[str, Any]) -> dict[str, tuple[int, int]]:
+    """Numbers of parameters, and of those that are trained, of each stage with weights and of the whole
+    ``model``, last."""
+    with torch.device("meta"):
+        model = GHGS.from_config(config)
+    parts = {name: getattr(model, name) for name in ("encoder", *HEADS)} | {"model": model}
+    return {name: (_count(part, False), _count(part, True)) for name, part in parts.items()}
+
+
+def _count(part: nn.Module, trained: bool) -> int:
+    return sum(p.numel() for p in part.parameters() if p.requires_grad or not trained)
+
+
+class _Needs(PeakProbe):
+    """FLOPs and peaks of stages on tensors without values."""
+
+    is_available = True
 
     def __init__(self, shapes: Shapes, flops: FlopsProbe):
+        super().__init__(torch.device("cpu"))
         self.shapes, self.flops = shapes, flops
-        self.peaks: dict[str, int] = {}
-        self._open: list[str] = []
 
-    def begin(self, stage: str) -> None:
-        self._note()
-        self._open.append(stage)
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        super().begin(stage)
         self.flops.begin(stage)
 
-    def end(self, stage: str) -> None:
+    def end(self, stage: str, result: Any = None) -> None:
         self.flops.end(stage)
-        self._note()
-        self._open.pop()
+        super().end(stage)
 
-    def _note(self) -> None:
-        """The peak since the last note counts for all stages that are open."""
-        for stage in self._open:
-            self.peaks[stage] = max(self.peaks.get(stage, 0), self.shapes.peak)
-        self.shapes.restart()
+    def held(self) -> int:
+        return self.shapes.live
+
+    def peak(self) -> int:
+        return self.shapes.peak
+
+    def reset(self) -> None:
+        self.shapes.peak = self.shapes.live
 
 
-def estimate_prediction(config: Mapping[str, Any], scene: Scene, device: str, precision: str) -> Pass:
-    """What ``model(batch)`` needs.
+def estimate(
+    config: Mapping[str, Any], scene: Scene, device: str, precision: str, training: bool = False
+) -> Pass:
+    """What ``model(batch)`` needs, or a step of training from the second one: the moments are there.
 
     Args:
-        config: of the model.
+        config: of the model; for training, of a run of ``ghgs train``.
         scene: the photographs.
         device: ``cpu`` or ``cuda``: whose kernels run.
         precision: of matrix products, ``float32``, ``bfloat16`` or ``float16``.
+        training: whether a loss and its gradients are computed, too.
     """
-    shapes = Shapes()
-    model, batch = _without_values(config, scene, shapes)
-    found = Pass(held=_bytes(model.parameters()))
-    with torch.no_grad(), _watched(model.eval(), shapes, device, found), _cast(precision):
-        model(dataclasses.replace(batch, targets=None))
-    return found
+    shapes, flops = Shapes(), FlopsProbe()
+    model = filled_model(config, lambda _, parameter: shapes.of(parameter.shape))
+    model.train(training).check_inputs = False
+    batch, needs = _batch(scene, shapes), _Needs(shapes, flops)
+    half = precision != "float32"
+    # Tensors without values are on the CPU, whatever the device.
+    cast = torch.autocast("cpu", getattr(torch, precision) if half else torch.bfloat16, enabled=half)
+    with ExitStack() as stack:
+        # The counter of FLOPs goes last: it must see operations first.
+        for context in (torch.set_grad_enabled(training), _kernels(device), shapes, flops):
+            stack.enter_context(context)
+        with watched(model, needs), inside(TOTAL, needs):
+            if training:
+                _step(model, build(config["loss"], "loss"), batch, needs, cast)
+            else:
+                with cast:
+                    model(dataclasses.replace(batch, targets=None))
+    moments = 2 * _bytes(p for p in model.parameters() if p.requires_grad) if training else 0
+    return Pass(flops.flops, needs.peaks, _bytes(model.parameters()) + moments)
 
 
-def estimate_training(config: Mapping[str, Any], scene: Scene, device: str, precision: str) -> Pass:
-    """What a step of training needs, from the second one: the optimizer's moments are there.
-
-    Args:
-        config: of a run of ``ghgs train``.
-        scene, device, precision: as of :func:`estimate_prediction`.
-    """
-    shapes = Shapes()
-    model, batch = _without_values(config, scene, shapes)
-    losses = build(config["loss"], "loss")
-    moments = 2 * _bytes(p for p in model.parameters() if p.requires_grad)
-    found = Pass(held=_bytes(model.parameters()) + moments)
-    with _watched(model.train(), shapes, device, found) as probe:
-        with _cast(precision):
-            total = _loss(model, losses, batch, probe)
-        with inside(BACKWARD, probe):
-            total.backward()
-    return found
-
-
-def _loss(model: GHGS, losses: Losses, batch: Batch, probe: Probe) -> Tensor:
-    prediction = model(batch)
-    with inside(RENDER, probe):
-        rendering = _rendered(prediction.gaussians, batch.targets.cameras)
-    with inside(LOSS, probe):
-        return losses(prediction, rendering, batch)[0]
-
-
-@contextmanager
-def _watched(model: GHGS, shapes: Shapes, device: str, found: Pass) -> Iterator[Probe]:
-    """A probe that notes in ``found`` what the stages need; operations inside need no memory."""
-    flops = FlopsProbe()
-    probe = _Probe(shapes, flops)
-    found.flops, found.peaks = flops.flops, probe.peaks
-    # The counter of FLOPs goes last: it must see operations first.
-    with (
-        without_kernels(compiled=device == "cpu"),
-        shapes,
-        flops,
-        watched(model, probe),
-        inside(TOTAL, probe),
-    ):
-        yield probe
-
-
-def _cast(precision: str) -> torch.autocast:
-    """The autocast of a precision; tensors of shapes are on the CPU whatever the device."""
-    is_half = precision != "float32"
-    return torch.autocast("cpu", getattr(torch, precision) if is_half else torch.bfloat16, enabled=is_half)
-
-
-def _without_values(config: Mapping[str, Any], scene: Scene, shapes: Shapes) -> tuple[GHGS, Batch]:
-    """The model and a batch; masks and cameras have values."""
-    with torch.device("meta"):
-        model = GHGS.from_config(config)
-    model.check_inputs = False
-    with shapes.world:
-        for module in model.modules():
-            for name, p in module._parameters.items():
-                if p is not None:
-                    empty = torch.empty(p.shape, dtype=p.dtype)
-                    module._parameters[name] = nn.Parameter(empty, requires_grad=p.requires_grad)
-    batch = ellipsoid_batch(scene.share, scene.views, scene.size, scene.batch)
-    targets = batch.targets.cameras[:, [0] * scene.targets]
-    count = (scene.batch, scene.targets)
-    bodies = [torch.zeros(_VERTICES, 3) for _ in range(scene.batch)]
-    return model, dataclasses.replace(
-        batch,
-        images=shapes.empty(batch.images),
-        depths=shapes.empty(torch.zeros(batch.masks.shape)),
-        body_vertices=[shapes.empty(body) for body in bodies],
-        targets=Targets(
-            shapes.empty(torch.zeros(*count, 3, *scene.size)),
-            batch.masks[:, [0] * scene.targets],
-            targets,
-        ),
-    )
+def _step(model: GHGS, losses: Losses, batch: Batch, needs: Watcher, cast: torch.autocast) -> None:
+    with cast:
+        prediction = model(batch)
+        with inside(RENDER, needs):
+            rendering = _rendered(prediction.gaussians, batch.targets.cameras)
+        with inside(LOSS, needs):
+            total = losses(prediction, rendering, batch)[0]
+        del prediction, rendering
+    with inside(BACKWARD, needs):
+        total.backward()
 
 
 def _rendered(gaussians: Gaussians, cameras: Cameras) -> Rendering:
     """Images of a size, through which gradients go to all attributes; rasterizers keep little else."""
-    names = ("means", "quaternions", "scales", "opacities", "colors")
-    seen = sum(getattr(gaussians, name).sum() for name in names)
+    seen = sum(getattr(gaussians, name).sum() for name in ATTRIBUTES)
     image = seen * seen.new_zeros(*cameras.shape, 5, cameras.height, cameras.width)
     return Rendering(*image.split((3, 1, 1), dim=2))
+
+
+@contextmanager
+def _kernels(device: str) -> Iterator[None]:
+    """The shapes of the results of compiled kernels; PyTorch's own operators where ``device`` has none."""
+    results = [
+        (encoder, "attend", lambda q, k, v: v.new_empty(q.transpose(1, 2).shape)),
+        (geometry, "sweep", lambda colors, masks, *rest: colors.new_empty(*masks.shape, len(rest[-2]))),
+        (chamfer, "nearest", lambda queries, _: torch.zeros(len(queries), dtype=torch.long)),
+    ]
+    if device != "cpu":
+        results += [(module, "is_supported", lambda *_: False) for module in (bounds, encoder, geometry)]
+    with ExitStack() as stack:
+        for module, name, result in results:
+            stack.enter_context(mock.patch.object(module, name, result))
+        yield
+
+
+def _batch(scene: Scene, shapes: Shapes) -> Batch:
+    """A batch whose masks and cameras have values, and nothing else."""
+    batch = ellipsoid_batch(scene.share, scene.views, scene.size, scene.batch)
+    target, empty = [0] * scene.targets, shapes.empty
+    return dataclasses.replace(
+        batch,
+        images=empty(batch.images),
+        depths=shapes.of(batch.masks.shape),
+        body_vertices=[shapes.of((_VERTICES, 3)) for _ in range(scene.batch)],
+        targets=Targets(
+            empty(batch.images[:, target]), batch.masks[:, target], batch.targets.cameras[:, target]
+        ),
+    )
 
 
 def _bytes(tensors: Iterable[Tensor]) -> int:

@@ -1,15 +1,12 @@
 """Running a model without its numbers: floating-point tensors have shapes alone, masks and indices values.
 
-What a pass computes depends on masks, indices and cameras (numbers of pixels, tokens and windows), and on
-floating-point numbers only where they are broken. So such a pass does all operations, with their shapes, in
-no memory; what lives at a time is known.
+What a pass computes depends on masks, indices and cameras, and on floating-point numbers only where they are
+broken. So such a pass does all operations, with their shapes, in no memory; what lives at a time is known.
 """
 
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from functools import partial
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -17,11 +14,6 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
-
-from ghgs_lit.bounds import cpu as bounds
-from ghgs_lit.encoder import cpu as encoder
-from ghgs_lit.geometry import chamfer
-from ghgs_lit.geometry import cpu as geometry
 
 _INDEXING = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
 
@@ -33,8 +25,9 @@ class Shapes(TorchDispatchMode):
     is finite and in range, an index is 0. Operations without such tensors are computed.
 
     Attributes:
+        world: in which tensors without values are made.
         live: bytes of tensors that were made while it was open and are still held.
-        peak: most of them at one time since :meth:`restart`.
+        peak: most of them at one time since it was set to ``live``.
     """
 
     def __init__(self) -> None:
@@ -47,19 +40,19 @@ class Shapes(TorchDispatchMode):
         """A tensor of the same shape, dtype and device without values."""
         return self.world.from_tensor(tensor)
 
-    def restart(self) -> None:
-        """Forget the peak."""
-        self.peak = self.live
+    def of(self, shape: Sequence[int]) -> Tensor:
+        """A tensor of float32 without values."""
+        with self.world:
+            return torch.empty(shape)
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if function is torch.ops.prim.device.default:  # two of three calls
             return args[0].fake_device
-        self._count(tree_leaves((args, kwargs)), made_here=False)
-        if any(isinstance(value, FakeTensor) for value in tree_leaves((args, kwargs))):
-            result = self._of_shapes(function, args, kwargs)
-        else:
-            result = function(*args, **kwargs)
+        values = tree_leaves((args, kwargs))
+        self._count(values, made_here=False)
+        is_fake = any(isinstance(value, FakeTensor) for value in values)
+        result = (self._of_shapes if is_fake else _computed)(function, args, kwargs)
         self._count(tree_leaves(result), made_here=True)
         return result
 
@@ -75,10 +68,7 @@ class Shapes(TorchDispatchMode):
 
     def _count(self, values: list[Any], made_here: bool) -> None:
         """Note the memory of tensors that are seen for the first time; that of arguments was there before."""
-        for value in values:
-            if not isinstance(value, Tensor):
-                continue
-            storage = value.untyped_storage()
+        for storage in (value.untyped_storage() for value in values if isinstance(value, Tensor)):
             key, size = storage._cdata, made_here * storage.nbytes()
             if key not in self._known:
                 self._known[key] = weakref.ref(storage, partial(self._freed, key, size))
@@ -90,13 +80,15 @@ class Shapes(TorchDispatchMode):
         self._known.pop(key, None)
 
 
+def _computed(function, args, kwargs):
+    return function(*args, **kwargs)
+
+
 def _whole_indices(indices: list[Tensor | None]) -> list[Tensor | None]:
     """Masks as the indices that they select."""
-    found: list[Tensor | None] = []
-    for index in indices:
-        is_mask = index is not None and index.dtype == torch.bool
-        found += index.nonzero().unbind(1) if is_mask else [index]
-    return found
+    is_mask = [index is not None and index.dtype == torch.bool for index in indices]
+    pairs = zip(indices, is_mask, strict=True)
+    return [part for index, mask in pairs for part in (index.nonzero().unbind(1) if mask else [index])]
 
 
 def _valued(tensor: Tensor, name: str, args: tuple) -> Tensor:
@@ -106,43 +98,3 @@ def _valued(tensor: Tensor, name: str, args: tuple) -> Tensor:
     with_itself = len(args) > 1 and args[0] is args[1]
     true = (name == "aten::eq" and with_itself) or (name == "aten::ne" and not with_itself)
     return torch.full(tensor.shape, true if tensor.dtype == torch.bool else 0, dtype=tensor.dtype)
-
-
-def _sweep(colors, masks, near, *rest):
-    *_, shares, _ = rest
-    return colors.new_empty(*masks.shape, len(shares))
-
-
-#: Shapes of what compiled kernels give: module, function, stand-in.
-_RESULTS: tuple[tuple[ModuleType, str, Callable], ...] = (
-    (encoder, "attend", lambda q, k, v: v.new_empty(q.transpose(1, 2).shape)),
-    (geometry, "sweep", _sweep),
-    (chamfer, "nearest", lambda queries, references: torch.zeros(len(queries), dtype=torch.long)),
-)
-
-
-@contextmanager
-def replaced(module: ModuleType, name: str, value: Any) -> Iterator[None]:
-    """An attribute of a module with another value while the context lasts."""
-    before = getattr(module, name)
-    setattr(module, name, value)
-    try:
-        yield
-    finally:
-        setattr(module, name, before)
-
-
-@contextmanager
-def without_kernels(compiled: bool) -> Iterator[None]:
-    """Instead of compiled kernels the shapes of their results.
-
-    Args:
-        compiled: false for PyTorch's own operators, which run where there are no compiled kernels.
-    """
-    with ExitStack() as stack:
-        for module, name, result in _RESULTS:
-            stack.enter_context(replaced(module, name, result))
-        if not compiled:
-            for module in (bounds, encoder, geometry):
-                stack.enter_context(replaced(module, "is_supported", lambda *_: False))
-        yield

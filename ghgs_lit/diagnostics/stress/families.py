@@ -2,22 +2,6 @@
 
 from dataclasses import dataclass
 
-#: What a stage may take; a family changes one of them.
-INGREDIENTS = (
-    "cameras",
-    "depths",
-    "points",
-    "neighbors",
-    "quaternions",
-    "scales",
-    "opacities",
-    "features",
-    "raw values",
-    "images",
-    "masks",
-    "weights",
-)
-
 
 @dataclass(frozen=True)
 class Family:

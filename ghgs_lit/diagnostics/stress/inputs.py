@@ -4,8 +4,23 @@ import math
 
 import torch
 from torch import Generator, Tensor
+from torch.nn import functional
 
 F64 = torch.float64
+
+#: Size of the scene by family.
+UNITS = {"large": 1e3, "small": 1e-3}
+#: What the values of an ingredient are multiplied with, by family.
+FACTORS = {
+    "depths": {"zero_depth": 0.0, "negative_depth": -1.0, "near_zero_depth": 1e-12, "huge_depth": 1e12},
+    "quaternions": {"zero_quaternion": 0.0, "tiny_quaternion": 1e-20, "huge_quaternion": 1e20},
+    "features": {"zero_features": 0.0, "tiny_features": 1e-20, "huge_features": 1e18},
+}
+#: Families that change nothing in points without a camera, with the reason.
+NO_CAMERA = {
+    "wide long skewed mirrored degenerate": "takes points, no camera",
+    "behind on_camera beside": "relative to a camera",
+}
 
 
 def normal(g: Generator, *shape: int) -> Tensor:
@@ -18,12 +33,7 @@ def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
 
 def directions(g: Generator, *shape: int) -> Tensor:
     """Unit vectors along the last axis."""
-    found = normal(g, *shape)
-    return found / found.norm(dim=-1, keepdim=True)
-
-
-#: Size of the scene by family.
-UNITS = {"large": 1e3, "small": 1e-3}
+    return functional.normalize(normal(g, *shape), dim=-1)
 
 
 def place(family: str, g: Generator) -> Tensor:
@@ -38,122 +48,115 @@ def cameras(family: str, g: Generator, views: int, size: int, middle: Tensor) ->
     focal = {"wide": 0.1 * size, "long": 1e5}.get(family, float(uniform(g, 0.8, 1.2)) * size)
     distance = 2.0 * unit * (focal / size if family == "long" else 1.0)
     start = float(uniform(g, 0, 2 * math.pi))
-    poses = torch.empty(views, 3, 4, dtype=F64)
     principal = size / 2 + uniform(g, -0.5, 0.5, views, 2)
     lenses = torch.cat((torch.tensor([[focal, 1.03 * focal]], dtype=F64).expand(views, 2), principal), 1)
+    poses = torch.empty(views, 3, 4, dtype=F64)
     for v in range(views):
-        angle = start + 2 * math.pi * v / views
-        back = torch.tensor([math.sin(angle), 0.2, math.cos(angle)], dtype=F64)
-        forward = -back / back.norm()
-        right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
-        right = right / right.norm()
-        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        rotation = _towards_middle(start + 2 * math.pi * v / views)
         if family == "skewed":
             rotation = rotation + 1e-3 * normal(g, 3, 3)
         if family == "mirrored":
             rotation = rotation * torch.tensor([[-1.0], [1.0], [1.0]], dtype=F64)
         if family == "degenerate":
-            rotation = torch.stack((rotation[1], rotation[1], rotation[2]))
+            rotation = rotation[[1, 1, 2]]
         poses[v, :, :3] = rotation
         poses[v, :, 3] = -rotation @ middle + torch.tensor([0.0, 0.0, distance], dtype=F64)
     return lenses, poses
+
+
+def _towards_middle(angle: float) -> Tensor:
+    """The rotation [3, 3] of a camera at an angle around the scene, a little above it."""
+    back = torch.tensor([math.sin(angle), 0.2, math.cos(angle)], dtype=F64)
+    forward = -back / back.norm()
+    right = torch.linalg.cross(forward, torch.tensor([0.0, 1.0, 0.0], dtype=F64))
+    right = right / right.norm()
+    return torch.stack((right, torch.linalg.cross(forward, right), forward))
 
 
 def matrices(lenses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
     """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4]."""
     fx, fy, cx, cy = lenses.unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    rows = ((fx, zero, cx), (zero, fy, cy), (zero, zero, one))
-    intrinsics = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    intrinsics = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=poses.dtype).expand(*poses.shape[:-2], 1, 4)
     return intrinsics, torch.cat((poses, last), -2)
 
 
 def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor | None = None) -> Tensor:
     """World points [count, 3] of a subject at ``middle``; those relative to a camera need its pose."""
-    unit = UNITS.get(family, 1.0)
-    found = middle + 0.3 * unit * normal(g, count, 3)
+    around = middle + 0.3 * UNITS.get(family, 1.0) * normal(g, count, 3)
     if family == "duplicates":
-        return found[torch.arange(count) // 2]
+        return around[torch.arange(count) // 2]
     if family == "collapsed":
-        return found[:1].expand(count, 3).clone()
+        return around[:1].expand(count, 3).clone()
     if family == "far":
-        return found + 1e6 * directions(g, 1, 3)
-    if poses is None:
-        return found
+        return around + 1e6 * directions(g, 1, 3)
+    if poses is None or family not in ("behind", "beside", "on_camera"):
+        return around
     rotation, translation = poses[0, :, :3], poses[0, :, 3]
     center = -rotation.mT @ translation
     if family == "behind":
         return center - rotation[2] * uniform(g, 0.1, 3, count, 1) + 0.1 * normal(g, count, 3)
-    if family == "beside":
-        around = uniform(g, 0, 2 * math.pi, count, 1)
-        across = rotation[0] * around.cos() + rotation[1] * around.sin()
-        depth = uniform(g, 0.7, 1.5, count, 1)
-        return center + depth * (rotation[2] + uniform(g, 0.7, 1.2, count, 1) * across)
     if family == "on_camera":
         return center + 1e-6 * (rotation[2] * uniform(g, 0.5, 1, count, 1) + 0.2 * normal(g, count, 3))
-    return found
+    angle = uniform(g, 0, 2 * math.pi, count, 1)
+    across = rotation[0] * angle.cos() + rotation[1] * angle.sin()
+    depth = uniform(g, 0.7, 1.5, count, 1)
+    return center + depth * (rotation[2] + uniform(g, 0.7, 1.2, count, 1) * across)
 
 
 def depths(family: str, g: Generator, *shape: int) -> Tensor:
     """Depths of about two units."""
-    found = uniform(g, 1.5, 2.5, *shape) * UNITS.get(family, 1.0)
+    values = uniform(g, 1.5, 2.5, *shape) * UNITS.get(family, 1.0)
     if family == "equal_depths":
-        return torch.full_like(found, float(uniform(g, 1.5, 2.5)))
-    factor = {"zero_depth": 0.0, "negative_depth": -1.0, "near_zero_depth": 1e-12, "huge_depth": 1e12}
-    return found * factor.get(family, 1.0)
+        return torch.full_like(values, float(uniform(g, 1.5, 2.5)))
+    return values * FACTORS["depths"].get(family, 1.0)
 
 
 def quaternions(family: str, g: Generator, count: int) -> Tensor:
-    length = {"zero_quaternion": 0.0, "tiny_quaternion": 1e-20, "huge_quaternion": 1e20}
-    return normal(g, count, 4) * length.get(family, 1.0)
+    return normal(g, count, 4) * FACTORS["quaternions"].get(family, 1.0)
 
 
 def scales(family: str, g: Generator, count: int, unit: float = 0.05) -> Tensor:
-    found = unit * uniform(g, 0.2, 1.0, count, 3) * UNITS.get(family, 1.0)
+    values = unit * uniform(g, 0.2, 1.0, count, 3) * UNITS.get(family, 1.0)
     if family == "thin":
-        return found * torch.tensor([1.0, 1e-6, 1e-6], dtype=F64)
+        return values * torch.tensor([1.0, 1e-6, 1e-6], dtype=F64)
     factor = {"zero_scale": 0.0, "tiny_scale": 1e-12 / unit, "huge_scale": 1e4 / unit}
-    return found * factor.get(family, 1.0)
+    return values * factor.get(family, 1.0)
 
 
 def opacities(family: str, g: Generator, count: int) -> Tensor:
-    found = uniform(g, 0.05, 0.98, count)
+    values = uniform(g, 0.05, 0.98, count)
     fixed = {"transparent": 0.0, "opaque": 1.0}
-    return torch.full_like(found, fixed[family]) if family in fixed else found
+    return torch.full_like(values, fixed[family]) if family in fixed else values
 
 
 def features(family: str, g: Generator, count: int, width: int) -> Tensor:
-    found = normal(g, count, width)
+    values = normal(g, count, width)
     if family == "parallel_features":
-        return found[:1].expand(count, width).clone()
+        return values[:1].expand(count, width).clone()
     if family == "opposite_features":
-        signs = 1 - 2 * (torch.arange(count) % 2)
-        return found[:1] * signs[:, None]
-    factor = {"zero_features": 0.0, "tiny_features": 1e-20, "huge_features": 1e18}
-    return found * factor.get(family, 1.0)
+        return values[:1] * (1 - 2 * (torch.arange(count) % 2))[:, None]
+    return values * FACTORS["features"].get(family, 1.0)
 
 
 def raw(family: str, g: Generator, *shape: int) -> Tensor:
     """Raw values of a head; adverse ones of both signs."""
-    found = normal(g, *shape)
-    factor = {"saturated": 100.0, "extreme": 1e4}
-    return found.sign() * factor[family] * uniform(g, 0.5, 1.5, *shape) if family in factor else found
+    values, factor = normal(g, *shape), {"saturated": 100.0, "extreme": 1e4}.get(family)
+    return values if factor is None else values.sign() * factor * uniform(g, 0.5, 1.5, *shape)
 
 
 def images(family: str, g: Generator, *shape: int) -> Tensor:
-    found = uniform(g, 0, 1, *shape)
+    values = uniform(g, 0, 1, *shape)
     if family == "constant":
-        return torch.full_like(found, float(uniform(g, 0, 1)))
-    if family == "black":
-        return torch.zeros_like(found)
-    return 20 * found - 10 if family == "out_of_range" else found
+        return torch.full_like(values, float(uniform(g, 0, 1)))
+    return {"black": 0.0 * values, "out_of_range": 20 * values - 10}.get(family, values)
 
 
 def disc(size: int) -> Tensor:
     """A mask of a disc in the middle [size, size]."""
-    place = torch.arange(size, dtype=F64) + 0.5 - size / 2
-    return place[:, None].square() + place.square() < (0.3 * size) ** 2
+    offset = torch.arange(size, dtype=F64) + 0.5 - size / 2
+    return offset[:, None].square() + offset.square() < (0.3 * size) ** 2
 
 
 def spoiled(family: str, g: Generator, masks: Tensor) -> Tensor:

@@ -4,54 +4,89 @@ import math
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ghgs_lit.diagnostics.stress.families import FAMILIES, PLANTED
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, stack
 from ghgs_lit.errors import InputError
+from ghgs_lit.runs.results import plain
 
 #: Size of the random roundings of the inputs that estimate the condition number, in relative terms.
 _STEP = torch.finfo(torch.float32).eps
 
+#: A cell of the matrix: ``stage``, ``family``, ``dtype``, numbers of ``cases`` and ``failures``; ``error``
+#: and ``median`` in units of eps times the condition number (None: without a bound), ``budget``, the allowed
+#: factor; ``nonfinite``, the share of cases with a value that is not finite; ``gradient``, the median of the
+#: largest gradient; ``worst``, which output and seed; ``seconds``.
+Row = dict[str, Any]
+
 
 @dataclass(frozen=True)
-class Cell:
-    """What was found for a stage, a family and a dtype.
+class Outcome:
+    """What was found for n cases.
 
-    ``error`` and ``median`` are in units of eps times the condition number, ``budget`` is the allowed factor;
-    ``nonfinite`` is the share of cases with a value that is not finite where the reference is; ``gradient``
-    is the median of the largest gradient; ``worst`` says which output and seed.
+    Args:
+        errors: over eps times the condition number [n]; infinite where there is no bound.
+        lost: whether a value is not finite [n].
+        said: what has the error, of each case.
+        gradient: median of the largest gradient.
     """
 
-    stage: str
-    family: str
-    dtype: str
-    cases: int
-    failures: int
-    error: float
-    median: float
-    budget: float
-    nonfinite: float
-    gradient: float
-    worst: str
-    seconds: float
-
-    def as_dict(self) -> dict:
-        """Plain data; an error without a bound is None, since JSON has no infinity."""
-        values = asdict(self)
-        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+    errors: Tensor
+    lost: Tensor
+    said: Sequence[str]
+    gradient: float = 0.0
 
 
 def make_cases(stage: Stage, family: str, seeds: Sequence[int]) -> Values:
     """Stacked inputs [n, ...] in float64; a case depends on stage, family and seed only."""
-    cases = []
-    for seed in seeds:
-        key = zlib.crc32(f"{stage.name}/{family}/{seed}".encode())
-        cases.append(stage.make(family, torch.Generator().manual_seed(key)))
-    return {name: torch.stack([case[name] for case in cases]) for name in cases[0]}
+    keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in seeds]
+    return stack([stage.make(family, torch.Generator().manual_seed(key)) for key in keys])
+
+
+def measure(
+    stage: Stage, family: str, seeds: Sequence[int], dtypes: Sequence[str] | None = None
+) -> list[Row]:
+    """The cells of a family: one for each dtype of the stage (or for those of ``dtypes`` among them)."""
+    started = time.perf_counter()
+    chosen = [dtype for dtype in stage.dtypes if dtypes is None or dtype in dtypes]
+    cases = make_cases(stage, family, seeds)
+    if family in PLANTED:
+        check = partial(_planted, stage, PLANTED[family], cases, seeds)
+    elif family in stage.refused:
+        check = partial(_refused, stage, cases)
+    else:
+        check = _comparison(stage, family, cases)
+    outcomes = {dtype: check(dtype) for dtype in chosen}
+    seconds = (time.perf_counter() - started) / max(len(chosen), 1)
+    return [_row(stage, family, dtype, seeds, found, seconds) for dtype, found in outcomes.items()]
+
+
+def _row(
+    stage: Stage, family: str, dtype: str, seeds: Sequence[int], outcome: Outcome, seconds: float
+) -> Row:
+    errors, case = outcome.errors, int(outcome.errors.argmax())
+    return plain(
+        {
+            "stage": stage.name,
+            "family": family,
+            "dtype": dtype,
+            "cases": len(seeds),
+            "failures": int((errors > stage.factor).sum()),
+            "error": float(errors[case]),
+            "median": float(errors.median()),
+            "budget": stage.factor,
+            "nonfinite": float(outcome.lost.float().mean()),
+            "gradient": outcome.gradient,
+            "worst": f"{outcome.said[case]}, seed {seeds[case]}",
+            "seconds": seconds,
+        }
+    )
 
 
 def evaluate(run: Callable[[Values], Values], inputs: Values, gradients: Sequence[str], dtype: str) -> Values:
@@ -81,27 +116,21 @@ def _weights(name: str, value: Tensor) -> Tensor:
     return torch.randn(value.shape[1:], generator=g, dtype=torch.float64)
 
 
-def measure(
-    stage: Stage, family: str, seeds: Sequence[int], dtypes: Sequence[str] | None = None
-) -> list[Cell]:
-    """The cells of a family: one for each dtype of the stage (or for those of ``dtypes`` among them)."""
-    chosen = [dtype for dtype in stage.dtypes if dtypes is None or dtype in dtypes]
-    cases = make_cases(stage, family, seeds)
-    if family in PLANTED:
-        return [_planted(stage, family, cases, seeds, dtype) for dtype in chosen]
-    if family in stage.refused:
-        return [_refused(stage, family, cases, seeds, dtype) for dtype in chosen]
+def _comparison(stage: Stage, family: str, cases: Values) -> Callable[[str], Outcome]:
+    """What compares the cases in a dtype with the reference in float64."""
     # What all dtypes can represent: the rounding of the inputs is not the stage's error.
-    exact = {k: v.float().double() if v.is_floating_point() else v for k, v in cases.items()}
-    reference = stage.reference or stage.run
-    started = time.perf_counter()
-    truth = evaluate(reference, exact, stage.gradients, "float64")
-    spread = _spread(reference, exact, truth, stage)
-    shared = (time.perf_counter() - started) / max(len(chosen), 1)
-    return [_compare(stage, family, exact, truth, spread, seeds, dtype, shared) for dtype in chosen]
+    exact = _inputs(_inputs(cases, "float32"), "float64")
+    run = partial(evaluate, stage.reference or stage.run, gradients=stage.gradients, dtype="float64")
+    truth = run(exact)
+    return partial(_compared, stage, family, exact, truth, _spread(run, exact, truth, stage))
 
 
-def _spread(reference, exact: Values, truth: Values, stage: Stage) -> Values:
+def _inputs(cases: Values, dtype: str) -> Values:
+    working = torch.float64 if dtype == "float64" else torch.float32
+    return {k: v.to(working) if v.is_floating_point() else v for k, v in cases.items()}
+
+
+def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage: Stage) -> Values:
     """How far each output of the reference moves where the inputs are rounded at random, over the rounding.
 
     Two roundings are of one step. The other two are opposite and as large as the budget: a decision that
@@ -109,14 +138,12 @@ def _spread(reference, exact: Values, truth: Values, stage: Stage) -> Values:
     """
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
     for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
-        g, step = torch.Generator().manual_seed(seed), size * _STEP
-        moved = {}
+        g, step, moved = torch.Generator().manual_seed(seed), size * _STEP, dict(exact)
         for name, value in exact.items():
-            moved[name] = value
             if value.is_floating_point() and name not in stage.steady:
                 signs = 1 - 2 * torch.randint(2, value.shape, generator=g)
                 moved[name] = value * (1 + step * signs)
-        found = evaluate(reference, moved, stage.gradients, "float64")
+        found = run(moved)
         for name, value in truth.items():
             spread[name] = torch.maximum(spread[name], _largest(found[name] - value) / abs(step))
     return spread
@@ -129,8 +156,8 @@ def _largest(values: Tensor) -> Tensor:
     return flat.amax(1) if flat.shape[1] else flat.new_zeros(len(flat))
 
 
-def _compare(stage, family, exact, truth, spread, seeds, dtype, shared) -> Cell:
-    started = time.perf_counter()
+def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: Values, dtype: str) -> Outcome:
+    """The error of each output and gradient over what the problem itself allows."""
     working = torch.float64 if dtype == "float64" else torch.float32
     found = evaluate(stage.run, _inputs(exact, dtype), stage.gradients, dtype)
     eps = torch.finfo(getattr(torch, dtype) if stage.network else working).eps
@@ -147,92 +174,50 @@ def _compare(stage, family, exact, truth, spread, seeds, dtype, shared) -> Cell:
             scale = torch.full_like(scale, torch.finfo(torch.float64).max)
         ratios[name] = _largest(found[name] - value) / (eps * (scale + spread[name] + floor))
     names = list(ratios)
-    table = torch.stack([ratios[name].nan_to_num(nan=math.inf, posinf=math.inf) for name in names])
-    lost = (~torch.stack([_largest(found[name]) for name in names]).isfinite()).any(0)
+    table = torch.stack(list(ratios.values())).nan_to_num(nan=math.inf, posinf=math.inf)
+    largest = torch.stack([_largest(found[name]) for name in names])
+    lost = ~largest.isfinite().all(0)
     if dtype == "float16" and FAMILIES[family].ingredient == "weights":
         # Weights may take products beyond 65 504, float16's largest number: then the result must say so.
         table = torch.where(lost, 0.0, table)
-    worst, place = table.max(0)
-    case = int(worst.argmax())
-    gradient = [_largest(found[name]) for name in names if name.startswith("d ")]
-    return Cell(
-        stage.name,
-        family,
-        dtype,
-        cases=len(seeds),
-        failures=int((worst > stage.factor).sum()),
-        error=float(worst[case]),
-        median=float(worst.median()),
-        budget=stage.factor,
-        nonfinite=float(lost.float().mean()),
-        gradient=float(torch.stack(gradient).amax(0).median()) if gradient else 0.0,
-        worst=f"{names[int(place[case])]}, seed {seeds[case]}",
-        seconds=shared + time.perf_counter() - started,
-    )
+    errors, row = table.max(0)
+    slopes = largest[[name.startswith("d ") for name in names]]
+    gradient = float(slopes.amax(0).median()) if len(slopes) else 0.0
+    return Outcome(errors, lost, [names[i] for i in row.tolist()], gradient)
 
 
-def _inputs(cases: Values, dtype: str) -> Values:
-    working = torch.float64 if dtype == "float64" else torch.float32
-    return {k: v.to(working) if v.is_floating_point() else v for k, v in cases.items()}
-
-
-def _verdict(
-    stage: Stage, family: str, dtype: str, seeds, failed: int, seen: float, said: str, started
-) -> Cell:
-    """The cell of cases that hold or fail, without an error in between."""
-    return Cell(
-        stage.name,
-        family,
-        dtype,
-        cases=len(seeds),
-        failures=failed,
-        error=math.inf if failed else 0.0,
-        median=0.0,
-        budget=stage.factor,
-        nonfinite=seen,
-        gradient=0.0,
-        worst=said,
-        seconds=time.perf_counter() - started,
-    )
-
-
-def _refused(stage: Stage, family: str, cases: Values, seeds: Sequence[int], dtype: str) -> Cell:
+def _refused(stage: Stage, cases: Values, dtype: str) -> Outcome:
     """Each case alone must raise an ``InputError``."""
-    started, failed = time.perf_counter(), 0
-    inputs = _inputs(cases, dtype)
-    for i in range(len(seeds)):
+    inputs, errors = _inputs(cases, dtype), []
+    for i in range(len(next(iter(cases.values())))):
         try:
             evaluate(stage.run, {name: value[i : i + 1] for name, value in inputs.items()}, (), dtype)
-            failed += 1
+            errors.append(math.inf)
         except InputError:
-            continue
-    return _verdict(stage, family, dtype, seeds, failed, 0.0, "refused in one line", started)
+            errors.append(0.0)
+    lost = torch.zeros(len(errors))
+    return Outcome(torch.tensor(errors), lost, ["refused in one line"] * len(errors))
 
 
-def _planted(stage: Stage, family: str, cases: Values, seeds: Sequence[int], dtype: str) -> Cell:
-    """A value that is not finite is refused, or seen in the outputs, and reaches no other case.
-
-    The error is 0 where that holds, else infinite.
-    """
-    started = time.perf_counter()
+def _planted(stage: Stage, value: float, cases: Values, seeds: Sequence[int], dtype: str) -> Outcome:
+    """``value``, which is not finite, in one input: it is refused, or seen in the outputs, and reaches no
+    other case. The error is 0 where that holds, else infinite."""
     inputs = _inputs(cases, dtype)
-    names = [name for name, value in inputs.items() if value.is_floating_point() and name not in stage.steady]
-    failed, seen, said = 0, 0, ""
+    names = [name for name, x in inputs.items() if x.is_floating_point() and name not in stage.steady]
+    errors, lost, said = torch.zeros(len(seeds)), torch.zeros(len(seeds)), []
     for i, seed in enumerate(seeds):
-        pair = {name: value[[i, (i + 1) % len(seeds)]].clone() for name, value in inputs.items()}
-        chosen = pair[names[i % len(names)]]
-        g = torch.Generator().manual_seed(seed)
-        chosen[0].view(-1)[int(torch.randint(chosen[0].numel(), (), generator=g))] = PLANTED[family]
+        pair = {name: x[[i, (i + 1) % len(seeds)]].clone() for name, x in inputs.items()}
+        name = names[i % len(names)]
+        g, entries = torch.Generator().manual_seed(seed), pair[name][0].view(-1)
+        entries[int(torch.randint(len(entries), (), generator=g))] = value
+        said.append(f"in {name}")
         try:
             found = evaluate(stage.run, pair, stage.gradients, dtype)
         except InputError:
             continue
-        rows = torch.stack([value.reshape(len(value), -1).isfinite().all(1) for value in found.values()]).all(
-            0
-        )
-        seen += not rows[0]
-        if not rows[1] or (rows[0] and not stage.silent):
-            failed += 1
-            what = "reached another case" if not rows[1] else "vanished"
-            said = f"{what} from {names[i % len(names)]}, seed {seed}"
-    return _verdict(stage, family, dtype, seeds, failed, seen / len(seeds), said, started)
+        first, other = torch.stack([x.reshape(2, -1).isfinite().all(1) for x in found.values()]).all(0)
+        lost[i] = not first
+        if not other or (first and not stage.silent):
+            errors[i] = math.inf
+            said[i] = f"{'vanished' if other else 'reached another case'} from {name}"
+    return Outcome(errors, lost, said)

@@ -1,100 +1,98 @@
 """The matrix as JSON, as tables and as a picture."""
 
-import io
 import json
-import math
-from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
+from ghgs_lit.diagnostics.output import document, save_figure, texts
 from ghgs_lit.diagnostics.stress.families import FAMILIES
-from ghgs_lit.diagnostics.stress.run import Row
+from ghgs_lit.diagnostics.stress.measure import Row
 from ghgs_lit.diagnostics.stress.stages import STAGES
-from ghgs_lit.files import write_atomically, write_text_atomically
+from ghgs_lit.files import write_text_atomically
+
+#: Columns of the worst cells.
+_WORST = ("stage", "family", "dtype", "error", "budget")
 
 
-def _ratio(row: Row) -> float:
-    """Error over budget; infinite where the error has no bound."""
-    return math.inf if row["error"] is None else row["error"] / row["budget"]
+def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """The rows with ``ratio``, the error over the budget, infinite where the error has no bound."""
+    frame = pd.DataFrame(rows)
+    return frame.assign(ratio=(frame.error.astype(float) / frame.budget).fillna(np.inf))
+
+
+def worst_of(rows: Sequence[Row]) -> list[Row]:
+    """The worst cell of each stage and dtype."""
+    index = frame_of(rows).groupby(["stage", "dtype"], sort=False).ratio.idxmax()
+    return [{name: rows[i][name] for name in _WORST} for i in index]
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """The numbers of cases and failures, the worst of each stage and dtype, and every cell."""
-    worst: dict[tuple, Row] = {}
-    for row in rows:
-        place = (row["stage"], row["dtype"])
-        if place not in worst or _ratio(row) > _ratio(worst[place]):
-            worst[place] = row
-    names = ("stage", "family", "dtype", "error", "budget")
-    return {
-        "cases": sum(row["cases"] for row in rows),
-        "failures": sum(row["failures"] for row in rows),
-        "worst": [{name: row[name] for name in names} for row in worst.values()],
-        "cells": list(rows),
-    }
+    totals = {name: sum(row[name] for row in rows) for name in ("cases", "failures")}
+    return {**totals, "worst": worst_of(rows), "cells": list(rows)}
+
+
+def bounded(error: float | None) -> str:
+    """An error with three digits."""
+    return "no bound" if error is None else f"{error:.3g}"
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
     """The worst errors, the numbers of cases, budgets with their reasons, and why cells are empty."""
-    stages, families = _axes(rows)
-    found = summary(rows)
-    lines = ["# Stress test", "", f"{found['cases']} cases, {found['failures']} failures.", ""]
-    lines += ["## Worst errors", "", "In units of eps times the condition number of the case.", ""]
-    lines += _table(("stage", "dtype", "family", "error", "budget"), [
-        (r["stage"], r["dtype"], r["family"], "no bound" if r["error"] is None else f"{r['error']:.3g}",
-         f"{r['budget']:g}")
-        for r in found["worst"]
-    ])  # fmt: skip
-    counts = Counter()
-    for row in rows:
-        counts[row["stage"], row["family"]] += row["cases"]
-    lines += ["", "## Cases", ""]
-    lines += _table(("stage", *families, "all"), [
-        (s, *(counts[s, f] or "" for f in families), sum(counts[s, f] for f in families))
-        for s in stages
-    ])  # fmt: skip
-    lines += ["", "## Budgets", ""]
-    lines += _table(
-        ("stage", "factor", "reason"), [(s, f"{STAGES[s].factor:g}", STAGES[s].reason) for s in stages]
+    found, cases = summary(rows), _matrix(pd.DataFrame(rows), "cases", "sum")
+    families, stages = list(cases.columns), [STAGES[name] for name in cases.index]
+    worst = pd.DataFrame(found["worst"]).assign(error=[bounded(row["error"]) for row in found["worst"]])
+    shown = dict.fromkeys(("stage", "dtype", "family", "error"), "{}") | {"budget": "{:g}"}
+    budgets = [(stage.name, f"{stage.factor:g}", stage.reason) for stage in stages]
+    counts = cases.map(lambda count: "" if pd.isna(count) else f"{count:.0f}")
+    tables = {
+        "Worst errors": texts(worst, {name: (name, form) for name, form in shown.items()}),
+        "Cases": counts.assign(all=cases.sum(axis=1).map("{:.0f}".format)).reset_index(),
+        "Budgets": pd.DataFrame(budgets, columns=["stage", "factor", "reason"]),
+        "Empty cells": pd.DataFrame(
+            [(stage.name, *_missing(stage, families)) for stage in stages],
+            columns=["stage", "families", "dtypes"],
+        ),
+        "Families": pd.DataFrame({"family": families, "inputs": [FAMILIES[f].says for f in families]}),
+    }
+    notes = [
+        f"{found['cases']} cases, {found['failures']} failures.",
+        "Errors are in units of eps times the condition number of the case.",
+    ]
+    return document("Stress test", notes, tables)
+
+
+def _missing(stage: Any, families: Sequence[str]) -> tuple[str, str]:
+    """Why a stage has no cases of some families, and no other dtypes."""
+    reasons: dict[str, list[str]] = {}
+    for family in families:
+        if reason := stage.missing(family):
+            reasons.setdefault(reason, []).append(family)
+    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items()), stage.no_dtype
+
+
+def _matrix(frame: pd.DataFrame, values: str, how: str) -> pd.DataFrame:
+    """Values by stage and family, in their order."""
+    table = frame.pivot_table(index="stage", columns="family", values=values, aggfunc=how)
+    stages, families = (
+        [name for name in known if name in set(frame[key])]
+        for key, known in (("stage", STAGES), ("family", FAMILIES))
     )
-    lines += ["", "## Empty cells", ""]
-    for stage in stages:
-        reasons = defaultdict(list)
-        for family in families:
-            if reason := STAGES[stage].missing(family):
-                reasons[reason].append(family)
-        said = "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items())
-        dtypes = f" Dtypes: {STAGES[stage].no_dtype}." if STAGES[stage].no_dtype else ""
-        lines.append(f"- {stage}: {said or 'none'}.{dtypes}")
-    lines += ["", "## Families", ""]
-    lines += _table(("family", "inputs"), [(name, FAMILIES[name].says) for name in families])
-    return "\n".join(lines) + "\n"
-
-
-def _axes(rows: Sequence[Row]) -> tuple[list[str], list[str]]:
-    stages, families = ({row[name] for row in rows} for name in ("stage", "family"))
-    return [s for s in STAGES if s in stages], [f for f in FAMILIES if f in families]
-
-
-def _table(header: Sequence[str], lines: Sequence[Sequence[object]]) -> list[str]:
-    rows = [header, ["---"] * len(header), *lines]
-    return [f"| {' | '.join(map(str, row))} |" for row in rows]
+    return table.reindex(index=stages, columns=families)
 
 
 def draw(rows: Sequence[Row]) -> Figure:
     """The largest error over budget of each stage and family, over all dtypes."""
-    stages, families = _axes(rows)
-    values = np.full((len(stages), len(families)), np.nan)
-    for row in rows:
-        i, j = stages.index(row["stage"]), families.index(row["family"])
-        level = float(np.clip(np.log10(max(_ratio(row), 1e-6)), -6, 3))
-        values[i, j] = level if np.isnan(values[i, j]) else max(values[i, j], level)
-    figure = Figure(figsize=(3.2 + 0.3 * len(families), 2.4 + 0.3 * len(stages)), layout="constrained")
+    ratios = _matrix(frame_of(rows), "ratio", "max")
+    values = np.log10(ratios.clip(1e-6, 1e3)).to_numpy()
+    height, width = values.shape
+    figure = Figure(figsize=(3.2 + 0.3 * width, 2.4 + 0.3 * height), layout="constrained")
     axes = figure.add_subplot()
     colors = matplotlib.colormaps["RdYlGn_r"].copy()
     colors.set_bad("0.93")
@@ -102,10 +100,10 @@ def draw(rows: Sequence[Row]) -> Figure:
     picture = axes.imshow(np.ma.masked_invalid(values), cmap=colors, norm=norm, aspect="auto")
     for i, j in zip(*np.nonzero(values > 0), strict=True):
         axes.text(j, i, "✗", ha="center", va="center", color="white", fontweight="bold")
-    axes.set_xticks(range(len(families)), [f.replace("_", " ") for f in families], rotation=90, fontsize=8)
-    axes.set_yticks(range(len(stages)), stages, fontsize=8)
-    axes.set_xticks(np.arange(len(families) + 1) - 0.5, minor=True)
-    axes.set_yticks(np.arange(len(stages) + 1) - 0.5, minor=True)
+    axes.set_xticks(range(width), [f.replace("_", " ") for f in ratios.columns], rotation=90, fontsize=8)
+    axes.set_yticks(range(height), ratios.index, fontsize=8)
+    axes.set_xticks(np.arange(width + 1) - 0.5, minor=True)
+    axes.set_yticks(np.arange(height + 1) - 0.5, minor=True)
     axes.grid(which="minor", color="white", linewidth=1)
     axes.tick_params(which="minor", length=0)
     found = summary(rows)
@@ -118,9 +116,7 @@ def draw(rows: Sequence[Row]) -> Figure:
 def write(directory: Path, rows: Sequence[Row], source: dict[str, Any]) -> Path:
     """Write ``stress.md``, ``stress.png`` and ``stress.json``; returns the path of the last."""
     write_text_atomically(directory / "stress.md", to_markdown(rows))
-    content = io.BytesIO()
-    draw(rows).savefig(content, format="png", dpi=120)
-    write_atomically(directory / "stress.png", lambda path: path.write_bytes(content.getvalue()))
+    save_figure(draw(rows), directory / "stress.png")
     path = directory / "stress.json"
     text = json.dumps({**summary(rows), "provenance": source}, indent=1, allow_nan=False)
     write_text_atomically(path, text + "\n")

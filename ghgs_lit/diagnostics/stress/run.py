@@ -1,8 +1,9 @@
 """All cases of a run: divided among processes, written as they end, and not computed twice."""
 
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -10,14 +11,12 @@ from pathlib import Path
 import torch
 
 from ghgs_lit.diagnostics.stress.families import FAMILIES
-from ghgs_lit.diagnostics.stress.measure import measure
+from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.stage import DTYPES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
 from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.progress import track
-
-Row = dict[str, str | int | float | None]
 
 
 @dataclass(frozen=True)
@@ -29,10 +28,15 @@ class Task:
     seeds: int
     dtypes: tuple[str, ...]
 
+    @property
+    def key(self) -> str:
+        """A name that no other task has."""
+        return "/".join((self.stage, self.family, str(self.seeds), ",".join(self.dtypes)))
+
     def run(self) -> list[Row]:
         """One row for each dtype."""
-        cells = measure(STAGES[self.stage], self.family, range(self.seeds), self.dtypes)
-        return [{**cell.as_dict(), "seeds": self.seeds} for cell in cells]
+        rows = measure(STAGES[self.stage], self.family, range(self.seeds), self.dtypes)
+        return [{**row, "seeds": self.seeds} for row in rows]
 
 
 def tasks_of(
@@ -46,21 +50,21 @@ def tasks_of(
     Raises:
         InputError: a name that is not known.
     """
-    chosen = []
-    for key, names, known in (
-        ("stages", stages, tuple(STAGES)),
-        ("families", families, tuple(FAMILIES)),
-        ("dtypes", dtypes, DTYPES),
-    ):
-        for name in names or ():
-            choice(key, name, known)
-        chosen.append(tuple(known if names is None else names))
+    stages = _chosen("stages", stages, tuple(STAGES))
+    families = _chosen("families", families, tuple(FAMILIES))
+    dtypes = _chosen("dtypes", dtypes, DTYPES)
     return [
-        Task(name, family, STAGES[name].quick if quick else STAGES[name].seeds, chosen[2])
-        for name in chosen[0]
-        for family in chosen[1]
+        Task(name, family, STAGES[name].quick if quick else STAGES[name].seeds, dtypes)
+        for name in stages
+        for family in families
         if STAGES[name].missing(family) is None
     ]
+
+
+def _chosen(key: str, names: Sequence[str] | None, known: tuple[str, ...]) -> tuple[str, ...]:
+    for name in names or ():
+        choice(key, name, known)
+    return known if names is None else tuple(names)
 
 
 def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
@@ -72,49 +76,32 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
         workers: processes; 0: this one.
     """
     done = Journal(journal)
-    done.say_done([_key(task) for task in tasks], "families")
-    left = [task for task in tasks if _key(task) not in done]
-    for task, rows in track(_Sized(_results(left, workers), len(left)), "stages and families"):
-        done.add(_key(task), rows)
-    return [row for task in tasks for row in done[_key(task)]]
+    done.say_done([task.key for task in tasks], "families")
+    left = [task for task in tasks if task.key not in done]
+    with _mapping(workers) as map_tasks:
+        for task, rows in zip(track(left, "stages and families"), map_tasks(Task.run, left), strict=True):
+            done.add(task.key, rows)
+    return [row for task in tasks for row in done[task.key]]
 
 
-@dataclass(frozen=True)
-class _Sized:
-    """An iterator whose length is known, for a progress bar."""
-
-    items: Iterator
-    length: int
-
-    def __iter__(self) -> Iterator:
-        return self.items
-
-    def __len__(self) -> int:
-        return self.length
-
-
-def _key(task: Task) -> str:
-    return "/".join((task.stage, task.family, str(task.seeds), ",".join(task.dtypes)))
-
-
-def _results(tasks: Sequence[Task], workers: int) -> Iterator[tuple[Task, list[Row]]]:
+@contextmanager
+def _mapping(workers: int) -> Iterator[Callable[..., Iterator]]:
+    """``map`` in this process, or divided among others."""
     if workers == 0:
-        yield from ((task, task.run()) for task in tasks)
+        yield map
         return
     # Not forked: a child would inherit locks of threads that it does not have.
     pool = ProcessPoolExecutor(
         workers, get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
     )
     try:
-        futures = {pool.submit(task.run): task for task in tasks}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+        yield pool.map
     finally:
         pool.shutdown(cancel_futures=True)
 
 
 def processes(workers: int | None) -> int:
     """``workers``, or one for each processor of this process."""
-    return (
-        len(os.sched_getaffinity(0)) if workers is None and hasattr(os, "sched_getaffinity") else workers or 0
-    )
+    if workers is None and hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return workers or 0

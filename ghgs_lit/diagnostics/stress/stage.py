@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress.families import FAMILIES
@@ -80,3 +81,23 @@ class Stage:
         if ingredient is not None and ingredient not in self.ingredients:
             return f"takes no {ingredient}"
         return self.excluded.get(family)
+
+
+def except_for(reasons: Mapping[str, str]) -> dict[str, str]:
+    """The families of ``excluded``: reasons by names that are separated by spaces."""
+    return {name: reason for names, reason in reasons.items() for name in names.split()}
+
+
+def case_by_case(run: Callable[[Values], Values]) -> Callable[[Values], Values]:
+    """A function of one case as one of stacked cases."""
+
+    def stacked(values: Values) -> Values:
+        count = len(next(iter(values.values())))
+        return stack([run({name: value[i] for name, value in values.items()}) for i in range(count)])
+
+    return stacked
+
+
+def stack(cases: list[Values]) -> Values:
+    """Values of cases, stacked along a first axis."""
+    return {name: torch.stack([case[name] for case in cases]) for name in cases[0]}

@@ -1,8 +1,6 @@
 """``ghgs benchmark`` from end to end with tiny models: files, budgets, presets without code, scaling."""
 
-import csv
 import json
-import re
 
 import pytest
 
@@ -107,19 +105,14 @@ def test_the_stages_add_up_to_the_total(measured):
 
 
 def test_all_files_of_a_benchmark_are_written(measured):
-    """The page needs no other file and has a hint for each preset; TensorBoard has a run for each."""
-    with open(measured / "benchmark.csv", newline="") as file:
-        assert len(list(csv.DictReader(file))) == 4 * 10
+    """One table, one picture, one file of numbers, and the configuration."""
     text = (measured / "benchmark.md").read_text()
     assert "| balanced |" in text
     assert "Machine: " in text
-    page = (measured / "benchmark.html").read_text()
-    assert not re.search(r'(src|href)="http', page)
-    for preset in ("none", "exact", "balanced", "auto"):
-        assert re.search(rf"<title>{preset}: [\d.]+ s", page)
-        assert list((measured / "tensorboard" / preset).glob("events*"))
-    assert list((measured / "tensorboard" / "figure").glob("events*"))
     assert (measured / "benchmark.png").read_bytes().startswith(b"\x89PNG")
+    files = {path.name for path in measured.iterdir() if not path.name.startswith(".")}
+    assert files >= {"benchmark.json", "benchmark.md", "benchmark.png", "config.yaml"}
+    assert not files & {"benchmark.csv", "benchmark.html", "tensorboard"}
 
 
 def test_a_preset_of_the_user_that_breaks_its_budget_ends_with_code_1(data, tmp_path, capsys):

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.diagnostics.doctor.estimate import BACKWARD, Scene, estimate_prediction, estimate_training
+from ghgs_lit.diagnostics.doctor.estimate import BACKWARD, Scene, estimate
 from ghgs_lit.diagnostics.doctor.shapes import Shapes
 from tests.helpers.models import TINY
 
@@ -56,7 +56,7 @@ def test_keys_that_save_memory_do():
 
     def peak(scene=SCENE, precision="float32", **encoder):
         changed = {**config, "encoder": {**config["encoder"], **encoder}}
-        return estimate_training(changed, scene, "cuda", precision).bytes
+        return estimate(changed, scene, "cuda", precision, training=True).bytes
 
     whole = peak()
     assert peak(checkpointing=True) < whole
@@ -68,8 +68,8 @@ def test_keys_that_save_memory_do():
 def test_operations_are_counted_by_stage():
     """The backward pass of products takes about twice the forward pass; predictions have none."""
     config = resolve(compose("train", ["model=hull", "loss=depth"]))
-    prediction = estimate_prediction(config, SCENE, "cpu", "float32")
-    step = estimate_training(config, SCENE, "cpu", "float32")
+    prediction = estimate(config, SCENE, "cpu", "float32")
+    step = estimate(config, SCENE, "cpu", "float32", training=True)
     assert prediction.flops["encoder"] == step.flops["encoder"] > 0
     forward = step.flops["total"] - step.flops[BACKWARD]
     assert 1.5 < step.flops[BACKWARD] / forward < 2.5

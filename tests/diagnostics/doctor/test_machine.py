@@ -5,8 +5,8 @@ import importlib.metadata
 import torch
 
 from ghgs_lit.cli import doctor_machine
+from ghgs_lit.diagnostics.doctor.estimate import parameters
 from ghgs_lit.diagnostics.doctor.machine import machine_lines, missing_extras
-from ghgs_lit.diagnostics.doctor.needs import needs
 from ghgs_lit.model import GHGS
 from tests.helpers.models import TINY, config
 from tests.helpers.verbs import ghgs
@@ -31,11 +31,11 @@ def test_parameters_are_those_of_the_model():
     """The meta device gives what a built model has."""
     for trainable in ("all", "none"):
         described = config("model=hull", f"encoder.trainable={trainable}")
-        found = {n.stage: n for n in needs(described)}
+        found = parameters(described)
         model = GHGS.from_config(described)
-        assert found["model"].parameters == sum(p.numel() for p in model.parameters())
-        assert found["model"].trained == sum(p.numel() for p in model.parameters() if p.requires_grad)
-        assert found["encoder"].trained == (found["encoder"].parameters if trainable == "all" else 0)
+        total = sum(p.numel() for p in model.parameters())
+        assert found["model"] == (total, sum(p.numel() for p in model.parameters() if p.requires_grad))
+        assert found["encoder"][1] == (found["encoder"][0] if trainable == "all" else 0)
 
 
 def test_the_verb_says_what_fits_and_which_keys_make_it_fit(tmp_path, capsys, monkeypatch):

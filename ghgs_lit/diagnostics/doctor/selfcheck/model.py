@@ -8,13 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.weights import random_model
 from ghgs_lit.diagnostics.doctor.selfcheck.outcome import SKIPPED, Outcome, compared
-from ghgs_lit.diagnostics.doctor.selfcheck.renderer import ATTRIBUTES
 from ghgs_lit.kernels.precision import has_bfloat16
+from ghgs_lit.kernels.watching import Results, watched
 from ghgs_lit.model import GHGS
-from ghgs_lit.types import Batch, Gaussians, Prediction
+from ghgs_lit.types import Batch, Gaussians
 
 #: Largest error of a stage, by precision. In float32 it is 1e-6 on a CPU; a device that sums in another order
 #: may choose another neighbour at equal distances, which moves one token. The others round every product: 8
@@ -110,40 +111,17 @@ def _unsupported(precision: str, device: torch.device) -> str | None:
 @torch.no_grad()
 def _results(model: GHGS, batch: Batch) -> dict[str, Tensor]:
     """What each stage gives for the subject, in the order of the data flow, on the CPU."""
-    with _outputs(model, "encoder", "recalibration") as outputs:
-        prediction = model(batch)
-    latent = {name: torch.stack(tokens.latent).cpu() for name, tokens in outputs.items()}
-    return _of_subject(prediction.to("cpu"), batch.masks.cpu(), **latent)
-
-
-def _of_subject(
-    prediction: Prediction, masks: Tensor, encoder: Tensor, recalibration: Tensor
-) -> dict[str, Tensor]:
-    bounds, points = prediction.depth_maps.bounds, prediction.points
-    found = {}
-    if bounds is not None:
-        found["bounds"] = torch.stack((bounds.near[masks], bounds.far[masks]))
-    found["encoder"] = encoder
-    found["depth_head"] = prediction.depth[masks]
-    found["unprojection"] = points.tokens[points.tokens_valid]
-    found["recalibration"] = recalibration
-    return found | {f"gaussian_head, {name}": getattr(prediction.gaussians, name) for name in ATTRIBUTES}
-
-
-@contextmanager
-def _outputs(model: GHGS, *names: str) -> Iterator[dict[str, Any]]:
-    """What the stages ``names`` return while the context lasts."""
-    found: dict[str, Any] = {}
-
-    def keep(name: str):
-        def hook(_module: nn.Module, _inputs: Any, output: Any) -> None:
-            found[name] = output
-
-        return hook
-
-    hooks = [getattr(model, name).register_forward_hook(keep(name)) for name in names]
-    try:
-        yield found
-    finally:
-        for hook in hooks:
-            hook.remove()
+    seen = Results()
+    with watched(model, {name: name for name in ("encoder", "recalibration")}, seen):
+        prediction = model(batch).to("cpu")
+    encoder, recalibration = (torch.stack(tokens.latent).cpu() for tokens in seen.results.values())
+    bounds, points, masks = prediction.depth_maps.bounds, prediction.points, batch.masks.cpu()
+    edges = {} if bounds is None else {"bounds": torch.stack((bounds.near[masks], bounds.far[masks]))}
+    return {
+        **edges,
+        "encoder": encoder,
+        "depth_head": prediction.depth[masks],
+        "unprojection": points.tokens[points.tokens_valid],
+        "recalibration": recalibration,
+        **{f"gaussian_head, {name}": getattr(prediction.gaussians, name) for name in ATTRIBUTES},
+    }

@@ -6,14 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.doctor.selfcheck.outcome import SKIPPED, Outcome, compared
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import RasterSettings, render
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.types import Cameras, Gaussians
-
-ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 
 #: Largest errors of images and of gradients. Rounding to float32 gives 1e-6 and 1e-5 on a CPU; a splat that
 #: one of both cuts off at 1/255, at its border of a tile or in another order gives more than 1e-3.

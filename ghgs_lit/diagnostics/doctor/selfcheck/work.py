@@ -9,10 +9,11 @@ from rich.filesize import decimal
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.stages import TOTAL, Probe, SecondsProbe, inside, watched
+from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, watched
 from ghgs_lit.diagnostics.benchmark.weights import random_model
-from ghgs_lit.diagnostics.doctor.estimate import Scene, estimate_prediction
+from ghgs_lit.diagnostics.doctor.estimate import Scene, estimate
 from ghgs_lit.diagnostics.doctor.selfcheck.outcome import FAILED, PASSED, SKIPPED, Outcome
+from ghgs_lit.kernels.watching import Watcher, inside
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch
 
@@ -40,7 +41,7 @@ def work(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
         yield Outcome(check, SKIPPED, "only CUDA knows the memory of tensors; see ghgs doctor task=machine")
         return
     _predict(model, batch, peaks)
-    expected = estimate_prediction(config, scene, "cuda", "float32")
+    expected = estimate(config, scene, "cuda", "float32")
     measured = expected.held + peaks.peaks[TOTAL]
     is_near = abs(expected.bytes / measured - 1) <= _LIMIT
     found = f"peak {decimal(measured)}, estimated {decimal(expected.bytes)}, limit {_LIMIT:.0%}"
@@ -48,6 +49,6 @@ def work(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
 
 
 @torch.no_grad()
-def _predict(model: GHGS, batch: Batch, probe: Probe) -> None:
+def _predict(model: GHGS, batch: Batch, probe: Watcher) -> None:
     with watched(model, probe), inside(TOTAL, probe):
         model(batch)

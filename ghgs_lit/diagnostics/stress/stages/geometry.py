@@ -1,12 +1,13 @@
 """Bounds, projection, unprojection, token points, padding, photo-consistency, undistortion."""
 
 import torch
+from kornia.geometry.calibration import distort_points
 from torch import Generator, Tensor
 
-from ghgs_lit.bounds import SubjectBox, VisualHull
+from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
@@ -111,12 +112,8 @@ def scene(family: str, g: Generator, views: int, size: int, target: bool = False
         "middle": rig["middle"],
     }
     if target:
-        same = family == "identical"
-        found |= {
-            "target": images[:1] if same else images[views:],
-            "target_lenses": rig["lenses"][views:],
-            "target_poses": rig["poses"][views:],
-        }
+        found["target"] = images[:1] if family == "identical" else images[views:]
+        found |= {f"target_{name}": rig[name][views:] for name in ("lenses", "poses")}
     return found
 
 
@@ -124,17 +121,18 @@ def batch_of(v: Values) -> Batch:
     return Batch(v["images"], v["masks"], cameras_of(v, v["images"].shape[-1]))
 
 
-def _seen(family: str, g: Generator) -> Values:
-    """A scene whose subject is in every frame."""
-    return scene(family, g, 4, 24)
+_HULL = VisualHull(dilation=0.02)
 
 
-def _bounds(stage: SubjectBox, v: Values) -> Values:
+def _bounds(v: Values) -> Values:
     """Bounds of the subject's pixels as the model asks for them, in the subject's frame, whose limits are in
     metres; and how far the true surface lies outside them."""
     batch, masks = batch_of(v), v["masks"]
     frame = Frame.of(batch)
-    found, metre = stage(frame.enter(batch)), frame.metre.to(v["truth"])[:, None, None, None]
+    found, metre = (
+        VisualHull(dilation=0.02)(frame.enter(batch)),
+        frame.metre.to(v["truth"])[:, None, None, None],
+    )
     found = DepthBounds(found.near * metre, found.far * metre)
     outside = torch.relu(found.near - v["truth"]) + torch.relu(v["truth"] - found.far)
     seen = masks & (v["truth"] > 0)
@@ -147,7 +145,7 @@ def _bounds(stage: SubjectBox, v: Values) -> Values:
 
 def _bounds_slowly(v: Values) -> Values:
     """In the double precision of its inputs; the true surface must lie inside."""
-    found = _bounds(VisualHull(dilation=0.02), v)
+    found = _bounds(v)
     return {**found, "outside": torch.zeros_like(found["outside"])}
 
 
@@ -157,8 +155,7 @@ def _cells(v: Values) -> Tensor:
 
 
 def _frame_inputs(family: str, g: Generator) -> Values:
-    found = scene(family, g, 3, _SIZE)
-    return {**found, "points": inputs.normal(g, 16, 3)}
+    return {**scene(family, g, 3, _SIZE), "points": inputs.normal(g, 16, 3)}
 
 
 def _frame(v: Values) -> Values:
@@ -171,8 +168,7 @@ def _frame(v: Values) -> Values:
 
 
 def _sample_inputs(family: str, g: Generator) -> Values:
-    found = _project_inputs(family, g)
-    return {**found, "maps": inputs.images(family, g, 3, _SIZE, _SIZE)}
+    return {**_project_inputs(family, g), "maps": inputs.images(family, g, 3, _SIZE, _SIZE)}
 
 
 def _places(v: Values) -> Tensor:
@@ -195,9 +191,8 @@ def _sample_slowly(v: Values) -> Values:
 
 
 def _photo_inputs(family: str, g: Generator) -> Values:
-    found = scene(family, g, 3, 12)
-    depth = found["truth"]
-    return {**found, "near": depth - 0.2, "far": depth + 0.2}
+    found = scene(family, g, 3, _SIZE)
+    return {**found, "near": found["truth"] - 0.2, "far": found["truth"] + 0.2}
 
 
 def _photo(v: Values) -> Values:
@@ -223,10 +218,6 @@ def _tokens(v: Values) -> Values:
     }
 
 
-def _padding_inputs(family: str, g: Generator) -> Values:
-    return scene(family, g, 2, 18)
-
-
 def _padding(v: Values) -> Values:
     """Maps that were padded and cut, and a point's pixel in the padded camera, moved back."""
     padding = pad_to_patches(v["masks"], 4)
@@ -247,26 +238,24 @@ def _lens_inputs(family: str, g: Generator) -> Values:
     return {"lens": _rig(family, g, size=16)["lenses"][0], "distortion": distortion}
 
 
-def _lens(v: Values) -> Values:
+def _intrinsics(v: Values) -> Tensor:
     fx, fy, cx, cy = v["lens"].unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    matrices = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
-    pairs = zip(matrices.numpy(), v["distortion"].numpy(), strict=True)
+    return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
+
+def _lens(v: Values) -> Values:
+    pairs = zip(_intrinsics(v).numpy(), v["distortion"].numpy(), strict=True)
     return {"grid": torch.cat([undistorting_grid(k, d, 16, 16) for k, d in pairs])}
 
 
 def _lens_slowly(v: Values) -> Values:
-    """OpenCV's model written out at the same knots."""
+    """OpenCV's model by kornia at the same knots."""
     knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
     rows, columns = torch.meshgrid(knots, knots, indexing="ij")
-    fx, fy, cx, cy = (value[:, None, None] for value in v["lens"].unbind(-1))
-    k1, k2, p1, p2, k3 = (v["distortion"][:, i, None, None] for i in range(5))
-    x, y = (columns - cx) / fx, (rows - cy) / fy
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    w = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    grid = 2 * torch.stack((u * fx + cx, w * fy + cy), 1) / 16 - 1
+    pixels = torch.stack((columns, rows), -1).flatten(0, 1).expand(len(v["lens"]), 9, 2)
+    grid = 2 * distort_points(pixels, _intrinsics(v), v["distortion"]) / 16 - 1
+    grid = grid.mT.unflatten(-1, (3, 3))
     dense = torch.nn.functional.interpolate(grid, (16, 16), mode="bilinear", align_corners=True)
     return {"grid": dense.permute(0, 2, 3, 1)}
 
@@ -290,7 +279,7 @@ STAGES = (
         "as projection, and a division by a component of the direction", silent="NaN loses every comparison",
     ),
     Stage(
-        "bounds and hull", ("cameras", "masks"), _seen, lambda v: _bounds(VisualHull(dilation=0.02), v), 100,
+        "bounds and hull", ("cameras", "masks"), lambda family, g: scene(family, g, 4, 24), _bounds, 100,
         "decisions on a grid: one cell may differ (kappa), the true surface must be inside", _bounds_slowly,
         steady=("truth", "middle", "images"), seeds=32, kappa=_cells, excluded=_OUTSIDE_FRAME,
         silent="cameras that are not finite are refused before this stage",
@@ -304,7 +293,7 @@ STAGES = (
         "samples of maps", ("cameras", "points", "images"), _sample_inputs, _sample, 20,
         "a mean of four pixels; their shares lose the digits of a pixel's place (kappa)", _sample_slowly,
         steady=("middle",), seeds=64,
-        excluded={n: "its callers clean their maps" for n in ("nan", "inf")},
+        excluded=except_for({"nan inf": "its callers clean their maps"}),
     ),
     Stage(
         "photo-consistency", ("cameras", "images", "masks"), _photo_inputs, _photo, 100,
@@ -317,7 +306,7 @@ STAGES = (
         silent="relative depths are read inside the mask only",
     ),
     Stage(
-        "padding", ("cameras", "images", "masks"), _padding_inputs, _padding, 10,
+        "padding", ("cameras", "images", "masks"), lambda family, g: scene(family, g, 2, 18), _padding, 10,
         "copies, and a principal point that moves by whole pixels", _padding_slowly,
         gradients=("images",), steady=("truth", "poses"),
     ),

@@ -6,7 +6,7 @@ import torch
 from torch import Generator
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import CONFIDENCES
@@ -18,13 +18,10 @@ from ghgs_lit.types import Tokens
 
 def _depth_inputs(family: str, g: Generator) -> Values:
     near = inputs.depths("equal_depths" if family == "equal_depths" else "ordinary", g, 24)
-    unit_ = inputs.UNITS.get(family, 1.0)
-    return {
-        "raw": inputs.raw(family, g, 24),
-        "near": near * unit_,
-        "far": near * unit_ + inputs.uniform(g, 0.02, 1, 24) * unit_,
-        "confidence": inputs.raw(family, g, 24),
-    }
+    metre = inputs.UNITS.get(family, 1.0)
+    raw = inputs.raw(family, g, 24)
+    far = near * metre + inputs.uniform(g, 0.02, 1, 24) * metre
+    return {"raw": raw, "near": near * metre, "far": far, "confidence": inputs.raw(family, g, 24)}
 
 
 def _depth(v: Values) -> Values:
@@ -47,12 +44,9 @@ _ATTRIBUTES = FootprintAttributes()
 
 def _attributes(v: Values) -> Values:
     names = ("offset", "scale", "rotation", "opacity", "footprint")
-    found = _ATTRIBUTES(*(v[name].flatten(0, 1) for name in names))
-    shape = v["opacity"].shape
-    return {
-        name: value.unflatten(0, shape)
-        for name, value in zip(("offsets", "scales", "quaternions", "opacities"), found, strict=True)
-    }
+    rows = _ATTRIBUTES(*(v[name].flatten(0, 1) for name in names))
+    rows = dict(zip(("offsets", "scales", "quaternions", "opacities"), rows, strict=True))
+    return {name: value.unflatten(0, v["opacity"].shape) for name, value in rows.items()}
 
 
 def _unit_inputs(family: str, g: Generator) -> Values:
@@ -87,8 +81,7 @@ _GRID = (2, 3)
 
 
 def _dpt_inputs(family: str, g: Generator) -> Values:
-    count = _GRID[0] * _GRID[1]
-    return {f"layer{i}": inputs.features(family, g, count, 32) for i in range(4)}
+    return {f"layer{i}": inputs.features(family, g, _GRID[0] * _GRID[1], 32) for i in range(4)}
 
 
 def _head() -> DPTHead:
@@ -102,14 +95,10 @@ _HEADS[torch.float64] = copy.deepcopy(_HEADS[torch.float32]).double()
 
 
 def _dpt(v: Values) -> Values:
-    n, (h, w) = len(v["layer0"]), _GRID
-    image, row, column = (
-        axis.flatten()
-        for axis in torch.meshgrid(torch.arange(n), torch.arange(h), torch.arange(w), indexing="ij")
-    )
+    shape = (len(v["layer0"]), 1, *_GRID)
+    image, _, row, column = torch.ones(shape).nonzero().unbind(1)
     layers = tuple(v[f"layer{i}"].flatten(0, 1) for i in range(4))
-    tokens = Tokens(layers, layers[0], image, row, column, (n, 1, h, w), 4)
-    return {"maps": _HEADS[layers[0].dtype](tokens)}
+    return {"maps": _HEADS[layers[0].dtype](Tokens(layers, layers[0], image, row, column, shape, 4))}
 
 
 _BOUNDED = "a value between bounds is finite whatever the raw value"
@@ -118,12 +107,10 @@ STAGES = (
     Stage(
         "depth activation", ("raw values", "cameras", "depths"), _depth_inputs, _depth, 50,
         "a sigmoid and two divisions", gradients=("raw", "near", "far"), silent=_BOUNDED,
-        excluded={
-            **{name: "depths are the result" for name in
-               ("zero_depth", "negative_depth", "near_zero_depth", "huge_depth")},
-            **{name: "takes bounds, not cameras" for name in
-               ("shifted", "wide", "long", "skewed", "mirrored", "degenerate")},
-        },
+        excluded=except_for({
+            "zero_depth negative_depth near_zero_depth huge_depth": "depths are the result",
+            "shifted wide long skewed mirrored degenerate": "takes bounds, not cameras",
+        }),
     ),
     Stage(
         "attributes", ("raw values", "depths"), _attribute_inputs, _attributes, 50,

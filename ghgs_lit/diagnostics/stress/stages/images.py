@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case, except_for
 from ghgs_lit.geometry.chamfer import KINDS, chamfer
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import psnr, ssim
@@ -18,9 +18,12 @@ def _pair(family: str, g: Generator) -> Values:
     return {"image": image.clone(), "target": target.clone()}
 
 
+def _l1(v: Values) -> Tensor:
+    return (v["image"] - v["target"]).abs().flatten(1).mean(1)
+
+
 def _l1_ssim(v: Values) -> Values:
-    l1 = (v["image"] - v["target"]).abs().flatten(1).mean(1)
-    return {"l1": l1, "ssim": ssim(v["image"], v["target"])}
+    return {"l1": _l1(v), "ssim": ssim(v["image"], v["target"])}
 
 
 def _ssim_slowly(v: Values) -> Values:
@@ -35,23 +38,22 @@ def _ssim_slowly(v: Values) -> Values:
     c1, c2 = 0.01**2, 0.03**2
     first = (2 * mean_a * mean_b + c1) / (mean_a.square() + mean_b.square() + c1)
     values = first * (2 * ab + c2) / (aa + bb + c2)
-    l1 = (v["image"] - v["target"]).abs().flatten(1).mean(1)
-    return {"l1": l1, "ssim": values.flatten(1).mean(1)}
+    return {"l1": _l1(v), "ssim": values.flatten(1).mean(1)}
+
+
+def _brightest(v: Values) -> Tensor:
+    return torch.cat((v["image"], v["target"]), 1).flatten(1).abs().amax(1)
 
 
 def _moments(v: Values) -> Tensor:
     """SSIM's definition subtracts moments of the size x^2 and compares the rest with 0.03^2."""
-    return (
-        torch.maximum(v["image"].flatten(1).abs().amax(1), v["target"].flatten(1).abs().amax(1)).square()
-        / 9e-4
-    )
+    return _brightest(v).square() / 9e-4
 
 
 def _terms(v: Values) -> Tensor:
     """Gradients of SSIM subtract terms of the size 2 x / 0.03^2, each a mean over the windows."""
     windows = 3 * (_SIZE - 10) ** 2
-    largest = torch.maximum(v["image"].flatten(1).abs().amax(1), v["target"].flatten(1).abs().amax(1))
-    return 2 * largest / (9e-4 * windows)
+    return 2 * _brightest(v) / (9e-4 * windows)
 
 
 def _metrics(v: Values) -> Values:
@@ -74,23 +76,20 @@ def _clouds(family: str, g: Generator) -> Values:
 
 
 def _chamfer(v: Values) -> Values:
-    return {
-        kind: torch.stack([chamfer(p, s, kind) for p, s in zip(v["points"], v["surface"], strict=True)])
-        for kind in KINDS
-    }
+    return {kind: chamfer(v["points"], v["surface"], kind) for kind in KINDS}
 
 
 def _chamfer_slowly(v: Values) -> Values:
     """All distances, in the precision of the inputs."""
-    apart = (v["points"][:, :, None] - v["surface"][:, None]).square().sum(-1)
-    pairs = torch.cat((apart.amin(2), apart.amin(1)), 1) * 2
+    apart = (v["points"][:, None] - v["surface"]).square().sum(-1)
+    pairs = torch.cat((apart.amin(1), apart.amin(0))) * 2
     root = torch.where(pairs > 0.02, pairs / 2, 0.01).sqrt()
     costs = {
         "squared": pairs,
         "huber": torch.where(pairs > 0.02, 2 * (0.2 * root - 0.01), pairs),
         "truncated": pairs.clamp(max=0.02),
     }
-    return {kind: value.mean(1) for kind, value in costs.items()}
+    return {kind: value.mean() for kind, value in costs.items()}
 
 
 STAGES = (
@@ -100,14 +99,10 @@ STAGES = (
         gradients=("image",), kappa=_moments, sizes=_terms, seeds=96,
     ),
     Stage(
-        "Chamfer", ("cameras", "points", "neighbors"), _clouds, _chamfer, 20,
-        "means of squares of differences",
-        _chamfer_slowly, gradients=("points", "surface"), seeds=96, ties=("duplicates", "collapsed"),
-        excluded={
-            **{n: "takes points, no camera" for n in ("wide", "long", "skewed", "mirrored", "degenerate")},
-            **{n: "relative to a camera" for n in ("behind", "on_camera", "beside")},
-            "masked": "takes no masks",
-        },
+        "Chamfer", ("cameras", "points", "neighbors"), _clouds, case_by_case(_chamfer), 20,
+        "means of squares of differences", case_by_case(_chamfer_slowly), gradients=("points", "surface"),
+        seeds=96, ties=("duplicates", "collapsed"),
+        excluded=except_for({**inputs.NO_CAMERA, "masked": "takes no masks"}),
     ),
     Stage(
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,

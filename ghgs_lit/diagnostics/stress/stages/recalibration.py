@@ -1,10 +1,10 @@
-"""Neighbours, cosines and attention among them, and their compiled kernels."""
+"""Neighbours, cosines and attention among them, and the encoder's compiled attention."""
 
 import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case, except_for
 from ghgs_lit.encoder.cpu.attention import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
@@ -26,17 +26,15 @@ def _point_inputs(family: str, g: Generator) -> Values:
 
 def _distances(v: Values) -> Values:
     """Distances, in float64, of the neighbours that are found."""
-    each = []
-    for points, view in zip(v["points"], v["view"], strict=True):
-        near, exact = nearest_neighbors(points, view, _K), points.double()
-        each.append((exact[near.index] - exact[:, None]).norm(dim=-1))
-    return {"all": torch.stack(each)}
+    exact = v["points"].double()
+    near = nearest_neighbors(v["points"], v["view"], _K)
+    return {"all": (exact[near.index] - exact[:, None]).norm(dim=-1)}
 
 
 def _distances_slowly(v: Values) -> Values:
     """Every difference, sorted."""
-    distance = (v["points"][:, :, None] - v["points"][:, None]).norm(dim=-1)
-    return {"all": distance.sort(-1).values[..., :_K]}
+    distance = (v["points"][:, None] - v["points"]).norm(dim=-1)
+    return {"all": distance.sort(-1).values[:, :_K]}
 
 
 def _neighbor_table(family: str, g: Generator, count: int, k: int) -> Values:
@@ -56,34 +54,31 @@ def _cosine_inputs(family: str, g: Generator) -> Values:
 
 
 def _cosines(v: Values) -> Values:
-    pairs = zip(v["features"], v["index"], v["valid"], strict=True)
-    return {"cosines": torch.stack([neighbor_cosines(f, Neighbors(i, m)) for f, i, m in pairs])}
+    return {"cosines": neighbor_cosines(v["features"], Neighbors(v["index"], v["valid"]))}
 
 
 def _cosines_slowly(v: Values) -> Values:
     """Angles of scaled features."""
-    features = v["features"]
-    largest = features.abs().amax(-1, keepdim=True)
-    features = features / torch.where(largest > 0, largest, 1.0)
-    length = features.norm(dim=-1, keepdim=True)
-    features = features / torch.where(length > 0, length, 1.0)
-    return {
-        "cosines": torch.stack(
-            [(f[:, None] * f[i]).sum(-1) for f, i in zip(features, v["index"], strict=True)]
-        )
-    }
+    largest = v["features"].abs().amax(-1, keepdim=True)
+    scaled = v["features"] / torch.where(largest > 0, largest, 1.0)
+    length = scaled.norm(dim=-1, keepdim=True)
+    unit = scaled / torch.where(length > 0, length, 1.0)
+    return {"cosines": (unit[:, None] * unit[v["index"]]).sum(-1)}
+
+
+def _attention_features(family: str, g: Generator, *shape: int) -> Tensor:
+    """Features of a family; huge ones are of 30 times the ordinary size."""
+    if family == "huge_features":
+        return 30.0 * inputs.normal(g, *shape)
+    return inputs.features(family, g, *shape)
 
 
 def _attention_inputs(family: str, g: Generator) -> Values:
     count = _COUNT.get(family, 12)
     k = min(_K, count)
-    large = {"huge_features": 30.0}.get(family)
-    q, k_, v = (
-        large * inputs.normal(g, count, 32) if large else inputs.features(family, g, count, 32)
-        for _ in range(3)
-    )
+    features = {name: _attention_features(family, g, count, 32) for name in ("q", "k", "v")}
     cosines = inputs.uniform(g, -1, 1, count, k)
-    return {"q": q, "k": k_, "v": v, "cosines": cosines, **_neighbor_table(family, g, count, k)}
+    return {**features, "cosines": cosines, **_neighbor_table(family, g, count, k)}
 
 
 _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped", "log")}
@@ -91,36 +86,22 @@ _BLOCKS = {s: SemanticAttention(128, 2, s) for s in ("product", "product_clamped
 
 def _attention(v: Values) -> Values:
     """Eq. 3 with every use of the similarity."""
-    found = {}
-    for name, block in _BLOCKS.items():
-        each = [
-            block._attend(q, k, value, Neighbors(index, valid), cosines)
-            for q, k, value, index, valid, cosines in zip(
-                *(v[name] for name in ("q", "k", "v", "index", "valid", "cosines")), strict=True
-            )
-        ]
-        found[name] = torch.stack(each)
-    return found
+    near, tokens = Neighbors(v["index"], v["valid"]), (v["q"], v["k"], v["v"])
+    return {name: block._attend(*tokens, near, v["cosines"]) for name, block in _BLOCKS.items()}
 
 
 def _attention_slowly(v: Values) -> Values:
     """Gathered, one softmax a head."""
-    found = {}
-    for name in _BLOCKS:
-        each = []
-        for q, k, value, index, valid, s in zip(
-            *(v[name] for name in ("q", "k", "v", "index", "valid", "cosines")), strict=True
-        ):
-            q, k, value = (x.unflatten(-1, (2, 16)) for x in (q, k, value))
-            logits = torch.einsum("mad,mkad->amk", q, k[index]) / 4.0
-            if name == "log":
-                logits = logits + s.clamp(min=0.01).log()
-            else:
-                logits = logits * (s.clamp(min=0) if name == "product_clamped" else s)
-            weights = logits.masked_fill(~valid, -torch.inf).softmax(-1)
-            each.append(torch.einsum("amk,mkad->mad", weights, value[index]).flatten(1))
-        found[name] = torch.stack(each)
-    return found
+    q, k, value = (v[name].unflatten(-1, (2, 16)) for name in ("q", "k", "v"))
+    s, logits = v["cosines"], torch.einsum("mad,mkad->amk", q, k[v["index"]]) / 4.0
+    changed = {
+        "product": logits * s,
+        "product_clamped": logits * s.clamp(min=0),
+        "log": logits + s.clamp(min=0.01).log(),
+    }
+    weights = {name: x.masked_fill(~v["valid"], -torch.inf).softmax(-1) for name, x in changed.items()}
+    rows = value[v["index"]]
+    return {name: torch.einsum("amk,mkad->mad", w, rows).flatten(1) for name, w in weights.items()}
 
 
 def _products(v: Values) -> Tensor:
@@ -130,14 +111,10 @@ def _products(v: Values) -> Tensor:
 
 
 def _head_inputs(family: str, g: Generator) -> Values:
-    large = 30.0 if family == "huge_features" else None
-    names = ("q", "k", "v")
-    return {
-        name: large * inputs.normal(g, 2, 20, 64)
-        if large
-        else torch.stack([inputs.features(family, g, 20, 64)] * 2)
-        for name in names
-    }
+    """Of two heads, equal ones but for huge features."""
+    shape = (2, 20, 64) if family == "huge_features" else (20, 64)
+    features = {name: _attention_features(family, g, *shape) for name in ("q", "k", "v")}
+    return {name: value.expand(2, 20, 64).clone() for name, value in features.items()}
 
 
 def _head_kernel(v: Values) -> Values:
@@ -149,33 +126,30 @@ def _heads_slowly(v: Values) -> Values:
     return {"attended": (weights @ v["v"]).transpose(1, 2)}
 
 
-_FLOAT32 = ("float32", "bfloat16", "float16")
-_KERNEL = "the kernel takes float32"
 _HUGE = "queries and keys 30 times as large as ordinary ones: they follow a LayerNorm"
+_INFINITE = "an infinite logit is a weight of 1"
 
-STAGES = (
+STAGES = [
     Stage(
-        "neighbours", ("cameras", "points", "neighbors"), _point_inputs, _distances, 20,
-        "distances of differences: three squares and a root", _distances_slowly, seeds=48,
-        excluded={
-            **{n: "takes points, no camera" for n in ("wide", "long", "skewed", "mirrored", "degenerate")},
-            **{n: "relative to a camera" for n in ("behind", "on_camera", "beside")},
-        },
+        "neighbours", ("cameras", "points", "neighbors"), _point_inputs, case_by_case(_distances), 20,
+        "distances of differences: three squares and a root", case_by_case(_distances_slowly), seeds=48,
+        excluded=except_for(inputs.NO_CAMERA),
         silent="a point that is not finite is nobody's neighbour while there are others",
     ),
     Stage(
-        "cosine", ("features", "neighbors"), _cosine_inputs, _cosines, 20,
-        "a product of two unit vectors of 16 components", _cosines_slowly,
+        "cosine", ("features", "neighbors"), _cosine_inputs, case_by_case(_cosines), 20,
+        "a product of two unit vectors of 16 components", case_by_case(_cosines_slowly),
     ),
     Stage(
-        "attention", ("features", "neighbors"), _attention_inputs, _attention, 50,
+        "attention", ("features", "neighbors"), _attention_inputs, case_by_case(_attention), 50,
         f"logits of sums of 16 products, whose error the softmax multiplies by their size. {_HUGE}",
-        _attention_slowly, gradients=("q", "k", "v"), seeds=48, sizes=_products,
-        silent="an infinite logit is a weight of 1, and a token that nobody attends to has no effect",
+        case_by_case(_attention_slowly), gradients=("q", "k", "v"), seeds=48, sizes=_products,
+        silent=f"{_INFINITE}, and a token that nobody attends to has no effect",
     ),
-    *((Stage(
+]  # fmt: skip
+if "avx512f" in processor_features():
+    STAGES.append(Stage(
         "encoder kernel", ("features",), _head_inputs, _head_kernel, 100,
         f"logits of sums of 64 products; exponentials by a polynomial. {_HUGE}", _heads_slowly,
-        dtypes=_FLOAT32, no_dtype=_KERNEL, silent="an infinite logit is a weight of 1",
-    ),) if "avx512f" in processor_features() else ()),
-)  # fmt: skip
+        dtypes=("float32", "bfloat16", "float16"), no_dtype="the kernel takes float32", silent=_INFINITE,
+    ))  # fmt: skip

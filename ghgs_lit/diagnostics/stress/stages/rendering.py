@@ -4,7 +4,7 @@ import torch
 from torch import Generator
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.rendering import RasterSettings, reference, render
 from ghgs_lit.types import Cameras, Gaussians
 
@@ -43,23 +43,22 @@ def _cameras(v: Values) -> Cameras:
 
 def _project(v: Values) -> Values:
     """Centres, covariances, their inverses and determinants of the splats before the camera."""
-    each = []
-    gaussians, cameras = _gaussians(v), _cameras(v)
-    for i in range(len(v["means"])):
-        with torch.autocast("cpu", enabled=False):  # as in render()
-            splats = reference.project(gaussians[i], cameras[i, 0], RasterSettings(antialiased=True))
-        xx, xy, yy = splats.covariances.unbind(-1)
-        front = (splats.depths > 0)[:, None]
-        inverse = torch.stack((yy, -xy, xx), -1) / splats.determinants[:, None]
-        found = {
-            "centers": splats.centers,
-            "inverses": inverse,
-            # What is fainter is not drawn.
-            "opacities": torch.relu(splats.opacities[:, None] - 1 / 255),
-            "covariances": splats.covariances,
-        }
-        each.append({name: torch.where(front, value, 0.0) for name, value in found.items()})
-    return {name: torch.stack([one[name] for one in each]) for name in each[0]}
+    with torch.autocast("cpu", enabled=False):  # as in render()
+        splats = reference.project(
+            Gaussians(*(v[name] for name in _FIELDS), splits=(len(v["means"]),)),
+            _cameras(v)[0],
+            RasterSettings(antialiased=True),
+        )
+    xx, xy, yy = splats.covariances.unbind(-1)
+    found = {
+        "centers": splats.centers,
+        "inverses": torch.stack((yy, -xy, xx), -1) / splats.determinants[:, None],
+        # What is fainter is not drawn.
+        "opacities": torch.relu(splats.opacities[:, None] - 1 / 255),
+        "covariances": splats.covariances,
+    }
+    front = (splats.depths > 0)[:, None]
+    return {name: torch.where(front, value, 0.0) for name, value in found.items()}
 
 
 def _render(backend: str, v: Values) -> Values:
@@ -72,7 +71,7 @@ _NOT_DRAWN = "a splat that is not finite is not drawn; the report of ghgs predic
 
 STAGES = (
     Stage(
-        "splat projection", _TAKES, _inputs, _project, 100,
+        "splat projection", _TAKES, _inputs, case_by_case(_project), 100,
         "a product of four matrices, squared, and a quotient of two determinants",
         gradients=("means", "quaternions", "scales"), seeds=32, silent=_NOT_DRAWN,
         excluded={"on_camera": "nearer than near: left out before", "behind": "left out before"},

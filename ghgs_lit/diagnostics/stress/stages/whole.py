@@ -10,12 +10,12 @@ from torch import Generator, Tensor, nn
 
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values
+from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
 from ghgs_lit.diagnostics.stress.stages.geometry import batch_of, scene
 from ghgs_lit.losses import Losses
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
-from ghgs_lit.types import Batch, Cameras, DepthBounds, Gaussians, Prediction, Targets
+from ghgs_lit.types import Batch, Cameras, DepthBounds, Prediction, Targets
 
 _SIZE = 28
 _TINY = ("encoder.width=16", "encoder.heads=2", "encoder.depth=4", "encoder.layers=[0,1,2,3]")
@@ -55,13 +55,11 @@ def _inputs(family: str, g: Generator) -> Values:
 
 def _dense(prediction: Prediction, batch: Batch) -> Values:
     """Depths and Gaussians as maps, 0 where there are none; a depth of the subject that was lost is NaN."""
-    gaussians: Gaussians = prediction.gaussians
-    b, v, h, w = batch.masks.shape
-    rows = torch.cat(
-        (gaussians.means, gaussians.scales, gaussians.opacities[:, None], gaussians.colors), dim=-1
-    )
-    place = gaussians.image * (h * w) + gaussians.pixel
-    maps = rows.new_zeros(b * v * h * w, rows.shape[1]).index_copy(0, place, rows).reshape(b, v, h, w, -1)
+    gaussians, size = prediction.gaussians, batch.masks.shape
+    parts = (gaussians.means, gaussians.scales, gaussians.opacities[:, None], gaussians.colors)
+    rows = torch.cat(parts, dim=-1)
+    row = gaussians.image * (size[-2] * size[-1]) + gaussians.pixel
+    maps = rows.new_zeros(batch.masks.numel(), rows.shape[1]).index_copy(0, row, rows).unflatten(0, size)
     depth = torch.where(prediction.depth_valid, prediction.depth, torch.where(batch.masks, torch.nan, 0.0))
     return {"depth": depth, "means": maps[..., :3], "scales": maps[..., 3:6], "rest": maps[..., 6:]}
 
@@ -78,29 +76,22 @@ def _predict(name: str, v: Values) -> Values:
 _LOSSES = Losses({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 1.0}, chamfer="huber")
 
 
+@torch.enable_grad()
 def _step(v: Values) -> Values:
-    """The loss of each case, and the gradient of every parameter."""
-    losses, slopes = [], []
-    model = _model("hull", v)
-    for i in range(len(v["images"])):
-        one = {name: value[i : i + 1] for name, value in v.items()}
-        cameras = Cameras(*inputs.matrices(one["target_lenses"], one["target_poses"]), _SIZE, _SIZE)
-        masks = torch.ones(1, 1, _SIZE, _SIZE, dtype=torch.bool)
-        batch = batch_of(one)
-        surface = one["middle"] + 0.5 * inputs.directions(Generator().manual_seed(1), 40, 3).to(one["middle"])
-        batch = Batch(
-            batch.images, batch.masks, batch.cameras, Targets(one["target"], masks, cameras), [surface],
-            one["truth"],
-        )  # fmt: skip
-        with torch.enable_grad():
-            prediction = model(batch)
-            backend = "reference" if v["images"].dtype == torch.float64 else "cpu"
-            rendering = render(prediction.gaussians, cameras, backend)
-            total, values = _LOSSES(prediction, rendering, batch)
-            found = torch.autograd.grad(total, list(model.parameters()), allow_unused=True)
-        losses.append(torch.stack(list(values.values())))
-        slopes.append(torch.cat([s.flatten() for s in found if s is not None]))
-    return {"losses": torch.stack(losses), "gradient": torch.stack(slopes)}
+    """The loss of a case, and the gradient of every parameter."""
+    one = {name: value[None] for name, value in v.items()}
+    model, exact = _model("hull", one), v["images"].dtype == torch.float64
+    cameras = Cameras(*inputs.matrices(one["target_lenses"], one["target_poses"]), _SIZE, _SIZE)
+    masks = torch.ones(1, 1, _SIZE, _SIZE, dtype=torch.bool)
+    surface = one["middle"] + 0.5 * inputs.directions(Generator().manual_seed(1), 40, 3).to(one["middle"])
+    targets = Targets(one["target"], masks, cameras)
+    batch = dataclasses.replace(batch_of(one), targets=targets, body_vertices=[surface], depths=one["truth"])
+    prediction = model(batch)
+    rendering = render(prediction.gaussians, cameras, "reference" if exact else "cpu")
+    total, values = _LOSSES(prediction, rendering, batch)
+    slopes = torch.autograd.grad(total, list(model.parameters()), allow_unused=True)
+    gradient = torch.cat([slope.flatten() for slope in slopes if slope is not None])
+    return {"losses": torch.stack(list(values.values())), "gradient": gradient}
 
 
 def _far(v: Values) -> Tensor:
@@ -112,31 +103,40 @@ def _far(v: Values) -> Tensor:
 
 
 _NETWORK = "thirty layers in a row, each as accurate as a dense head alone; their errors add up"
-_SMALL = {
-    "wide": "the subject is smaller than a pixel",
-    "degenerate": "no photographs come from such a camera",
-}
-
-
-def _pipeline(name: str) -> Stage:
-    return Stage(
-        f"pipeline {name}", ("cameras", "images", "masks", "weights"), _inputs,
-        lambda v: _predict(name, v), 100, _NETWORK,
-        steady=("truth", "middle", "target", "target_lenses", "target_poses"), seeds=20, quick=1,
-        network=True, kappa=_far, excluded=_SMALL, refused=("out_of_range",),
-        silent="what the model does not read is not in its output",
-    )  # fmt: skip
-
+_FRAME = ("truth", "middle", "target", "target_lenses", "target_poses")
+#: What all rows here share.
+_stage = partial(
+    Stage,
+    ingredients=("cameras", "images", "masks", "weights"),
+    make=_inputs,
+    factor=100,
+    seeds=20,
+    quick=1,
+    network=True,
+    kappa=_far,
+    excluded={
+        "wide": "the subject is smaller than a pixel",
+        "degenerate": "no photographs come from such a camera",
+    },
+    refused=("out_of_range",),
+)
 
 STAGES = (
-    _pipeline("paper"),
-    _pipeline("hull"),
-    _pipeline("recurrent"),
-    Stage(
-        "training step", ("cameras", "images", "masks", "weights"), _inputs, _step, 100,
-        f"{_NETWORK}, forward and backward, and the losses'", seeds=20, quick=1, network=True, kappa=_far,
-        excluded=_SMALL,
-        steady=("middle",), refused=("out_of_range",),
+    *(
+        _stage(
+            f"pipeline {name}",
+            run=partial(_predict, name),
+            reason=_NETWORK,
+            steady=_FRAME,
+            silent="what the model does not read is not in its output",
+        )
+        for name in ("paper", "hull", "recurrent")
+    ),
+    _stage(
+        "training step",
+        run=case_by_case(_step),
+        reason=f"{_NETWORK}, forward and backward, and the losses'",
+        steady=("middle",),
         silent="what the step does not read is not in its loss",
     ),
-)  # fmt: skip
+)

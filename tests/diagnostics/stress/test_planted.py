@@ -1,0 +1,149 @@
+"""Defects planted one at a time in the code of the stages: the stress test reports each of them."""
+
+import inspect
+import sys
+import textwrap
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from ghgs_lit.bounds.agreement import trusted_views
+from ghgs_lit.diagnostics.stress.measure import measure
+from ghgs_lit.diagnostics.stress.stages import STAGES, heads
+from ghgs_lit.geometry import projection, rotations, sampling, vectors
+from ghgs_lit.geometry.padding import Padding
+from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.metrics import functional
+from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
+from ghgs_lit.rendering import reference
+from ghgs_lit.rendering.cpu import binning
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A line of ``function`` that is another one, and a stage, a family and a dtype that show it."""
+
+    says: str
+    function: Callable
+    before: str
+    after: str
+    stage: str
+    family: str
+    dtype: str = "float32"
+
+    def plant(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Change the function wherever it is known, until the test ends."""
+        function = inspect.unwrap(self.function)
+        source = textwrap.dedent(inspect.getsource(function))
+        assert source.count(self.before) == 1, self
+        changed: dict[str, Callable] = {}
+        exec(source.replace(self.before, self.after), vars(sys.modules[function.__module__]), changed)
+        code = inspect.unwrap(changed[function.__name__]).__code__
+        monkeypatch.setattr(function, "__code__", code)
+
+
+DEFECTS = (
+    Defect(
+        "a bare square root", vectors.unit, "keepdim=True).masked_fill(is_zero, 1.0)", "keepdim=True)",
+        "unit vectors", "zero_quaternion",
+    ),
+    Defect(
+        "squares that overflow", vectors.unit, "scaled = x / largest.masked_fill(is_zero, 1.0)", "scaled = x",
+        "unit vectors", "huge_quaternion",
+    ),
+    Defect(
+        "an epsilon that hides what is short", vectors.unit, "scaled * squared.rsqrt()",
+        "x / (x.norm(dim=-1, keepdim=True) + 1e-8)", "cosine", "tiny_features",
+    ),
+    Defect(
+        "geometry in half precision", projection.unproject, "x, y, z = x * depth",
+        "depth = depth.half().to(depth)\n    x, y, z = x * depth", "unprojection", "ordinary",
+    ),
+    Defect(
+        "a product that autocast catches", projection._camera_axes, "return [row",
+        "return list((extrinsics[..., :3, :3] @ points[..., None])[..., 0].unbind(-1))\n    return [row",
+        "projection", "ordinary", "bfloat16",
+    ),
+    Defect(
+        "a softmax without its maximum", SemanticAttention._attend_dense, "logits.softmax(-1)",
+        "logits.exp() / logits.exp().sum(-1, keepdim=True)", "attention", "huge_features",
+    ),
+    Defect(
+        "a mask that is dropped", SemanticAttention._attend_dense, "~neighbors.valid",
+        "~neighbors.valid & False", "attention", "masked",
+    ),
+    Defect(
+        "distances in half precision", nearest_neighbors, "torch.cdist(points[rows], points,",
+        "torch.cdist(points[rows].half().float(), points.half().float(),", "neighbours", "shifted",
+    ),
+    Defect(
+        "distances by products", nearest_neighbors, '"donot_use_mm_for_euclid_dist"',
+        '"use_mm_for_euclid_dist"', "neighbours", "shifted",
+    ),
+    Defect(
+        "the map of another subject", sampling.sample, "2 * image.to(pixels) + 1",
+        "2 * (image.to(pixels) + 1) % (2 * count) + 1", "samples of maps", "ordinary",
+    ),
+    Defect(
+        "a quaternion over its squared length", rotations.quaternion_to_matrix,
+        "q.norm(dim=-1, keepdim=True)", "q.square().sum(-1, keepdim=True)",
+        "quaternion and covariance", "ordinary",
+    ),
+    Defect(
+        "a window whose sum is not 1", functional._gaussian_window, "weights / weights.sum()", "weights",
+        "L1 and SSIM", "ordinary",
+    ),
+    Defect(
+        "a border on the wrong side", Padding.pad_batch, "cropped(self.top, self.left,",
+        "cropped(self.top, -self.left,",
+        "padding", "ordinary",
+    ),
+    Defect(
+        "a wrong mask that keeps its vote", trusted_views, "voting & ~", "voting | ~",
+        "bounds and hull", "wrong_mask",
+    ),
+    Defect(
+        "a Jacobian without its clamp", reference.project,
+        "torch.minimum(torch.maximum(tangents, low), high)", "tangents", "compositing", "beside",
+    ),
+)  # fmt: skip
+
+
+def failures(stage: str, family: str, dtype: str) -> int:
+    """How many of three cases fail."""
+    return sum(row["failures"] for row in measure(STAGES[stage], family, range(3), [dtype]))
+
+
+@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.says)
+def test_a_changed_line_is_reported(defect, monkeypatch):
+    """Without the defect the same cases pass."""
+    assert failures(defect.stage, defect.family, defect.dtype) == 0
+    defect.plant(monkeypatch)
+    assert failures(defect.stage, defect.family, defect.dtype) > 0
+
+
+def test_a_confidence_without_its_limit_is_reported(monkeypatch):
+    """exp(100) is infinite in float32, and is not in float64."""
+    monkeypatch.setitem(CONFIDENCES, "expp1", lambda c: 1 + c.exp())
+    assert failures("depth activation", "saturated", "float32") > 0
+
+
+def test_a_norm_without_its_epsilon_is_reported(monkeypatch):
+    """Tokens of 0 have no direction."""
+    for head in heads._HEADS.values():
+        monkeypatch.setattr(head.norm, "eps", 0.0)
+    assert failures("dense head", "zero_features", "float32") > 0
+
+
+def test_tiles_from_back_to_front_are_reported(monkeypatch):
+    """The order of the splats of a tile is that of their depths."""
+    right = binning.scatter
+
+    def reversed_(first, last, shifts, depths, *rest):
+        with np.errstate(all="ignore"):
+            return right(first, last, shifts, (1 / depths).astype(np.float32), *rest)
+
+    monkeypatch.setattr(binning, "scatter", reversed_)
+    assert failures("compositing", "ordinary", "float32") > 0
