@@ -14,7 +14,6 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
-from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
@@ -25,6 +24,7 @@ from ghgs_lit.training.checkpoints import Checkpoints
 from ghgs_lit.training.validation_pictures import Pictures
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.losses import losses_of
 from tests.helpers.models import close, config, make_model
 from tests.helpers.people import render_boxes
 from tests.helpers.pretend_device import DEVICE, pretend_device
@@ -110,7 +110,7 @@ class PretendAccelerator(Accelerator):
 def train(folder, **place):
     """Two steps and a validation with callbacks; gives the module."""
     options = Optimization(lr=1e-3, warmup=0.0, freeze_until={"gaussian_head.opacity": 0.4})
-    module = GHGSModule(make_model("model=hull"), REFERENCE, Losses(WEIGHTS), options, config("model=hull"))
+    module = GHGSModule(make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull"))
     loader = DataLoader([full_batch()] * 2, batch_size=None, collate_fn=lambda batch: batch)
     trainer = L.Trainer(
         **place,
@@ -146,7 +146,7 @@ def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywh
 
 def test_batches_are_copied_there_without_a_wait():
     """From pinned memory such copies run beside the step before."""
-    module = GHGSModule(make_model("model=hull"), REFERENCE, Losses(WEIGHTS), Optimization(lr=1e-3), {})
+    module = GHGSModule(make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), Optimization(lr=1e-3), {})
     with pretend_device() as log:
         batch = module.transfer_batch_to_device(full_batch(), DEVICE, 0)
         assert log.calls.total() >= 8

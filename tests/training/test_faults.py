@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.losses import Losses
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization, faults
 from ghgs_lit.training.faults import Step, first_fault
 from ghgs_lit.types import map_tensors
+from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
 from tests.helpers.scenes import training_batch
 
@@ -22,7 +22,7 @@ STAGES += ("renderer", "losses")
 def make_module(*overrides) -> GHGSModule:
     renderer = Renderer(backend="cpu")
     module = GHGSModule(
-        make_model(*overrides), renderer, Losses(LOSSES), Optimization(lr=0.01), config(*overrides)
+        make_model(*overrides), renderer, losses_of(LOSSES), Optimization(lr=0.01), config(*overrides)
     )
     return module.train()
 

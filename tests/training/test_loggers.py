@@ -13,7 +13,6 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import Memory, StepTime, resident_mb
 from ghgs_lit.training.clock import PARTS, StepClock
@@ -28,6 +27,7 @@ from ghgs_lit.training.loggers import (
     resume,
 )
 from ghgs_lit.training.validation_pictures import Attention, Pictures, PointClouds
+from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, flat_renderer
 
 
@@ -67,7 +67,7 @@ def run(tmp_path_factory):
     subject = GHGSModule(
         Staged(),
         flat_renderer,
-        Losses({"render_l1": 0.8, "chamfer": 1.0}),
+        losses_of({"render_l1": 0.8, "chamfer": 1.0}),
         Optimization(lr=0.05),
         {"seed": 1},
     )

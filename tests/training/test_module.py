@@ -14,7 +14,6 @@ from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses
 from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress, StepTime
@@ -22,6 +21,7 @@ from ghgs_lit.training.checkpoints import Checkpoints
 from ghgs_lit.training.optimization import require_whole_parameters
 from ghgs_lit.training.validation_pictures import Pictures
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, example_batch, flat_renderer, infinitely_steep
 
 RELEASE = Optimization(lr=1e-4, warmup=0.01, start_factor=0.04, end_factor=5e-4)
@@ -30,7 +30,7 @@ CONFIG = {"encoder": {"width": 3, "layers": [0, 1]}, "seed": 1, "resume": None}
 
 def module(renderer=flat_renderer, lr=0.05, **weights) -> GHGSModule:
     weights = weights or {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 0.5}
-    return GHGSModule(Standin(), renderer, Losses(weights), Optimization(lr=lr, warmup=0.1), CONFIG)
+    return GHGSModule(Standin(), renderer, losses_of(weights), Optimization(lr=lr, warmup=0.1), CONFIG)
 
 
 def trainer(folder, steps=12, callbacks=(), **options) -> L.Trainer:
@@ -136,7 +136,7 @@ def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
 def test_the_gradient_is_clipped(tmp_path):
     """One bad batch moves the weights by a bounded gradient."""
     subject = GHGSModule(
-        Standin(), flat_renderer, Losses({"depth": 100.0}), Optimization(lr=0.1, clip=0.5), CONFIG
+        Standin(), flat_renderer, losses_of({"depth": 100.0}), Optimization(lr=0.1, clip=0.5), CONFIG
     )
     norms = []
 
@@ -157,7 +157,7 @@ def scaled(folder, scale: float, steps: int = 3, renderer=flat_renderer, **weigh
     scaler = torch.amp.GradScaler("cpu", init_scale=scale)
     norms = []
     subject = GHGSModule(
-        Standin(), renderer, Losses(weights or {"depth": 1.0}), Optimization(lr=0.1, clip=0.5), CONFIG
+        Standin(), renderer, losses_of(weights or {"depth": 1.0}), Optimization(lr=0.1, clip=0.5), CONFIG
     )
     real = subject.log
     subject.log = lambda name, value, **o: (

@@ -11,7 +11,6 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO, Checkpoints
 from ghgs_lit.training.cost import TrainingCost
@@ -19,6 +18,7 @@ from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
 from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
 from ghgs_lit.training.validation_pictures import Pictures
+from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, _Steps, flat_renderer
 
 STEPS = 16
@@ -48,7 +48,7 @@ class Cut(L.Callback):
 
 def module() -> GHGSModule:
     # Frozen parameters and points drawn at random: both must know where the run stands.
-    losses = Losses({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
+    losses = losses_of({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
     optimization = Optimization(lr=0.05, warmup=0.1, freeze_until={"shift": 0.4})
     return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
