@@ -79,7 +79,10 @@ def second_step(model: GHGS, options: Optimization, batch: Batch, log: Log) -> C
 def step(
     model: GHGS, options: Optimization, optimizer: torch.optim.Optimizer, batch: Batch, log: Log
 ) -> Counts:
-    losses, probe = Losses(weights=LossWeights(render_l1=0.8, render_ssim=0, chamfer=0, depth=0.2)), CountingProbe(log)
+    losses, probe = (
+        Losses(weights=LossWeights(render_l1=0.8, render_ssim=0, chamfer=0, depth=0.2)),
+        CountingProbe(log),
+    )
     with probe.of("forward"):
         prediction = model(batch)
     with probe.of("loss"):

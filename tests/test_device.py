@@ -34,7 +34,7 @@ from tests.helpers.verbs import ghgs
 PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
 MODELS = ["model=paper", "model=hull", "compat=release"]
 WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
-REFERENCE = Renderer("reference")
+REFERENCE = Renderer(backend="reference")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -110,7 +110,9 @@ class PretendAccelerator(Accelerator):
 def train(folder, **place):
     """Two steps and a validation with callbacks; gives the module."""
     options = Optimization(lr=1e-3, warmup=0.0, freeze_until={"gaussian_head.opacity": 0.4})
-    module = GHGSModule(make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull"))
+    module = GHGSModule(
+        make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull")
+    )
     loader = DataLoader([full_batch()] * 2, batch_size=None, collate_fn=lambda batch: batch)
     trainer = L.Trainer(
         **place,

@@ -28,9 +28,7 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
     return 1 - values.mean()
 
 
-def chamfer(
-    prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None
-) -> Scalar:
+def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None) -> Scalar:
     """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean.
 
     Args:

@@ -248,7 +248,7 @@ def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes
             predictions.append(batch.subjects)
             return super().forward(batch)
 
-    method = {"model": ModelMethod(Counting(), Renderer("cpu"))}
+    method = {"model": ModelMethod(Counting(), Renderer(backend="cpu"))}
 
     def rows_of(names, pictures=None):
         chosen = {name: protocols[name] for name in names}
