@@ -33,7 +33,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "rounds": {"recurrent": "ghgs_lit.rounds.Rounds"},
     "renderer": {"splats": "ghgs_lit.rendering.Renderer"},
     "loss": {"weighted": "ghgs_lit.losses.Losses"},
-    "metrics": {"images": "ghgs_lit.metrics.ImageMetrics"},
+    "metrics": {"images": "ghgs_lit.metrics.MetricsOptions"},
     "optimizer": {"adamw": "ghgs_lit.training.Optimization"},
     "trainer": {"lightning": "lightning.pytorch.Trainer"},
     "data": {

@@ -123,7 +123,7 @@ class Renderer(Options):
 
     group = "renderer"
     backend: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
-    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch, slow), auto: by the device."""
+    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch); auto: by the device."""
     background: float | tuple[float, ...] = 0.0
     """Colour behind the Gaussians: one number or one for each channel."""
     near: Positive = 0.01

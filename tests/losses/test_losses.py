@@ -199,7 +199,7 @@ def test_subsampled_chamfer_is_unbiased():
         ({"weights": {"render_l1": 0.0}}, r"loss\.weights: expected at least one weight above 0"),
         (
             {"weights": {"chamfer": 1.0}, "chamfer_points": 0},
-            r"loss\.chamfer_points: expected an integer >= 1",
+            r"loss\.chamfer_points: expected an integer",
         ),
         ({"weights": {"depth": 1.0}, "depth": "metres"}, r"loss key: .*'depth'"),
     ],

@@ -61,7 +61,7 @@ def test_impossible_constants_are_refused_by_name(options, key):
 @pytest.mark.parametrize(("near", "far"), [(0.0, 1.0), (2.0, 1.0), (float("nan"), 1.0), (1.0, float("inf"))])
 def test_an_impossible_range_of_depths_is_refused(near, far):
     """Nothing would be drawn, or everything behind the camera."""
-    with pytest.raises(InputError, match="near|far"):
+    with pytest.raises(InputError, match=r"near|far"):
         render(cloud(5), camera_ring(1, 20, 30), "cpu", near=near, far=far)
 
 
