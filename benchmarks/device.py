@@ -70,7 +70,7 @@ def forward(model: GHGS, batch: Batch, log: Log) -> Counts:
 
 def second_step(model: GHGS, options: Optimization, batch: Batch, log: Log) -> Counts:
     """Counts of a training step whose renderer gives black images, without making the optimizer's state."""
-    optimizer = options.build(model)
+    optimizer = options.optimizer(model)
     step(model, options, optimizer, batch, log)
     optimizer.zero_grad()
     return step(model, options, optimizer, batch, log)

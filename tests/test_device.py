@@ -20,7 +20,7 @@ from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import StepTime
-from ghgs_lit.training.checkpoints import Checkpoints
+from ghgs_lit.training.checkpoints import CheckpointOptions
 from ghgs_lit.training.validation_pictures import Pictures
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint
@@ -114,12 +114,17 @@ def train(folder, **place):
         make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull")
     )
     loader = DataLoader([full_batch()] * 2, batch_size=None, collate_fn=lambda batch: batch)
+    last = CheckpointOptions(filename="last", every_n_train_steps=2)
     trainer = L.Trainer(
         **place,
         max_steps=2,
         limit_val_batches=1,
         default_root_dir=folder,
-        callbacks=[StepTime(), Pictures(1), Checkpoints(filename="last", every_n_train_steps=2)],
+        callbacks=[
+            StepTime(),
+            Pictures(1),
+            CheckpointOptions(filename="last", every_n_train_steps=2).build(),
+        ],
         logger=False,
         enable_progress_bar=False,
         enable_model_summary=False,

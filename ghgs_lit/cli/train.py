@@ -10,7 +10,6 @@ import lightning.pytorch as L
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from torch import nn
 
@@ -18,7 +17,6 @@ from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder import open_cache
-from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
@@ -42,7 +40,6 @@ from ghgs_lit.training.budgets import TokenBudgets
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.interruption import StopAtStep
-from ghgs_lit.training.optimization import require_whole_parameters
 
 
 def quiet() -> None:
@@ -81,27 +78,20 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
     """The Trainer with its loggers and callbacks, which all write below ``directory``.
 
     Raises:
-        InputError: the Trainer refuses its settings, or the strategy divides parameters among processes.
+        InputError: the Trainer refuses its options, or the strategy divides parameters among processes.
     """
-    built = [
-        build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()
-    ]
-    callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    try:
-        trainer = build(
-            config["trainer"],
-            "trainer",
-            logger=built or False,
-            plugins=[AtomicCheckpointIO()],
-            callbacks=[*further, *callbacks],
-            default_root_dir=str(directory),
-            enable_checkpointing=any(isinstance(c, Checkpoint) for c in [*further, *callbacks]),
-            enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
-        )
-    except (MisconfigurationException, TypeError, ValueError) as error:
-        raise InputError(f"trainer: {error}") from None
-    require_whole_parameters(trainer)
-    return trainer
+    logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
+    callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
+    return build(
+        config["trainer"],
+        "trainer",
+        logger=logs or False,
+        plugins=[AtomicCheckpointIO()],
+        callbacks=callbacks,
+        default_root_dir=str(directory),
+        enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
+        enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
+    )
 
 
 def run(cfg: DictConfig) -> float | str | None:

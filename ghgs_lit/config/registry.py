@@ -35,7 +35,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "loss": {"weighted": "ghgs_lit.losses.Losses"},
     "metrics": {"images": "ghgs_lit.metrics.MetricsOptions"},
     "optimizer": {"adamw": "ghgs_lit.training.Optimization"},
-    "trainer": {"lightning": "lightning.pytorch.Trainer"},
+    "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
         "humman": "ghgs_lit.data.datamodules.HuMManDataModule",
         "rendered": "ghgs_lit.data.datamodules.RenderedDataModule",
@@ -45,18 +45,18 @@ KINDS: dict[str, dict[str | None, str]] = {
         "zju_mocap": "ghgs_lit.data.datamodules.ZJUMoCapDataModule",
     },
     "callbacks": {
-        "attention": "ghgs_lit.training.validation_pictures.Attention",
-        "checkpoints": "ghgs_lit.training.checkpoints.Checkpoints",
-        "memory": "ghgs_lit.training.callbacks.Memory",
-        "pictures": "ghgs_lit.training.validation_pictures.Pictures",
-        "point_clouds": "ghgs_lit.training.validation_pictures.PointClouds",
-        "progress": "ghgs_lit.training.callbacks.RunProgress",
-        "step_time": "ghgs_lit.training.callbacks.StepTime",
+        "attention": "ghgs_lit.training.validation_pictures.AttentionOptions",
+        "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
+        "memory": "ghgs_lit.training.callbacks.MemoryOptions",
+        "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
+        "point_clouds": "ghgs_lit.training.validation_pictures.PointCloudOptions",
+        "progress": "ghgs_lit.training.callbacks.ProgressOptions",
+        "step_time": "ghgs_lit.training.callbacks.StepTimeOptions",
     },
     "logger": {
-        "csv": "ghgs_lit.training.loggers.CsvLog",
-        "tensorboard": "ghgs_lit.training.loggers.TensorBoardLog",
-        "wandb": "ghgs_lit.training.loggers.WandbLog",
+        "csv": "ghgs_lit.training.loggers.CsvOptions",
+        "tensorboard": "ghgs_lit.training.loggers.TensorBoardOptions",
+        "wandb": "ghgs_lit.training.loggers.WandbOptions",
     },
 }
 

@@ -88,7 +88,7 @@ class BudgetedModule(L.LightningModule):
         return getattr(self.trainer.precision_plugin, "scaler", None)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = self.optimization.build(self.model, fused=self._scaler is None)
+        optimizer = self.optimization.optimizer(self.model, fused=self._scaler is None)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 
