@@ -114,7 +114,6 @@ def train(folder, **place):
         make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull")
     )
     loader = DataLoader([full_batch()] * 2, batch_size=None, collate_fn=lambda batch: batch)
-    last = CheckpointOptions(filename="last", every_n_train_steps=2)
     trainer = L.Trainer(
         **place,
         max_steps=2,

@@ -8,11 +8,12 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Count, Index, Options, Share, Text
+from ghgs_lit.config.options import Amount, Count, Index, Options, Share, Text
 from ghgs_lit.errors import InputError, require
 
 Duration = Annotated[
-    str, Field(pattern=r"^\d+(:\d+){3}$"), Words("days:hours:minutes:seconds such as 00:00:10:00")
+    Annotated[str, Field(pattern=r"^\d+(:\d+){3}$")] | dict[str, Amount],
+    Words("days:hours:minutes:seconds such as 00:00:10:00"),
 ]
 
 
