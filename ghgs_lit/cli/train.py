@@ -3,6 +3,7 @@
 import logging
 import time
 import warnings
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 from torch import nn
 
-from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
+from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder import open_cache
@@ -48,6 +49,14 @@ def quiet() -> None:
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
     for message in (*messages, "The dirpath has changed", "overridden `transfer_batch_to_device`"):
         warnings.filterwarnings("ignore", f".*{message}.*")
+
+
+@cache
+def say_which_model() -> None:
+    """Print, once in a process, that the default is not the paper's model, where nothing chose one."""
+    chosen = {"model", "experiment", "sweep"} & set(said())
+    if choices().get("model") == "hull" and not chosen:
+        print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
 def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int | None:
@@ -152,6 +161,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     """
     if rank_zero_only.rank == 0:
         write_config(config, directory)
+        say_which_model()
     L.seed_everything(config["seed"], workers=True, verbose=False)
     data = build_data(config)
     model = GHGS.from_config(config)
