@@ -32,11 +32,11 @@ def nested(key, value):
 
 def untyped(config, parent=""):
     """``config`` without the nodes that are options, which are checked here."""
-    return {
-        name: untyped(value, f"{name}.") if f"{parent}{name}" in NAMED else value
-        for name, value in config.items()
-        if not is_typed(f"{parent}{name}", value)
-    }
+    rest = {name: value for name, value in config.items() if not is_typed(f"{parent}{name}", value)}
+    named = (
+        {} if parent else {name: untyped(config[name] or {}, f"{name}.") for name in NAMED if name in config}
+    )
+    return {name: value for name, value in {**rest, **named}.items() if value or name not in NAMED}
 
 
 @functools.cache
