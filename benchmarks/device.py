@@ -25,7 +25,7 @@ from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
 from ghgs_lit.kernels.watching import Inputs, Watcher
-from ghgs_lit.losses import Losses
+from ghgs_lit.losses import Losses, LossWeights
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import Optimization
 from ghgs_lit.types import Batch, Rendering
@@ -72,7 +72,7 @@ def forward(model: GHGS, batch: Batch, log: Log) -> Counts:
 
 def second_step(model: GHGS, options: Optimization, batch: Batch, log: Log) -> Counts:
     """Counts of a training step whose renderer gives black images, without making the optimizer's state."""
-    optimizer = options.build(model)
+    optimizer = options.optimizer(model)
     step(model, options, optimizer, batch, log)
     optimizer.zero_grad()
     return step(model, options, optimizer, batch, log)
@@ -81,7 +81,10 @@ def second_step(model: GHGS, options: Optimization, batch: Batch, log: Log) -> C
 def step(
     model: GHGS, options: Optimization, optimizer: torch.optim.Optimizer, batch: Batch, log: Log
 ) -> Counts:
-    losses, probe = Losses({"render_l1": 0.8, "depth": 0.2}), CountingProbe(log)
+    losses, probe = (
+        Losses(weights=LossWeights(render_l1=0.8, render_ssim=0, chamfer=0, depth=0.2)),
+        CountingProbe(log),
+    )
     with probe.of("forward"):
         prediction = model(batch)
     with probe.of("loss"):

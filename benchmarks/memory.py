@@ -43,7 +43,10 @@ def measured_prediction(config: dict, scene: Scene) -> int:
 def measured_training(config: dict, scene: Scene) -> int:
     """Peak bytes of a second training step in addition to weights and moments."""
     model, renderer = GHGS.from_config(config), build(config["renderer"], "renderer")
-    losses, optimizer = build(config["loss"], "loss"), build(config["optimizer"], "optimizer").build(model)
+    losses, optimizer = (
+        build(config["loss"], "loss"),
+        build(config["optimizer"], "optimizer").optimizer(model),
+    )
     batch = _batch(scene)
     batch = dataclasses.replace(
         batch, depths=2.0 * batch.masks, body_vertices=[torch.rand(10475, 3) for _ in batch.images]

@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ghgs_lit.encoder.rope import rotary_tables
-from ghgs_lit.geometry.chamfer import chamfer
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import CONFIDENCES
@@ -57,23 +56,6 @@ def inverse_depth() -> list[Row]:
             f"depth is float32 under any autocast; confidence of raw 100: {confident:.2g}",
         ),
     ]  # fmt: skip
-
-
-def outlier() -> Row:
-    g = torch.Generator().manual_seed(0)
-    surface = F.normalize(torch.randn(2000, 3, generator=g), dim=1)
-    points = surface[torch.randperm(2000, generator=g)] + 0.01 * torch.randn(2000, 3, generator=g)
-    losses = {}
-    for kind in ("squared", "huber"):
-        moved = points.clone()
-        moved[0] = torch.tensor([1000.0, 0.0, 0.0])
-        losses[kind] = [float(chamfer(p, surface, kind)) for p in (points, moved)]
-    plain, ours = losses["squared"], losses["huber"]
-    return (
-        "W3", "a mean of squared distances, one of 2000 points at 1 km",
-        f"{plain[0]:.2g} becomes {plain[1]:.3g}",
-        f"`loss.chamfer=huber`: {ours[0]:.2g} becomes {ours[1]:.2g}",
-    )  # fmt: skip
 
 
 def similarity() -> Row:
@@ -218,7 +200,6 @@ def intrinsics() -> Row:
 def main() -> None:
     rows = [
         *inverse_depth(),
-        outlier(),
         similarity(),
         *token_places(),
         residual(),

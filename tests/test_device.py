@@ -14,17 +14,17 @@ from ghgs_lit.config import conf_dir
 from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
-from ghgs_lit.losses import Losses
-from ghgs_lit.metrics import ImageMetrics
+from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import StepTime
-from ghgs_lit.training.checkpoints import Checkpoints
+from ghgs_lit.training.checkpoints import CheckpointOptions
 from ghgs_lit.training.validation_pictures import Pictures
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint
+from tests.helpers.losses import losses_of
 from tests.helpers.models import close, config, make_model
 from tests.helpers.people import render_boxes
 from tests.helpers.pretend_device import DEVICE, pretend_device
@@ -34,7 +34,7 @@ from tests.helpers.verbs import ghgs
 PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
 MODELS = ["model=paper", "model=hull", "compat=release"]
 WEIGHTS = {"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 0.01, "depth": 0.5}
-REFERENCE = Renderer("reference")
+REFERENCE = Renderer(backend="reference")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -110,14 +110,20 @@ class PretendAccelerator(Accelerator):
 def train(folder, **place):
     """Two steps and a validation with callbacks; gives the module."""
     options = Optimization(lr=1e-3, warmup=0.0, freeze_until={"gaussian_head.opacity": 0.4})
-    module = GHGSModule(make_model("model=hull"), REFERENCE, Losses(WEIGHTS), options, config("model=hull"))
+    module = GHGSModule(
+        make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), options, config("model=hull")
+    )
     loader = DataLoader([full_batch()] * 2, batch_size=None, collate_fn=lambda batch: batch)
     trainer = L.Trainer(
         **place,
         max_steps=2,
         limit_val_batches=1,
         default_root_dir=folder,
-        callbacks=[StepTime(), Pictures(1), Checkpoints(filename="last", every_n_train_steps=2)],
+        callbacks=[
+            StepTime(),
+            Pictures(1),
+            CheckpointOptions(filename="last", every_n_train_steps=2).build(),
+        ],
         logger=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -146,7 +152,7 @@ def test_training_there_changes_the_weights_alike_and_its_checkpoint_loads_anywh
 
 def test_batches_are_copied_there_without_a_wait():
     """From pinned memory such copies run beside the step before."""
-    module = GHGSModule(make_model("model=hull"), REFERENCE, Losses(WEIGHTS), Optimization(lr=1e-3), {})
+    module = GHGSModule(make_model("model=hull"), REFERENCE, losses_of(WEIGHTS), Optimization(lr=1e-3), {})
     with pretend_device() as log:
         batch = module.transfer_batch_to_device(full_batch(), DEVICE, 0)
         assert log.calls.total() >= 8
@@ -159,7 +165,7 @@ def test_batches_are_copied_there_without_a_wait():
 def test_everything_is_measured_there(tmp_path, monkeypatch):
     """The model, refined too, and all baselines, with all metrics and pictures: rows are those of the CPU."""
     monkeypatch.setattr("ghgs_lit.prediction.refinement.cameras._STEPS", 3)
-    metrics = ImageMetrics(regions=("image", "box", "subject"), lpips="off")
+    metrics = MetricsOptions(regions=("image", "box", "subject"), lpips="off").build()
 
     def rows(device):
         def build():

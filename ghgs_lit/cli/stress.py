@@ -41,10 +41,10 @@ def run(cfg: DictConfig) -> None:
 
 def _replay(path: str) -> None:
     """Print what is wrong with a saved step; exit code 1 where it still is."""
-    again = replay(path)
-    print(f"step {again.global_step}, when it was saved: {again.recorded}")
-    print(f"step {again.global_step}, now: {again.found or 'all values are finite'}")
-    if again.found is not None:
+    step, recorded, fault = replay(path)
+    print(f"step {step}, when it was saved: {recorded}")
+    print(f"step {step}, now: {fault or 'all values are finite'}")
+    if fault is not None:
         raise SystemExit(1)
 
 

@@ -3,6 +3,7 @@
 import logging
 import time
 import warnings
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,13 @@ import lightning.pytorch as L
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 from torch import nn
 
-from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides
+from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
 from ghgs_lit.encoder import FeatureCacheOptions
-from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
@@ -42,7 +41,6 @@ from ghgs_lit.training.budgets import TokenBudgets
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.interruption import StopAtStep
-from ghgs_lit.training.optimization import require_whole_parameters
 
 
 def quiet() -> None:
@@ -51,6 +49,14 @@ def quiet() -> None:
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
     for message in (*messages, "The dirpath has changed", "overridden `transfer_batch_to_device`"):
         warnings.filterwarnings("ignore", f".*{message}.*")
+
+
+@cache
+def say_which_model() -> None:
+    """Print, once in a process, that the default is not the paper's model, where nothing chose one."""
+    chosen = {"model", "experiment", "sweep"} & set(said())
+    if choices().get("model") == "hull" and not chosen:
+        print("training model=hull, which learns in minutes; model=paper is the paper's method", flush=True)
 
 
 def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int | None:
@@ -81,27 +87,20 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
     """The Trainer with its loggers and callbacks, which all write below ``directory``.
 
     Raises:
-        InputError: the Trainer refuses its settings, or the strategy divides parameters among processes.
+        InputError: the Trainer refuses its options, or the strategy divides parameters among processes.
     """
-    built = [
-        build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()
-    ]
-    callbacks = [build(node, f"callbacks.{name}") for name, node in config["callbacks"].items()]
-    try:
-        trainer = build(
-            config["trainer"],
-            "trainer",
-            logger=built or False,
-            plugins=[AtomicCheckpointIO()],
-            callbacks=[*further, *callbacks],
-            default_root_dir=str(directory),
-            enable_checkpointing=any(isinstance(c, Checkpoint) for c in [*further, *callbacks]),
-            enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
-        )
-    except (MisconfigurationException, TypeError, ValueError) as error:
-        raise InputError(f"trainer: {error}") from None
-    require_whole_parameters(trainer)
-    return trainer
+    logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
+    callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
+    return build(
+        config["trainer"],
+        "trainer",
+        logger=logs or False,
+        plugins=[AtomicCheckpointIO()],
+        callbacks=callbacks,
+        default_root_dir=str(directory),
+        enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
+        enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
+    )
 
 
 def run(cfg: DictConfig) -> float | str | None:
@@ -162,6 +161,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     """
     if rank_zero_only.rank == 0:
         write_config(config, directory)
+        say_which_model()
     L.seed_everything(config["seed"], workers=True, verbose=False)
     data = build_data(config)
     model = GHGS.from_config(config)

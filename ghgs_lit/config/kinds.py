@@ -87,7 +87,6 @@ def text_like(pattern: str, expected: str) -> Kind:
 
 NULL = Kind("null", lambda value: value is None)
 FLAG = Kind("true or false", lambda value: isinstance(value, bool))
-ANY_TEXT = Kind("a text", lambda value: isinstance(value, str))
 TEXT = Kind("a text", lambda value: isinstance(value, str) and value != "")
 PATH = Kind("a path", TEXT.holds) | NULL
 COUNT = integer(least=1)

@@ -8,10 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.projection import at_least_float32
-
-KINDS = ("squared", "huber", "truncated")
 
 
 def nearest(
@@ -38,25 +35,6 @@ def nearest(
     return torch.cat(blocks) if blocks else queries.new_zeros(0, dtype=torch.long)
 
 
-def penalty(offsets: Float[Tensor, "n 3"], kind: str, scale: float) -> Float[Tensor, " n"]:
-    """The cost of pairs at a distance d: d^2 up to ``scale``.
-
-    Args:
-        offsets: differences of the pairs, in metres.
-        kind: beyond ``scale``: ``squared``, d^2; ``huber``, 2 scale d - scale^2; ``truncated``, scale^2.
-        scale: in metres.
-    """
-    squared = offsets.square().sum(-1)
-    if kind == "squared":
-        return squared
-    limit = scale * scale
-    if kind == "truncated":
-        return squared.clamp(max=limit)
-    outside = squared > limit
-    distance = torch.where(outside, squared, torch.full_like(squared, limit)).sqrt()
-    return torch.where(outside, 2 * scale * distance - limit, squared)
-
-
 def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, "m 3"]:
     """At most ``limit`` of the points (None: all), evenly spaced in memory from a random start."""
     if limit is None or len(points) <= limit:
@@ -67,33 +45,25 @@ def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, 
 
 
 def chamfer(
-    points: Float[Tensor, "n 3"],
-    references: Float[Tensor, "m 3"],
-    kind: str = "squared",
-    scale: float = 0.1,
-    limit: int | None = None,
+    points: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], limit: int | None = None
 ) -> Float[Tensor, ""]:
-    """Mean penalty from each point to its nearest reference, plus the mean the other way round.
+    """Mean squared distance from each point to its nearest reference, plus the mean the other way round.
 
     Args:
         points: the prediction, in metres.
         references: the surface, in metres.
-        kind: of :func:`penalty`.
-        scale: of :func:`penalty`, in metres.
         limit: points of each set that are matched at most (to all of the other set, so that the mean stays
             unbiased); None: all.
 
     Returns:
         0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
     """
-    choice("chamfer.kind", kind, KINDS)
-    require(scale > 0, "chamfer.scale", "a positive number of metres", scale)
     points, references = at_least_float32(points), at_least_float32(references)
     if not (torch.isfinite(points).all() and torch.isfinite(references).all()):
         return (points.sum() + references.sum()) * torch.nan
     if len(points) == 0 or len(references) == 0:
         return points.sum() * 0 + references.sum() * 0
     some, few = subsample(points, limit), subsample(references, limit)
-    there = penalty(some - references[nearest(some, references)], kind, scale)
-    back = penalty(points[nearest(few, points)] - few, kind, scale)
+    there = (some - references[nearest(some, references)]).square().sum(-1)
+    back = (points[nearest(few, points)] - few).square().sum(-1)
     return there.mean() + back.mean()

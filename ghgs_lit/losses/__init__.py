@@ -1,5 +1,5 @@
 """Training losses."""
 
-from ghgs_lit.losses.losses import Losses
+from ghgs_lit.losses.losses import Losses, LossWeights
 
-__all__ = ["Losses"]
+__all__ = ["LossWeights", "Losses"]

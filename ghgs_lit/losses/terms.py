@@ -28,22 +28,13 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
     return 1 - values.mean()
 
 
-def chamfer(
-    prediction: Prediction,
-    rendering: Rendering,
-    batch: Batch,
-    kind: str = "squared",
-    scale: float = 0.1,
-    points: int | None = None,
-) -> Scalar:
+def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None) -> Scalar:
     """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean.
 
     Args:
         prediction: its points are those before the Gaussian head's offset.
         rendering: not used.
         batch: with body vertices.
-        kind: ``squared``, ``huber`` or ``truncated``.
-        scale: metres beyond which ``huber`` and ``truncated`` differ from ``squared``.
         points: how many points of each set are matched; None for all.
 
     Raises:
@@ -53,14 +44,14 @@ def chamfer(
         raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
     used = prediction.points.valid & batch.masks
     values = [
-        chamfer_distance(prediction.points.pixels[b][used[b]], vertices, kind, scale, points)
+        chamfer_distance(prediction.points.pixels[b][used[b]], vertices, points)
         for b, vertices in enumerate(batch.body_vertices)
     ]
     return torch.stack(values).mean()
 
 
-def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: bool = False) -> Scalar:
-    """Mean |z - true z| over the subject's pixels with a true depth; 0 where there are none.
+def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
+    """Mean |z - true z| in metres over the subject's pixels with a true depth; 0 where there are none.
 
     Of a model with rounds the sum over the depths before the first round and after each, as the sequence loss
     of RAFT (Teed and Deng, ECCV 2020) without its weights.
@@ -69,7 +60,6 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
         prediction: its depth, where valid.
         rendering: not used.
         batch: with depth maps.
-        relative: divide by the true depth; otherwise metres.
 
     Raises:
         InputError: the data has no depth maps.
@@ -80,5 +70,4 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch, relative: 
     truth = torch.where(used, batch.depths, 1)
     rounds = prediction.rounds or (prediction.depth_maps,)
     errors = [(torch.where(used, at_least_float32(maps.depth), truth) - truth).abs() for maps in rounds]
-    errors = [error / truth if relative else error for error in errors]
     return sum(error.sum() for error in errors) / used.sum().clamp(min=1)

@@ -15,8 +15,8 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.metrics.functional import correlate
 
-PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * math.pi / 180
-"""The paper's viewer: 0.7 m away from a screen 0.7 m wide with 3840 pixels."""
+PIXELS_PER_DEGREE = 67.0206
+"""Resolution in the eye of the paper's viewer: 0.7 m away from a screen 0.7 m wide with 3840 pixels."""
 
 # Contrast sensitivity as sums of Gaussians (table 1): amplitude and width for each opponent channel.
 _SENSITIVITY = {"Y": ((1.0, 0.0047),), "Cx": ((1.0, 0.0053),), "Cz": ((34.1, 0.04), (13.5, 0.025))}
@@ -131,25 +131,20 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
     return strengths[0], strengths[1]
 
 
-def flip_map(
-    image: Float[Tensor, "n 3 h w"],
-    target: Float[Tensor, "n 3 h w"],
-    pixels_per_degree: float = PIXELS_PER_DEGREE,
-) -> Float[Tensor, "n h w"]:
+def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
     """FLIP of each pixel, in [0, 1].
 
     Args:
         image, target: values outside [0, 1] are clamped first.
-        pixels_per_degree: resolution in the viewer's eye.
     """
     # Each image separately: rounding can depend on the position in memory, and equal images must give 0.
     with torch.autocast(image.device.type, enabled=False):
         image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)
         to_xyz, _ = _xyz_matrices(image)
         first, second = (_opponent(_transform_colors(_linear_rgb(i), to_xyz)) for i in (image, target))
-        color = _color_difference(first, second, pixels_per_degree)
+        color = _color_difference(first, second, PIXELS_PER_DEGREE)
         edges, points = zip(
-            *(_features((i[:, :1] + 16) / 116, pixels_per_degree) for i in (first, second)), strict=True
+            *(_features((i[:, :1] + 16) / 116, PIXELS_PER_DEGREE) for i in (first, second)), strict=True
         )
         difference = torch.maximum((edges[0] - edges[1]).abs(), (points[0] - points[1]).abs())
         feature = (difference / math.sqrt(2)).clamp(0, 1) ** _FEATURE_EXPONENT

@@ -1,95 +1,98 @@
 """A measuring protocol: which metrics are computed, how, and under which names."""
 
-from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE
-from ghgs_lit.metrics.functional import PSNR_CAP, REGIONS
-from ghgs_lit.metrics.metric import FLIP, LPIPS, PSNR, SSIM, PerImageMetric
+from ghgs_lit.config.options import Amount, Options, Text
+from ghgs_lit.errors import InputError
+from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
+from ghgs_lit.metrics.functional import (
+    PSNR_CAP,
+    REGIONS,
+    decibels,
+    mean_inside,
+    mean_over,
+    region_of,
+    squared_error,
+    ssim_map,
+)
+from ghgs_lit.metrics.lpips import LPIPS, NETWORK
 
-LPIPS_POLICIES = ("auto", "require", "off")
+
+class MetricsOptions(Options):
+    """What is measured, and how."""
+
+    group = "metrics"
+    protocol: Text = "correct"
+    """Name that is reported with every number."""
+    regions: tuple[Literal["image", "box", "subject"], ...] = REGIONS
+    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP)."""
+    box_margin: Amount = 0.0
+    """Part of the box's height and width that is added to it on each side."""
+    ssim_padding: Literal["reflect", "valid", "zeros"] = "reflect"
+    """Border of SSIM: reflect (torchmetrics), valid (none, scikit-image), zeros (the authors)."""
+    clamp: bool = True
+    """Whether renders are clamped to [0, 1] first."""
+    lpips: Literal["auto", "require", "off"] = "auto"
+    """auto: left out, with a message, where torchvision or its weights are missing; require: an error."""
+    lpips_signed: bool = True
+    """Whether LPIPS sees [-1, 1], for which it was calibrated; false: [0, 1]."""
+
+    def build(self) -> "ImageMetrics":
+        return ImageMetrics(self)
 
 
 class ImageMetrics:
     """All metrics of a protocol: ``metrics(image, target, mask)`` gives one value per image by name.
 
     The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
-    ``_subject`` added for the other ``regions`` (no FLIP for the subject's pixels alone, since it blurs).
+    ``_subject`` added for the other regions (no FLIP for the subject's pixels alone, since it blurs).
 
-    Args:
+    Attributes:
         protocol: the name that is reported with every number.
-        regions: where PSNR and SSIM are measured: ``image``, ``box``, ``subject``.
-        ssim_padding: ``reflect`` (torchmetrics), ``valid`` (scikit-image) or ``zeros`` (the authors).
-        clamp: clamp renders to [0, 1] first.
-        lpips: ``auto`` leaves LPIPS out where it is not available (``left_out`` says why), ``require`` raises
-            an error there, ``off`` never computes it.
-        lpips_net: ``vgg``, ``alex`` or ``squeeze``.
-        lpips_signed: feed LPIPS [-1, 1] (its calibration) instead of [0, 1].
-        flip_pixels_per_degree: FLIP's viewing distance.
-        box_margin: part of the box's height and width that is added to it on each side.
+        left_out: why metrics are left out, by name.
     """
 
-    def __init__(
-        self,
-        protocol: str = "correct",
-        regions: Sequence[str] = REGIONS,
-        ssim_padding: str = "reflect",
-        clamp: bool = True,
-        lpips: str = "auto",
-        lpips_net: str = "vgg",
-        lpips_signed: bool = True,
-        flip_pixels_per_degree: float = PIXELS_PER_DEGREE,
-        box_margin: float = 0.0,
-    ):
-        choice("metrics.lpips", lpips, LPIPS_POLICIES)
-        for region in regions:
-            choice("metrics.regions", region, REGIONS)
-        require(box_margin >= 0, "metrics.box_margin", "a share of at least 0", box_margin)
-        self.protocol, self.clamp, self.box_margin = protocol, clamp, box_margin
-        self.metrics: dict[str, PerImageMetric] = {}
+    def __init__(self, options: MetricsOptions):
+        self.options, self.protocol = options, options.protocol
+        self.lpips: LPIPS | None = None
         self.left_out: dict[str, str] = {}
-        for region in regions:
-            suffix = "" if region == "image" else f"_{region}"
-            self.metrics[f"psnr{suffix}"] = PSNR(region, box_margin)
-            self.metrics[f"ssim{suffix}"] = SSIM(ssim_padding, region, box_margin=box_margin)
-            if region != "subject":
-                self.metrics[f"flip{suffix}"] = FLIP(region, flip_pixels_per_degree, box_margin=box_margin)
-        if lpips != "off":
+        if options.lpips != "off":
             try:
-                self.metrics["lpips"] = LPIPS(lpips_net, lpips_signed)
+                self.lpips = LPIPS(options.lpips_signed)
             except InputError as error:
-                if lpips == "require":
+                if options.lpips == "require":
                     raise
                 self.left_out["lpips"] = str(error)
 
     def to(self, device: torch.device | str) -> "ImageMetrics":
-        self.metrics = {name: metric.to(device) for name, metric in self.metrics.items()}
+        if self.lpips is not None:
+            self.lpips.network = self.lpips.network.to(device)
         return self
 
     @property
     def definitions(self) -> dict[str, str]:
         """How each metric and region is defined, to be stored beside the numbers."""
+        options = self.options
         said = {
-            "image": f"renders {'clamped to [0, 1]' if self.clamp else 'as they are'}, RGB, data range 1",
+            "image": f"renders {'clamped to [0, 1]' if options.clamp else 'as they are'}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
             "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
         }
-        for metric in self.metrics.values():
-            if isinstance(metric, SSIM):
-                said["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {metric.padding}"
-            elif isinstance(metric, FLIP):
-                said["flip"] = f"FLIP at {metric.pixels_per_degree:.2f} pixels a degree"
-            elif isinstance(metric, LPIPS):
-                said["lpips"] = f"{metric.net} on {'[-1, 1]' if metric.signed else '[0, 1]'}, whole image"
-            if metric.region == "box":
-                margin = f", {self.box_margin:g} of its sides wider on each side" if self.box_margin else ""
-                said["box"] = f"the smallest upright box of the subject's mask in the target{margin}"
-            elif metric.region == "subject":
-                said["subject"] = "the pixels of the subject's mask in the target"
+        if options.regions:
+            said["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
+        if {"image", "box"} & set(options.regions):
+            said["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
+        if "box" in options.regions:
+            wider = f", {options.box_margin:g} of its sides wider on each side" * (options.box_margin > 0)
+            said["box"] = f"the smallest upright box of the subject's mask in the target{wider}"
+        if "subject" in options.regions:
+            said["subject"] = "the pixels of the subject's mask in the target"
+        if self.lpips is not None:
+            said["lpips"] = f"{NETWORK} on {'[-1, 1]' if options.lpips_signed else '[0, 1]'}, whole image"
         return said
 
     @torch.no_grad()
@@ -100,9 +103,19 @@ class ImageMetrics:
         mask: Bool[Tensor, "n h w"],
     ) -> dict[str, Tensor]:
         """One value per image for each metric; nan where a region is empty."""
-        image = image.clamp(0, 1) if self.clamp else image
-        maps: dict[tuple, Tensor] = {}
-        for metric in self.metrics.values():
-            if metric.map_key not in maps:
-                maps[metric.map_key] = metric.maps(image, target)
-        return {name: metric.pool(maps[metric.map_key], mask) for name, metric in self.metrics.items()}
+        options = self.options
+        image = image.clamp(0, 1) if options.clamp else image
+        errors = squared_error(image, target)
+        similarity = ssim_map(image, target, options.ssim_padding).mean(1)
+        difference = flip_map(image, target) if {"image", "box"} & set(options.regions) else None
+        values = {}
+        for name in options.regions:
+            suffix = "" if name == "image" else f"_{name}"
+            region = region_of(mask, name, options.box_margin)
+            values[f"psnr{suffix}"] = decibels(mean_over(errors, region))
+            values[f"ssim{suffix}"] = mean_inside(similarity, region)
+            if name != "subject":
+                values[f"flip{suffix}"] = mean_over(difference, region)
+        if self.lpips is not None:
+            values["lpips"] = self.lpips(image, target)
+        return values

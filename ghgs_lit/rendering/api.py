@@ -2,19 +2,25 @@
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
+from pydantic import Field
 from torch import Tensor
 
+from ghgs_lit.config.options import Options, Positive
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
 from ghgs_lit.rendering import gsplat_backend
-from ghgs_lit.rendering.settings import RasterSettings, is_finite_number
+from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 BACKENDS = ("auto", "gsplat", "cpu", "reference")
+#: Metres; practically no limit.
+FAR = 1e10
 _MODULES = {"gsplat": "gsplat_backend", "cpu": "cpu", "reference": "reference"}
 
 Background = Tensor | float | Sequence[float]
@@ -26,7 +32,7 @@ def render(
     backend: str = "auto",
     background: Background = 0.0,
     near: float = 0.01,
-    far: float = 1e10,
+    far: float = FAR,
     settings: RasterSettings | None = None,
     region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
 ) -> Rendering:
@@ -57,7 +63,8 @@ def render(
         BackendUnavailable: gsplat cannot run on this machine.
     """
     settings = settings or made_for(gaussians)
-    _check_range(near, far)
+    require(0 < near < math.inf, "near", "a number of metres > 0", near)
+    require(near < far < math.inf, "far", f"more than near = {near}", far)
     _check_inputs(gaussians, cameras)
     backend = resolve_backend(backend, gaussians.means.device)
     module = importlib.import_module(f"ghgs_lit.rendering.{_MODULES[backend]}")
@@ -75,16 +82,15 @@ def render(
         if metre is not None:
             metre = metre.to(rendering.depth)[:, None, None, None, None]
             rendering = dataclasses.replace(rendering, depth=rendering.depth * metre)
-        if is_finite_number(background) and background == 0:
+        if isinstance(background, (int, float)) and background == 0:
             return rendering
         behind = (1 - rendering.alpha) * _background(background, rendering.image)
         return dataclasses.replace(rendering, image=rendering.image + behind)
 
 
 def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
-    """The constants that Gaussians were made for, but for those that are given."""
-    own = {"low_pass": gaussians.low_pass, "antialiased": gaussians.antialiased}
-    return RasterSettings(**{**own, **settings})
+    """The constants that Gaussians were made for, beside those that are given."""
+    return RasterSettings(low_pass=gaussians.low_pass, antialiased=gaussians.antialiased, **settings)
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
@@ -112,38 +118,18 @@ def resolve_backend(backend: str, device: torch.device) -> str:
     return backend
 
 
-class Renderer:
-    """:func:`render` with fixed options, as ``conf/renderer`` configures it.
+class Renderer(Options):
+    """:func:`render` with fixed options."""
 
-    Args:
-        backend, background, near, far: see :func:`render`.
-        settings: fields of :class:`RasterSettings`; None: the default, or what the Gaussians were made for.
-    """
-
-    def __init__(
-        self,
-        backend: str = "auto",
-        background: float | Sequence[float] = 0.0,
-        near: float = 0.01,
-        far: float = 1e10,
-        **settings,
-    ):
-        choice("renderer.backend", backend, BACKENDS)
-        for name in settings:
-            choice("renderer", name, tuple(RasterSettings.__dataclass_fields__))
-        _check_range(near, far)
-        numbers = background if isinstance(background, Sequence) else (background,)
-        require(
-            not isinstance(background, str) and all(is_finite_number(number) for number in numbers),
-            "renderer.background",
-            "a number or one for each channel",
-            background,
-        )
-        self.backend = backend
-        self.background = tuple(numbers) if isinstance(background, Sequence) else background
-        self.near, self.far = float(near), float(far)
-        self.settings = {name: value for name, value in settings.items() if value is not None}
-        RasterSettings(**self.settings)  # which checks them
+    group = "renderer"
+    backend: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
+    """gsplat (CUDA; needs the extra gpu), cpu (float32), reference (plain PyTorch); auto: by the device."""
+    background: float | tuple[float, ...] = 0.0
+    """Colour behind the Gaussians: one number or one for each channel."""
+    near: Positive = 0.01
+    """Metres; Gaussians whose centre is nearer are not drawn."""
+    alpha_max: float = Field(0.999, gt=0, lt=1)
+    """Upper limit of a Gaussian's alpha; gsplat applies it to opacities."""
 
     def __call__(
         self,
@@ -154,13 +140,8 @@ class Renderer:
     ) -> Rendering:
         """See :func:`render`; a ``background`` that is given here replaces the configured one."""
         background = self.background if background is None else background
-        settings = made_for(gaussians, **self.settings)
-        return render(gaussians, cameras, self.backend, background, self.near, self.far, settings, region)
-
-
-def _check_range(near: float, far: float) -> None:
-    require(is_finite_number(near) and near > 0, "renderer.near", "a number of metres > 0", near)
-    require(is_finite_number(far) and far > near, "renderer.far", f"more than near = {near}", far)
+        settings = made_for(gaussians, alpha_max=self.alpha_max)
+        return render(gaussians, cameras, self.backend, background, self.near, FAR, settings, region)
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:

@@ -8,12 +8,18 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Timer
 from torch import nn
+from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+
+
+def image_mean() -> MeanMetric:
+    """A mean over the images of a validation, in float64; undefined values (nan) are left out."""
+    return MeanMetric(nan_strategy="ignore").set_dtype(torch.float64)
 
 
 class BudgetedModule(L.LightningModule):
@@ -82,7 +88,7 @@ class BudgetedModule(L.LightningModule):
         return getattr(self.trainer.precision_plugin, "scaler", None)
 
     def configure_optimizers(self) -> dict[str, Any]:
-        optimizer = self.optimization.build(self.model, fused=self._scaler is None)
+        optimizer = self.optimization.optimizer(self.model, fused=self._scaler is None)
         groups = optimizer.param_groups
         self._options = [{k: v for k, v in group.items() if k != "params"} for group in groups]
 

@@ -12,9 +12,17 @@ from lightning.pytorch.callbacks import Callback, ProgressBar
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torch import nn
 
+from ghgs_lit.config.options import Options
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
 from ghgs_lit.training.clock import PARTS
 from ghgs_lit.types import Batch
+
+
+class ProgressOptions(Options):
+    """A progress bar over the budget of the run."""
+
+    def build(self) -> "RunProgress":
+        return RunProgress()
 
 
 class RunProgress(ProgressBar):
@@ -101,6 +109,13 @@ def _logs_now(trainer: L.Trainer) -> bool:
     return trainer.global_step % trainer.log_every_n_steps == 0
 
 
+class StepTimeOptions(Options):
+    """``time_ms/*``: milliseconds of each part of a step."""
+
+    def build(self) -> "StepTime":
+        return StepTime()
+
+
 class StepTime(Callback):
     """Logs the milliseconds of a step and of each of its parts, as means since the last log.
 
@@ -140,7 +155,7 @@ class StepTime(Callback):
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         pl_module.clock.end_step()
         if _logs_now(trainer):
-            names = {part: f"{place:02d}_{part}" for place, part in enumerate(PARTS, start=1)}
+            names = {part: f"{number:02d}_{part}" for number, part in enumerate(PARTS, start=1)}
             means = pl_module.clock.means()
             pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
 
@@ -157,6 +172,13 @@ def resident_mb() -> float:
         return int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+class MemoryOptions(Options):
+    """``memory_mb/*``: of the process and of the GPU."""
+
+    def build(self) -> "Memory":
+        return Memory()
 
 
 class Memory(Callback):

@@ -6,14 +6,15 @@ import shutil
 from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from pydantic import Field, model_validator
 
-from ghgs_lit.errors import require
+from ghgs_lit.config.options import Index, Options, Positive, Text
 from ghgs_lit.files import write_atomically
 
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
@@ -75,25 +76,52 @@ def validates_now(trainer: L.Trainer) -> bool:
     return (trainer.fit_loop.total_batch_idx + 1) % every == 0
 
 
-class Checkpoints(ModelCheckpoint):
-    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; each file replaces the previous of its name.
+class CheckpointOptions(Options):
+    """A checkpoint in ``<run>/checkpoints`` after every so many steps or minutes, or of the best validation.
 
     Where a validation is due, the best checkpoint is chosen first: list callbacks that monitor a value
     before those that do not.
-
-    Args:
-        minutes: saves whenever this much time has passed, as ``every_n_train_steps`` does by steps.
-        kwargs: arguments of ModelCheckpoint, which refuses those that it does not know.
     """
 
-    def __init__(self, minutes: float | None = None, **kwargs):
-        require(minutes is None or minutes > 0, "callbacks.minutes", "null or a positive number", minutes)
-        interval = None if minutes is None else timedelta(minutes=minutes)
+    group = "callbacks.checkpoints"
+    filename: Text
+    """Name of the file, without .ckpt."""
+    monitor: Text | None = None
+    """Logged value that is compared at each validation; null: none."""
+    mode: Literal["max", "min"] = "min"
+    """The better direction of monitor."""
+    save_top_k: int = Field(1, ge=-1)
+    """Number of files that are kept; -1: all."""
+    every_n_train_steps: Index | None = None
+    """Steps between two checkpoints."""
+    minutes: Positive | None = None
+    """Minutes between two checkpoints, in place of every_n_train_steps."""
+
+    @model_validator(mode="after")
+    def _by_steps_or_time(self) -> "CheckpointOptions":
+        self.require(
+            self.minutes is None or self.every_n_train_steps is None,
+            "minutes",
+            "null where every_n_train_steps is given",
+        )
+        return self
+
+    def build(self) -> "Checkpoints":
+        return Checkpoints(self)
+
+
+class Checkpoints(ModelCheckpoint):
+    """Lightning's ModelCheckpoint in ``<run>/checkpoints``; each file replaces the previous of its name."""
+
+    def __init__(self, options: CheckpointOptions):
+        arguments = dict(options)
+        minutes = arguments.pop("minutes")
         super().__init__(
             auto_insert_metric_name=False,
             enable_version_counter=False,
-            train_time_interval=interval,
-            **kwargs,
+            save_on_train_epoch_end=False,
+            train_time_interval=None if minutes is None else timedelta(minutes=minutes),
+            **arguments,
         )
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:

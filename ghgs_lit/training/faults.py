@@ -1,19 +1,18 @@
-"""Finding the first value of a training step that is not finite: its stage, its place and its sample."""
+"""The first value of a training step that is not finite: its stage, its place and its subject."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
+import lightning.pytorch as L
 import torch
 from torch import Tensor, nn
 
 from ghgs_lit.model import STAGES
 from ghgs_lit.types import Batch, map_tensors
-
-if TYPE_CHECKING:
-    from ghgs_lit.training.module import GHGSModule
 
 
 @dataclass(frozen=True)
@@ -33,190 +32,165 @@ class Step:
 
 @dataclass(frozen=True)
 class Fault:
-    """The first value that is not finite.
+    """The first value that is not finite, such as "3 of 9 values in the result of encoder (encoder.x)".
 
-    Args:
-        phase: ``weights``, ``batch``, ``forward`` or ``backward``.
-        stage: of the model, ``renderer`` or ``losses``; of weights, the stage that they belong to.
-        place: the tensor: a parameter, a field of the batch, or a module and the field of its result.
-        values: how many of its values are not finite.
-        sample: the subject; None where no sample alone is at fault.
+    ``place`` is the tensor: a parameter, a field of the batch, or a module and the field of its result;
+    ``sample`` the subject, None where no subject alone is at fault.
     """
 
-    phase: str
+    values: str
+    where: str
     stage: str
     place: str
-    values: str
     sample: str | None = None
 
     def __str__(self) -> str:
-        where = {
-            "weights": "in the weights of",
-            "batch": "in the data that enters",
-            "forward": "in the result of",
-            "backward": "in the gradient from",
-        }[self.phase]
         sample = "" if self.sample is None else f", subject {self.sample}"
-        return f"{self.values} {where} {self.stage} ({self.place}{sample})"
+        return f"{self.values} in the {self.where} {self.stage} ({self.place}{sample})"
 
 
-class _Watch:
-    """Remembers the first value that is not finite."""
+class _Faults(list[Fault]):
+    """Faults in the order in which they are seen."""
 
-    def __init__(self) -> None:
-        self.fault: Fault | None = None
+    def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
+        """Look at all tensors in ``value``; ``stage`` is the beginning of ``place`` unless it is given."""
+        for name, tensor in _tensors(value, place):
+            if broken := int((~tensor.isfinite()).sum()):
+                values = f"{broken} of {tensor.numel()} values are not finite"
+                self.append(Fault(values, where, stage or _stage_of(place), name))
 
-    def see(self, phase: str, stage: str, place: str, value: Any) -> None:
-        if self.fault is None and (found := _first_broken(value, place)) is not None:
-            self.fault = Fault(phase, stage, *found)
+
+def _stage_of(place: str) -> str:
+    """The stage that a module or parameter of the model belongs to."""
+    first = place.split(".")[0]
+    return first if first in (*STAGES, "renderer", "losses") else "model"
 
 
-def _first_broken(value: Any, place: str) -> tuple[str, str] | None:
-    """The place of the first tensor in ``value`` that is not finite, and how much of it is not."""
+def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
+    """The floating-point tensors in ``value``, and what to call them."""
     if isinstance(value, Tensor):
-        if not value.is_floating_point():
-            return None
-        broken = int((~value.isfinite()).sum())
-        return (place, f"{broken} of {value.numel()} values are not finite") if broken else None
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        inner = [(f"{place}.{f.name}", getattr(value, f.name)) for f in dataclasses.fields(value)]
+        if value.is_floating_point():
+            yield name, value
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for field in dataclasses.fields(value):
+            yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
     elif isinstance(value, Mapping):
-        inner = [(f"{place}.{name}", item) for name, item in value.items()]
+        for key in value:
+            yield from _tensors(value[key], f"{name}.{key}")
     elif isinstance(value, (tuple, list)):
-        inner = [(place, item) for item in value]
-    else:
-        return None
-    return next((found for name, item in inner if (found := _first_broken(item, name))), None)
+        for item in value:
+            yield from _tensors(item, name)
 
 
-def first_fault(module: "GHGSModule", step: Step) -> Fault | None:
+def first_fault(module: L.LightningModule, step: Step) -> Fault | None:
     """Run ``step`` again and look at every value: weights, batch, results of all modules, gradients.
 
-    A batch that is at fault is run again sample by sample, to name the one that is at fault alone.
+    A batch that is at fault is run again subject by subject, to name the one that is at fault alone.
 
     Args:
-        module: with the weights of the step; they and their gradients are not changed.
+        module: a :class:`~ghgs_lit.training.GHGSModule` with the weights of the step; they and their
+            gradients are not changed.
         step: what to run.
 
     Returns:
         The first fault in the order of computation; None where all values are finite.
     """
     fault = _search(module, step)
-    if fault is None or fault.phase == "weights":
+    if fault is None or fault.where == "weights of":
         return fault
     for element in range(len(step.batch.images)):
-        alone = dataclasses.replace(step, batch=_one_element(step.batch, element))
+        alone = dataclasses.replace(step, batch=_one_subject(step.batch, element))
         if len(step.batch.images) == 1 or _search(module, alone) is not None:
             subjects = step.batch.subjects
             return dataclasses.replace(fault, sample=subjects[element] if subjects else str(element))
     return fault
 
 
-def _search(module: "GHGSModule", step: Step) -> Fault | None:
-    watch, device = _Watch(), step.batch.images.device.type
-    for name, value in (*module.model.named_parameters(), *module.model.named_buffers()):
-        watch.see("weights", _stage_of(name), name, value)
-    watch.see("batch", "the model", "batch", step.batch)
-    if watch.fault is not None:
-        return watch.fault
-    trained = {name: p for name, p in module.model.named_parameters() if p.requires_grad}
-    with _watched(module, watch), torch.enable_grad():
+def _search(module: L.LightningModule, step: Step) -> Fault | None:
+    faults, model, device = _Faults(), module.model, step.batch.images.device.type
+    for name, value in (*model.named_parameters(), *model.named_buffers()):
+        faults.see("weights of", name, value)
+    faults.see("data that enters", "batch", step.batch, "the model")
+    trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    with ExitStack() as stack, torch.enable_grad():
+        if faults:
+            return faults[0]
+        _watch(module, faults, stack)
         try:
             with torch.autocast(device, step.autocast, enabled=step.autocast is not None):
                 _, total, _ = module.forward_losses(step)
         except Exception:  # a later stage may refuse what is not finite
-            if watch.fault is None:
+            if not faults:
                 raise
-        if watch.fault is None:
+        if not faults:
             slopes = torch.autograd.grad(total * step.scale, list(trained.values()), allow_unused=True)
-            _see_norm(watch, dict(zip(trained, slopes, strict=True)))
-    return watch.fault
+            norms = {n: slope.norm() for n, slope in zip(trained, slopes, strict=True) if slope is not None}
+            if norms:  # of finite values the largest is named
+                name = max(norms, key=lambda name: float(norms[name]))
+                norm = torch.stack(list(norms.values())).norm()
+                faults.see("gradient from", f"norm, largest of {name}", norm, _stage_of(name))
+    return faults[0] if faults else None
 
 
-def _see_norm(watch: _Watch, slopes: Mapping[str, Tensor | None]) -> None:
-    """Finite gradients whose norm is not finite: the largest one is named."""
-    norms = {name: slope.norm() for name, slope in slopes.items() if slope is not None}
-    if norms:
-        total = torch.stack(list(norms.values())).norm()
-        name = max(norms, key=lambda name: float(norms[name]))
-        watch.see("backward", _stage_of(name), f"norm, largest of {name}", total)
-
-
-def _stage_of(name: str) -> str:
-    """The stage that a module or parameter of the model belongs to."""
-    first = name.split(".")[0]
-    return first if first in STAGES else "model"
-
-
-@contextmanager
-def _watched(module: "GHGSModule", watch: _Watch) -> Iterator[None]:
-    """While the context lasts, ``watch`` sees the results and the gradients of every stage of ``module``."""
+def _watch(module: L.LightningModule, faults: _Faults, stack: ExitStack) -> None:
+    """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
     model = module.model
+    for name, part in model.named_modules():
+        hook = part.register_forward_hook(
+            lambda part, inputs, result, name=name or "model": faults.see("result of", name, result)
+        )
+        stack.callback(hook.remove)
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            stack.callback(parameter.register_hook(partial(faults.see, "gradient from", name)).remove)
     stages = [(model, name) for name in STAGES if hasattr(model, name)]
-    stages += [(module, "renderer"), (module, "losses")]
-    hooks, replaced = [], []
-    try:
-        for name, part in model.named_modules():
-            hooks.append(part.register_forward_hook(_looking(watch, name or "model")))
-        for name, parameter in model.named_parameters():
-            if parameter.requires_grad:
-                stage = _stage_of(name)
-                hooks.append(
-                    parameter.register_hook(lambda g, s=stage, n=name: watch.see("backward", s, n, g))
-                )
-        for owner, name in stages:
-            stage = getattr(owner, name)
-            if isinstance(stage, nn.Module):
-                hooks.append(stage.register_forward_pre_hook(_receiving(watch, name), with_kwargs=True))
-            else:
-                replaced.append((owner, name, stage))
-                setattr(owner, name, _around(watch, name, stage))
-        yield
-    finally:
-        for hook in hooks:
-            hook.remove()
-        for owner, name, stage in replaced:
-            setattr(owner, name, stage)
+    for owner, name in [*stages, (module, "renderer"), (module, "losses")]:
+        stage = getattr(owner, name)
+        if isinstance(stage, nn.Module):
+            hook = stage.register_forward_pre_hook(
+                lambda part, inputs, options, name=name: _own_views((inputs, options), name, faults),
+                with_kwargs=True,
+            )
+            stack.callback(hook.remove)
+        else:
+            stack.callback(setattr, owner, name, stage)
+            setattr(owner, name, _around(stage, name, faults))
 
 
-def _looking(watch: _Watch, name: str) -> Callable[..., None]:
-    return lambda part, inputs, result: watch.see("forward", _stage_of(name), name, result)
+def _own_views(inputs: tuple, stage: str, faults: _Faults) -> tuple:
+    """Views of a stage's inputs, whose gradients are those from this stage alone."""
 
-
-def _receiving(watch: _Watch, stage: str) -> Callable[..., tuple]:
-    """Gives a stage its own views of its inputs, whose gradients are those from this stage alone."""
-
-    def own(value: Tensor) -> Tensor:
+    def view(value: Tensor) -> Tensor:
         if not value.requires_grad:
             return value
-        view = value.view_as(value)
-        view.register_hook(lambda g: watch.see("backward", stage, "an input", g))
-        return view
+        value = value.view_as(value)
+        value.register_hook(lambda slope: faults.see("gradient from", "an input", slope, stage))
+        return value
 
-    return lambda part, inputs, options: (map_tensors(inputs, own), map_tensors(options, own))
+    return map_tensors(inputs, view)
 
 
-def _around(watch: _Watch, name: str, stage: Callable[..., Any]) -> Callable[..., Any]:
+def _around(stage: Callable[..., Any], name: str, faults: _Faults) -> Callable[..., Any]:
     """As the hooks of a module, for a stage that is none."""
 
     def call(*inputs: Any, **options: Any) -> Any:
-        inputs, options = _receiving(watch, name)(None, inputs, options)
+        inputs, options = _own_views((inputs, options), name, faults)
         result = stage(*inputs, **options)
-        watch.see("forward", name, name, result)
+        faults.see("result of", name, result)
         return result
 
     return call
 
 
-def _one_element(batch: Batch, element: int) -> Batch:
-    """A batch of one of its samples."""
-    own = slice(element, element + 1)
+def _one_subject(batch: Batch, element: int) -> Batch:
+    """A batch of one of its subjects."""
+    one = slice(element, element + 1)
     bodies, targets = batch.body_vertices, batch.targets
-    part = map_tensors(dataclasses.replace(batch, body_vertices=None), lambda t: t[own])
+    part = map_tensors(dataclasses.replace(batch, body_vertices=None), lambda t: t[one])
     return dataclasses.replace(
         part,
-        targets=targets and dataclasses.replace(part.targets, names=targets.names[own]),
-        body_vertices=bodies and bodies[own],
-        subjects=batch.subjects[own],
-        views=batch.views[own],
+        targets=targets and dataclasses.replace(part.targets, names=targets.names[one]),
+        body_vertices=bodies and bodies[one],
+        subjects=batch.subjects[one],
+        views=batch.views[one],
     )

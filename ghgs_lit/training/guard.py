@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
 import torch
@@ -11,9 +10,6 @@ from torch import Tensor
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_atomically
 from ghgs_lit.training.faults import Fault, Step, first_fault
-
-if TYPE_CHECKING:
-    from ghgs_lit.training.module import GHGSModule
 
 
 class DivergedError(InputError):
@@ -59,7 +55,7 @@ class Guard:
         self._steps.clear()
         self._in_a_row = 0
 
-    def refuse(self, module: "GHGSModule", scale: float) -> None:
+    def refuse(self, module: L.LightningModule, scale: float) -> None:
         """Name and save the fault, and drop the gradients, so that the optimizer changes nothing.
 
         Args:
@@ -70,19 +66,13 @@ class Guard:
             DivergedError: more than ``limit`` steps in a row were not finite.
         """
         trainer = module.trainer
-        own = None
-        for step, _ in self._steps:
-            step = dataclasses.replace(step, scale=scale)
-            if own is None and (fault := first_fault(module, step)) is not None:
-                own = f"{fault}{self._save(module, step, fault)}"
+        line = self._explain(module, scale)
         self._steps.clear()
-        lines = [own]
+        lines = [line]
         if trainer.world_size > 1:
-            lines = [None] * trainer.world_size
-            torch.distributed.all_gather_object(lines, own)
-        said = "; ".join(line for line in lines if line is not None)
-        if not said:
-            said = "a value that is finite when the step is run again"
+            lines = [""] * trainer.world_size
+            torch.distributed.all_gather_object(lines, line)
+        said = "; ".join(filter(None, lines)) or "a value that is finite when the step is run again"
         said = f"step {module.global_step}: expected a finite loss and gradient; found {said}"
         if self._in_a_row >= self.limit:
             raise DivergedError(said)
@@ -93,26 +83,32 @@ class Guard:
         if trainer.is_global_zero:
             print(f"{said}; the step is skipped", flush=True)
 
-    def _save(self, module: "GHGSModule", step: Step, fault: Fault) -> str:
-        """Write the dump, the first of its stage; returns the end of a message that names it."""
-        if fault.stage in self._saved:
-            return ""
-        self._saved.add(fault.stage)
-        rank = f"_process_{module.global_rank}" if module.global_rank else ""
-        folder = Path(module.trainer.default_root_dir) / "faults"
-        path = folder / f"step_{module.global_step:06d}{rank}.pt"
-        content = plain_dump(module, step, fault)
-        write_atomically(path, lambda temporary: torch.save(content, temporary))
-        return f"; `ghgs stress dump={path}` runs it again"
+    def _explain(self, module: L.LightningModule, scale: float) -> str:
+        """The first fault of this process, and the file of its step, once for each stage; "" without one."""
+        for step, _ in self._steps:
+            step = dataclasses.replace(step, scale=scale)
+            fault = first_fault(module, step)
+            if fault is None:
+                continue
+            if fault.stage in self._saved:
+                return str(fault)
+            self._saved.add(fault.stage)
+            rank = f"_process_{module.global_rank}" if module.global_rank else ""
+            folder = Path(module.trainer.default_root_dir) / "faults"
+            path = folder / f"step_{module.global_step:06d}{rank}.pt"
+            _write(path, module, step, fault)
+            return f"{fault}; `ghgs stress dump={path}` runs it again"
+        return ""
 
 
-def plain_dump(module: "GHGSModule", step: Step, fault: Fault) -> dict[str, Any]:
+def _write(path: Path, module: L.LightningModule, step: Step, fault: Fault) -> None:
     """A step with all that it depends on, as plain data and tensors (``weights_only=True`` reads it)."""
-    return {
-        "fault": dataclasses.asdict(fault),
+    content = {
+        "fault": str(fault),
         "global_step": module.global_step,
         "step": {**dataclasses.asdict(step), "autocast": str(step.autocast or "").removeprefix("torch.")},
         "state_dict": module.model.state_dict(),
         "optimizer_states": [optimizer.state_dict() for optimizer in module.trainer.optimizers],
         "config": dict(module.config),
     }
+    write_atomically(path, lambda temporary: torch.save(content, temporary))

@@ -10,6 +10,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from lightning.pytorch.utilities import rank_zero_only
 
 from ghgs_lit.config.keys import NOT_HYPERPARAMETERS, is_below, lookup
+from ghgs_lit.config.options import Options, Text
 from ghgs_lit.errors import InputError
 
 #: The final numbers that runs are compared by: TensorBoard's HParams tab shows the first five of them
@@ -33,9 +34,9 @@ class CsvLog(CSVLogger):
         writer.save()
 
 
-def _is_before(found: str | None, step: int) -> bool:
+def _is_before(written: str | None, step: int) -> bool:
     """False for the incomplete last line of a killed run, too."""
-    return found is not None and found.isdecimal() and int(found) < step
+    return written is not None and written.isdecimal() and int(written) < step
 
 
 class TensorBoardLog(TensorBoardLogger):
@@ -71,15 +72,35 @@ class TensorBoardLog(TensorBoardLogger):
         self.experiment.flush()
 
 
-class WandbLog(WandbLogger):
-    """Lightning's logger for Weights & Biases (extra ``wandb``)."""
+class CsvOptions(Options):
+    """The logged numbers as ``<run>/csv/metrics.csv``."""
 
-    def __init__(self, **kwargs: Any):
+    def build(self, save_dir: str) -> CsvLog:
+        return CsvLog(save_dir, name="csv", version="")
+
+
+class TensorBoardOptions(Options):
+    """TensorBoard's files in ``<run>/tensorboard``."""
+
+    def build(self, save_dir: str) -> TensorBoardLog:
+        return TensorBoardLog(save_dir, name="tensorboard", version="")
+
+
+class WandbOptions(Options):
+    """Weights & Biases (extra ``wandb``)."""
+
+    group = "logger.wandb"
+    project: Text = "ghgs_lit"
+    """Project that the run belongs to."""
+    offline: bool = False
+    """Whether only files are written, for `wandb sync` later."""
+
+    def build(self, save_dir: str) -> WandbLogger:
         if importlib.util.find_spec("wandb") is None:
             raise InputError(
                 "logger.wandb: expected the package wandb (pip install 'ghgs-lit[wandb]'); found none"
             )
-        super().__init__(**kwargs)
+        return WandbLogger(project=self.project, offline=self.offline, save_dir=save_dir)
 
 
 @rank_zero_only
@@ -123,8 +144,8 @@ def close(loggers: Sequence[Logger]) -> None:
 def final_numbers(summary: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """``hparam/psnr`` of the first protocol, ``hparam_v4_midway/psnr`` of others; only defined values."""
     return {
-        (f"hparam_v{row['views']}_{row['targets']}" if place else "hparam") + f"/{name}": float(row[name])
-        for place, row in enumerate(summary)
+        (f"hparam_v{row['views']}_{row['targets']}" if number else "hparam") + f"/{name}": float(row[name])
+        for number, row in enumerate(summary)
         for name in COMPARED
         if row.get(name) is not None
     }

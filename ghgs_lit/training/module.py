@@ -7,9 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from ghgs_lit.losses import Losses
-from ghgs_lit.metrics import PSNR, depth_error_mm
-from ghgs_lit.metrics.functional import psnr, ssim
-from ghgs_lit.training.base import BudgetedModule
+from ghgs_lit.metrics import depth_error_mm
+from ghgs_lit.metrics.functional import box_of, psnr, ssim
+from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.budgets import TokenBudgets, token_budget
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
@@ -51,7 +51,7 @@ class GHGSModule(BudgetedModule):
         self.losses = losses
         self.token_budgets = token_budgets
         self.guard = Guard(optimization.skip_nonfinite)
-        self.val_psnr, self.val_psnr_box = PSNR("image"), PSNR("box")
+        self.val_psnr, self.val_psnr_box = image_mean(), image_mean()
         model.keeps_drafts = True  # validation shows what each round is worth
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
@@ -98,10 +98,11 @@ class GHGSModule(BudgetedModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         prediction, rendering = self(batch)
         image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
-        size, mask = len(batch.images), batch.targets.masks.flatten(0, 1)
-        for name, metric in (("val/psnr", self.val_psnr), ("val/psnr_box", self.val_psnr_box)):
-            metric.update(image.clamp(0, 1), target, mask)
-            self.log(name, metric, prog_bar=name == "val/psnr", on_epoch=True, batch_size=size)
+        size, box = len(batch.images), box_of(batch.targets.masks.flatten(0, 1))
+        self.val_psnr.update(psnr(image.clamp(0, 1), target))
+        self.val_psnr_box.update(psnr(image.clamp(0, 1), target, box))
+        self.log("val/psnr", self.val_psnr, prog_bar=True, on_epoch=True, batch_size=size)
+        self.log("val/psnr_box", self.val_psnr_box, on_epoch=True, batch_size=size)
         means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}
         if batch.depths is not None:
             means["val/depth_error_mm"] = _depth_error(batch, prediction.depth_maps)

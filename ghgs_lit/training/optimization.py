@@ -1,72 +1,50 @@
 """How the weights are trained: AdamW or Muon, a linear schedule over the run's budget, gradient clipping."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import Annotated
 
-import lightning.pytorch as L
 import torch
-from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelParallelStrategy
+from pydantic import Field
 from torch import nn
 
+from ghgs_lit.config.options import Amount, Index, Options, Positive, Share
 from ghgs_lit.errors import require
 from ghgs_lit.training.muon import Muon
 
+BelowOne = Annotated[float, Field(ge=0, lt=1)]
+#: AdamW's term in the denominator.
+EPS = 1e-8
+#: The first learning rate as a fraction of the highest one.
+START_FACTOR = 0.04
 
-@dataclass(frozen=True)
-class Optimization:
+
+class Optimization(Options):
     """AdamW or Muon, whose learning rate rises linearly to ``lr`` and then falls linearly.
 
     The schedule depends on the share of the run's budget that is used: of steps or of time, whichever is
     larger.
-
-    Args:
-        lr: highest learning rate.
-        matrix_lr: highest learning rate of matrices, which then take the steps of
-            :class:`~ghgs_lit.training.muon.Muon`; None: AdamW for all parameters.
-        betas, eps, weight_decay: of AdamW.
-        warmup: share of the run in which the learning rate rises.
-        start_factor, end_factor: first and last learning rate as fractions of ``lr``.
-        clip: maximum norm of the gradient.
-        freeze_until: prefix of parameter names to the share of the run in which these parameters stay
-            unchanged. Splats whose depth is still wrong reduce the loss most by becoming transparent, and
-            do not recover from that.
-        skip_nonfinite: steps in a row whose loss or gradient is not finite that are skipped before the run
-            stops; 0: it stops at the first.
-
-    Raises:
-        InputError: a value that cannot work (names its key).
     """
 
-    lr: float
-    matrix_lr: float | None = None
-    betas: Sequence[float] = (0.9, 0.999)
-    eps: float = 1e-8
-    weight_decay: float = 1e-5
-    warmup: float = 0.01
-    start_factor: float = 0.04
-    end_factor: float = 0.0
-    clip: float = 1.0
-    freeze_until: Mapping[str, float] = field(default_factory=dict)
-    skip_nonfinite: int = 0
+    group = "optimizer"
+    lr: Positive = 1e-4
+    """Highest learning rate."""
+    matrix_scale: Positive | None = None
+    """Learning rate of matrices, which take Muon's orthogonal steps, in units of lr; null: AdamW for all."""
+    betas: tuple[BelowOne, BelowOne] = (0.9, 0.999)
+    """AdamW's averages of the gradient and of its square."""
+    weight_decay: Amount = 1e-5
+    """Decoupled weight decay."""
+    warmup: BelowOne = 0.01
+    """Share of the run in which the learning rate rises from 0.04 lr to lr."""
+    end_factor: Share = 5e-4
+    """Last learning rate as a fraction of lr."""
+    clip: Positive = 1.0
+    """Maximum norm of the gradient."""
+    freeze_until: dict[str, Share] = Field({})
+    """Beginning of parameter names: share of the run in which these parameters stay unchanged."""
+    skip_nonfinite: Index = 0
+    """Steps in a row that are not finite and are skipped before the run stops; 0: it stops at the first."""
 
-    def __post_init__(self):
-        require(self.lr > 0, "optimizer.lr", "a positive number", self.lr)
-        positive = self.matrix_lr is None or self.matrix_lr > 0
-        require(positive, "optimizer.matrix_lr", "a positive number or null", self.matrix_lr)
-        betas_fit = len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)
-        require(betas_fit, "optimizer.betas", "two numbers in [0, 1)", list(self.betas))
-        require(self.eps > 0, "optimizer.eps", "a positive number", self.eps)
-        require(self.weight_decay >= 0, "optimizer.weight_decay", "a number of at least 0", self.weight_decay)
-        require(0 <= self.warmup < 1, "optimizer.warmup", "a share in [0, 1)", self.warmup)
-        for name in ("start_factor", "end_factor"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"optimizer.{name}", "a share in [0, 1]", value)
-        require(self.clip > 0, "optimizer.clip", "a positive gradient norm", self.clip)
-        require(self.skip_nonfinite >= 0, "optimizer.skip_nonfinite", "0 or more steps", self.skip_nonfinite)
-        for prefix, share in self.freeze_until.items():
-            require(0 <= share <= 1, f"optimizer.freeze_until.{prefix}", "a share in [0, 1]", share)
-
-    def build(self, model: nn.Module, fused: bool = True) -> torch.optim.AdamW:
+    def optimizer(self, model: nn.Module, fused: bool = True) -> torch.optim.AdamW:
         """The optimizer of the parameters of ``model`` that are trained.
 
         Args:
@@ -84,14 +62,14 @@ class Optimization:
         parameters = [p for p in model.parameters() if p.requires_grad]
         options = {
             "lr": self.lr,
-            "betas": tuple(self.betas),
-            "eps": self.eps,
+            "betas": self.betas,
+            "eps": EPS,
             "weight_decay": self.weight_decay,
             "fused": fused,
         }
-        if self.matrix_lr is None:
+        if self.matrix_scale is None:
             return torch.optim.AdamW(parameters, **options)
-        return Muon(parameters, matrix_lr=self.matrix_lr, **options)
+        return Muon(parameters, matrix_lr=self.matrix_scale * self.lr, **options)
 
     def drop_frozen_gradients(self, model: nn.Module, progress: float) -> None:
         """Remove the gradients of the parameters that are frozen at the share ``progress`` of the run.
@@ -108,17 +86,6 @@ class Optimization:
     def factor(self, progress: float) -> float:
         """Learning rate as a fraction of ``lr`` when the share ``progress`` of the budget is used."""
         if progress < self.warmup:
-            return self.start_factor + (1 - self.start_factor) * progress / self.warmup
+            return START_FACTOR + (1 - START_FACTOR) * progress / self.warmup
         fall = (progress - self.warmup) / (1 - self.warmup)
         return 1 + (self.end_factor - 1) * min(fall, 1.0)
-
-
-def require_whole_parameters(trainer: L.Trainer) -> None:
-    """Refuse strategies that divide parameters among processes: each would clip by the norm of its shard.
-
-    Raises:
-        InputError: such a strategy is configured.
-    """
-    sharded = isinstance(trainer.strategy, (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy))
-    expected = "auto or a kind of ddp, whose processes have all parameters to clip the gradient by"
-    require(not sharded, "trainer.strategy", expected, type(trainer.strategy).__name__)

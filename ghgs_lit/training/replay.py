@@ -1,7 +1,6 @@
 """Running a step again that :class:`ghgs_lit.training.guard.Guard` has saved, on any machine."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,11 @@ from ghgs_lit.weights.reading import open_file
 _KEYS = ("fault", "global_step", "step", "state_dict", "config")
 
 
-@dataclass(frozen=True)
-class Replay:
-    """A saved step: what was found when it was saved, and what is found now (None: nothing)."""
-
-    global_step: int
-    recorded: Fault
-    found: Fault | None
-
-
-def replay(path: str | Path) -> Replay:
+def replay(path: str | Path) -> tuple[int, str, Fault | None]:
     """Run a saved step again, on the CPU.
+
+    Returns:
+        Its number, what was wrong when it was saved, and what is wrong now (None: nothing).
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -49,8 +42,7 @@ def replay(path: str | Path) -> Replay:
         build(config["optimizer"], "optimizer"),
         config,
     ).train()
-    found = first_fault(module, _step(content["step"]))
-    return Replay(content["global_step"], Fault(**content["fault"]), found)
+    return content["global_step"], content["fault"], first_fault(module, _step(content["step"]))
 
 
 def _step(values: Mapping[str, Any]) -> Step:

@@ -51,16 +51,17 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
         found = content_digest(checkpoint)
         require(found == digest, f"{path}: digest", f"{str(digest)[:12]}..., as written", f"{found[:12]}...")
     load_strictly(model, model_state(checkpoint), path)
-    _check_optimizer(path, checkpoint["config"], config)
+    _check_optimizer(path, checkpoint, config)
     return checkpoint["global_step"], differences(checkpoint["config"], config)
 
 
-def _check_optimizer(path: str | Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def _check_optimizer(path: str | Path, checkpoint: Mapping[str, Any], config: Mapping[str, Any]) -> None:
     """Refuse to go on with Muon from the averages of AdamW, and the other way round."""
-    key = "optimizer.matrix_lr"
-    old, new = flatten(before).get(key), flatten(now).get(key)
-    expected = f"{'null' if old is None else 'a learning rate'}, as in {path}"
-    require((old is None) == (new is None), key, expected, new)
+    states = checkpoint["optimizer_states"]
+    by_muon = any("orthogonal" in group for state in states for group in state["param_groups"])
+    key = "optimizer.matrix_scale"
+    scale = lookup(config, key)
+    require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -1,6 +1,5 @@
 """Pictures, attention and point clouds of the first validation subjects, while a run trains."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from ghgs_lit.errors import require
+from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.recalibration.inspection import attention_of
@@ -19,6 +18,8 @@ from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import save_png, sheet
 
+#: Maximum number of points of each cloud.
+CLOUD_POINTS = 6000
 #: How TensorBoard shows clouds: points of two centimetres through a perspective camera.
 CLOUD_VIEW = {
     "camera": {"cls": "PerspectiveCamera", "fov": 40},
@@ -29,10 +30,7 @@ CLOUD_VIEW = {
 class _FirstSubjects(Callback):
     """Calls :meth:`show` for the first ``subjects`` subjects of each validation, in one process."""
 
-    name = ""
-
     def __init__(self, subjects: int):
-        require(subjects >= 0, f"callbacks.{self.name}.subjects", "a number of at least 0", subjects)
         self.subjects = subjects
         self._left = 0
 
@@ -79,13 +77,19 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
             logger.log_image(tag, [picture])
 
 
+class PicturesOptions(Options):
+    """Inputs, depths, targets, renders and errors side by side."""
+
+    group = "callbacks.pictures"
+    subjects: Index = 2
+    """Number of subjects, the first of each validation; 0: none."""
+
+    def build(self) -> "Pictures":
+        return Pictures(self.subjects)
+
+
 class Pictures(_FirstSubjects):
     """Inputs, depths, targets, renders and errors side by side: ``sheet/<subject>``."""
-
-    name = "pictures"
-
-    def __init__(self, subjects: int = 2):
-        super().__init__(subjects)
 
     def show(
         self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
@@ -95,21 +99,28 @@ class Pictures(_FirstSubjects):
         _publish(trainer, f"sheet/{name}", picture, name)
 
 
+class AttentionOptions(Options):
+    """What one token attends to in the recalibration."""
+
+    group = "callbacks.attention"
+    subjects: Index = 1
+    """Number of subjects; 0: none."""
+    token: tuple[Index, Index, Index] | None = None
+    """View, row and column on the grid of tokens; null: the middle of the subject in its first view."""
+
+    def build(self) -> "Attention":
+        return Attention(self)
+
+
 class Attention(_FirstSubjects):
     """What one token attends to, drawn on the views: ``attention/<subject>``.
 
-    Args:
-        subjects: number of subjects.
-        token: ``[view, row, column]`` on the grid of tokens (of padded photographs, where the model pads);
-            None: the middle of the subject in its first view.
+    The token's place is on the grid of padded photographs, where the model pads.
     """
 
-    name = "attention"
-
-    def __init__(self, subjects: int = 1, token: Sequence[int] | None = None):
-        super().__init__(subjects)
-        require(token is None or len(token) == 3, "callbacks.attention.token", "null or 3 numbers", token)
-        self.token = None if token is None else tuple(token)
+    def __init__(self, options: AttentionOptions):
+        super().__init__(options.subjects)
+        self.token = options.token
         self._hook, self._seen = None, None
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -148,20 +159,19 @@ class Attention(_FirstSubjects):
         self._hook, self._seen = None, None
 
 
+class PointCloudOptions(Options):
+    """Predicted points and bodies in TensorBoard."""
+
+    group = "callbacks.point_clouds"
+    subjects: Index = 1
+    """Number of subjects; 0: none."""
+
+    def build(self) -> "PointClouds":
+        return PointClouds(self.subjects)
+
+
 class PointClouds(_FirstSubjects):
-    """Predicted points and the body's vertices in TensorBoard's mesh tab: ``<subject>/points`` and so on.
-
-    Args:
-        subjects: number of subjects.
-        points: maximum number of points of each cloud.
-    """
-
-    name = "point_clouds"
-
-    def __init__(self, subjects: int = 1, points: int = 6000):
-        super().__init__(subjects)
-        require(points >= 1, "callbacks.point_clouds.points", "a number of at least 1", points)
-        self.points = points
+    """Predicted points and the body's vertices in TensorBoard's mesh tab: ``<subject>/points`` and so on."""
 
     def show(
         self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
@@ -169,7 +179,7 @@ class PointClouds(_FirstSubjects):
         loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
         if not loggers:
             return
-        for kind, (positions, colors) in clouds(batch, outputs["prediction"], element, self.points).items():
+        for kind, (positions, colors) in clouds(batch, outputs["prediction"], element, CLOUD_POINTS).items():
             for logger in loggers:
                 logger.experiment.add_mesh(
                     f"{name}/{kind}",

@@ -109,7 +109,7 @@ def test_the_branch_does_not_learn_and_the_rest_does():
     tokens.latent[0].square().sum().backward()
     for name, parameter in encoder.named_parameters():
         assert (parameter.grad is None) == name.startswith("semantic."), name
-    trained = Optimization(lr=1e-3).build(encoder).param_groups[0]["params"]
+    trained = Optimization(lr=1e-3).optimizer(encoder).param_groups[0]["params"]
     assert {id(p) for p in trained} == {id(p) for n, p in encoder.named_parameters() if "semantic." not in n}
     assert encoder.dim_semantic == 6
 

@@ -19,7 +19,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.baselines import BASELINES
 from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, measure_all, not_finite
 from ghgs_lit.evaluation.protocols import target_protocols
-from ghgs_lit.metrics import ImageMetrics, psnr
+from ghgs_lit.metrics import MetricsOptions, psnr
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.rendering import Renderer
@@ -30,7 +30,7 @@ from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer
 from tests.helpers.verbs import ghgs
 
-OFF = ImageMetrics(lpips="off")
+OFF = MetricsOptions(lpips="off").build()
 
 
 def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
@@ -248,7 +248,7 @@ def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes
             predictions.append(batch.subjects)
             return super().forward(batch)
 
-    method = {"model": ModelMethod(Counting(), Renderer("cpu"))}
+    method = {"model": ModelMethod(Counting(), Renderer(backend="cpu"))}
 
     def rows_of(names, pictures=None):
         chosen = {name: protocols[name] for name in names}

@@ -16,10 +16,14 @@ from torchmetrics.functional.image import (
 )
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.metrics import PSNR, PSNR_CAP, SSIM, ImageMetrics, depth_error_mm, flip_map, psnr, ssim
+from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim
 from ghgs_lit.metrics.functional import box_of, ssim_map
+from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
+RELEASE = MetricsOptions(
+    protocol="release", regions=("image",), ssim_padding="zeros", clamp=False, lpips="off"
+)
 
 
 def _images(n=3, h=30, w=41, seed=0):
@@ -39,7 +43,7 @@ def test_authors_evaluation_numbers():
         ssim(first.double(), second.double(), "zeros"), data["out64/ssim_per_image"], atol=2e-7
     )
     # The release protocol, which measures whole images.
-    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")
+    release = RELEASE.build()
     values = release(first, second, torch.zeros(2, 40, 48, dtype=torch.bool))
     assert torch.allclose(values["psnr"][:, None], data["out/psnr"], atol=1e-5)
     assert torch.allclose(values["ssim"], data["out/ssim_per_image"], atol=2e-6)
@@ -132,10 +136,10 @@ def test_equal_images_and_empty_regions_are_defined():
     assert flip_map(image, image).abs().max() == 0
     assert psnr(image, image, nobody).isnan().all()
     assert not box_of(nobody).any()
-    metric = PSNR("box")
-    metric.update(image, image, nobody)
-    metric.update(image, image, ~nobody)
-    assert metric.compute().item() == pytest.approx(PSNR_CAP)
+    mean = image_mean()
+    mean.update(psnr(image, image, box_of(nobody)))
+    mean.update(psnr(image, image, box_of(~nobody)))
+    assert mean.compute().item() == pytest.approx(PSNR_CAP)
     assert depth_error_mm(torch.ones(3, 30, 41), torch.ones(3, 30, 41), nobody).isnan()
 
 
@@ -191,18 +195,17 @@ def test_flip_of_black_and_white_is_nearly_one():
     assert torch.allclose(flip_map(black, white), value, atol=1e-6)
 
 
-def test_metric_classes_average_the_pure_functions():
-    """Metric classes give the mean over images, not over batches, and store nothing in checkpoints."""
+def test_means_are_over_images():
+    """Not over batches; they accumulate in float64 and store nothing in checkpoints."""
     image, target = _images(4)
     mask = torch.rand(4, 30, 41, generator=torch.Generator().manual_seed(5)) > 0.9
-    for metric, values in (
-        (PSNR("box"), psnr(image, target, box_of(mask))),
-        (SSIM("zeros"), ssim(image, target, "zeros")),
-    ):
-        metric.update(image[:1], target[:1], mask[:1])
-        metric.update(image[1:], target[1:], mask[1:])
-        assert metric.compute().item() == pytest.approx(values.mean().item(), rel=1e-6)
-        assert not metric.state_dict()
+    for values in (psnr(image, target, box_of(mask)), ssim(image, target, "zeros")):
+        mean = image_mean()
+        mean.update(values[:1])
+        mean.update(values[1:])
+        assert mean.compute().dtype == torch.float64
+        assert mean.compute().item() == pytest.approx(values.double().mean().item(), rel=1e-12)
+        assert not mean.state_dict()
 
 
 def test_a_protocol_reports_its_metrics_by_name():
@@ -210,12 +213,12 @@ def test_a_protocol_reports_its_metrics_by_name():
     image, target = _images(2)
     mask = torch.zeros(2, 30, 41, dtype=torch.bool)
     mask[:, 8:20, 10:30] = True
-    values = ImageMetrics(lpips="off")(image * 1.5, target, mask)
+    values = MetricsOptions(lpips="off").build()(image * 1.5, target, mask)
     assert set(values) == {
         "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
     }  # fmt: skip
     assert torch.equal(values["psnr"], psnr((image * 1.5).clamp(0, 1), target))
-    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off")(image * 1.5, target, mask)
+    release = RELEASE.build()(image * 1.5, target, mask)
     assert set(release) == {"psnr", "ssim", "flip"}
     assert torch.equal(release["psnr"], psnr(image * 1.5, target))
 
@@ -228,11 +231,11 @@ def test_lpips_is_left_out_with_its_reason_or_refused():
         pass
     else:
         pytest.skip("torchvision is installed")
-    protocol = ImageMetrics(lpips="auto")
-    assert "lpips" not in protocol.metrics
+    protocol = MetricsOptions(lpips="auto").build()
+    assert protocol.lpips is None
     assert "torchvision" in protocol.left_out["lpips"]
     with pytest.raises(InputError, match="torchvision"):
-        ImageMetrics(lpips="require")
+        MetricsOptions(lpips="require").build()
 
 
 class RecordingNetwork:
@@ -263,16 +266,16 @@ def test_lpips_sees_what_its_protocol_says():
     mask = torch.ones(3, 30, 41, dtype=torch.bool)
     overshooting = image * 1.5
     for protocol, signed, expected in (
-        (ImageMetrics(), True, overshooting.clamp(0, 1)),
+        (MetricsOptions().build(), True, overshooting.clamp(0, 1)),
         # The authors' evaluation: neither clamped nor mapped to [-1, 1].
         (
-            ImageMetrics("release", ["image"], "zeros", False, "require", lpips_signed=False),
+            RELEASE.replace(lpips="require", lpips_signed=False).build(),
             False,
             overshooting,
         ),
     ):
         values = protocol(overshooting, target, mask)["lpips"]
-        network = protocol.metrics["lpips"].network
+        network = protocol.lpips.network
         assert network.options == ("vgg", signed)
         # One image at a time, since torchmetrics gives the mean of a batch.
         assert torch.equal(torch.cat([a for a, _ in network.inputs]), expected)
@@ -290,8 +293,8 @@ def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
     monkeypatch.setattr(
         torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", offline, raising=False
     )
-    protocol = ImageMetrics()
-    assert "lpips" not in protocol.metrics
+    protocol = MetricsOptions().build()
+    assert protocol.lpips is None
     assert protocol.left_out["lpips"] == "LPIPS: the weights of 'vgg' could not be loaded: no route"
 
 
@@ -307,21 +310,21 @@ def test_the_box_can_be_wider():
     # The box ends at the image's border.
     assert box_of(mask, 9.0)[0].all()
     image, target = _images(2, 20, 30)
-    values = ImageMetrics(lpips="off", box_margin=0.5)(image, target, mask)
+    values = MetricsOptions(lpips="off", box_margin=0.5).build()(image, target, mask)
     assert torch.equal(values["psnr_box"][:1], psnr(image, target, wider)[:1])
     assert values["psnr_box"][1].isnan()
     with pytest.raises(InputError, match="box_margin"):
-        ImageMetrics(lpips="off", box_margin=-0.1)
+        MetricsOptions(lpips="off", box_margin=-0.1).build()
 
 
 def test_a_protocol_says_what_its_numbers_mean():
     """Definitions stored beside the numbers name padding, cap, box and clamp."""
-    said = ImageMetrics(lpips="off", box_margin=0.1).definitions
+    said = MetricsOptions(lpips="off", box_margin=0.1).build().definitions
     assert said["ssim"].endswith("padding reflect")
     assert "at most 100 dB" in said["psnr"]
     assert "0.1 of its sides wider" in said["box"]
     assert "clamped" in said["image"]
-    release = ImageMetrics("release", ["image"], "zeros", clamp=False, lpips="off").definitions
+    release = RELEASE.build().definitions
     assert release["ssim"].endswith("padding zeros")
     assert "as they are" in release["image"]
     assert "box" not in release

@@ -9,12 +9,13 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses, terms
+from ghgs_lit.losses import terms
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import Rounds
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.types import Targets
+from tests.helpers.losses import losses_of
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
 from tests.helpers.scenes import make_batch
 
@@ -146,7 +147,7 @@ def test_validation_shows_what_each_round_is_worth():
     batch = make_batch(1, 3)
     batch = dataclasses.replace(batch, targets=Targets(batch.images, batch.masks, batch.cameras))
     trained = GHGSModule(
-        model("rounds.gains=false"), render, Losses({"render_l1": 1.0}), Optimization(lr=1.0), {}
+        model("rounds.gains=false"), render, losses_of({"render_l1": 1.0}), Optimization(lr=1.0), {}
     )
     trainer = L.Trainer(
         accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False

@@ -9,9 +9,9 @@ import torch
 
 from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.budgets import TokenBudgets, token_budget
+from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, StepData, example_batch, flat_renderer
@@ -81,7 +81,7 @@ def fit(folder, steps, resume=None):
     model = Watched()
     options = Optimization(lr=0.05)
     budgets = TokenBudgets(["all", "window", 0, 1, 2])
-    module = GHGSModule(model, flat_renderer, Losses({"render_l1": 1.0}), options, {"seed": 3}, budgets)
+    module = GHGSModule(model, flat_renderer, losses_of({"render_l1": 1.0}), options, {"seed": 3}, budgets)
     trainer = L.Trainer(
         accelerator="cpu", max_steps=steps, max_epochs=-1, default_root_dir=folder, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,

@@ -5,13 +5,13 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from ghgs_lit.losses import Losses
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
+from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
 from tests.helpers.scenes import training_batch
 
-LOSSES = Losses({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 1.0}, chamfer_points=20)
+LOSSES = losses_of({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 1.0}, chamfer_points=20)
 
 
 class Curve(L.Callback):

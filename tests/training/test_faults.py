@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import nn
 
-from ghgs_lit.losses import Losses
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.training import GHGSModule, Optimization, faults
+from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.faults import Step, first_fault
 from ghgs_lit.types import map_tensors
+from tests.helpers.losses import losses_of
 from tests.helpers.models import config, make_model
 from tests.helpers.scenes import training_batch
 
@@ -22,7 +22,7 @@ STAGES += ("renderer", "losses")
 def make_module(*overrides) -> GHGSModule:
     renderer = Renderer(backend="cpu")
     module = GHGSModule(
-        make_model(*overrides), renderer, Losses(LOSSES), Optimization(lr=0.01), config(*overrides)
+        make_model(*overrides), renderer, losses_of(LOSSES), Optimization(lr=0.01), config(*overrides)
     )
     return module.train()
 
@@ -61,7 +61,7 @@ def test_a_stage_whose_result_is_not_finite_is_named(stage):
     module = make_module()
     after(module, stage, lambda inputs, result: _nan(result))
     fault = first_fault(module, Step(training_batch(), 1))
-    assert (fault.phase, fault.stage, fault.sample) == ("forward", stage, "p0")
+    assert (fault.where, fault.stage, fault.sample) == ("result of", stage, "p0")
     assert fault.place.startswith(stage)
 
 
@@ -71,7 +71,7 @@ def test_a_stage_whose_gradient_is_not_finite_is_named(stage):
     module = make_module()
     after(module, stage, lambda inputs, result: _infinite_slope(result))
     fault = first_fault(module, Step(training_batch(), 1))
-    assert (fault.phase, fault.stage) == ("backward", stage)
+    assert (fault.where, fault.stage) == ("gradient from", stage)
 
 
 def test_the_sample_is_the_one_that_is_at_fault_alone():
@@ -97,11 +97,11 @@ def test_weights_and_data_are_looked_at_first():
     module, batch = make_module(), training_batch(2)
     batch.targets.images[1, 0, 0, 3, 4] = torch.inf
     fault = first_fault(module, Step(batch, 1))
-    assert (fault.phase, fault.place, fault.sample) == ("batch", "batch.targets.images", "p1")
+    assert (fault.where, fault.place, fault.sample) == ("data that enters", "batch.targets.images", "p1")
     name, parameter = next(iter(module.model.recalibration.named_parameters()))
     parameter.data.view(-1)[0] = torch.nan
     fault = first_fault(module, Step(batch, 1))
-    assert (fault.phase, fault.stage, fault.place) == ("weights", "recalibration", f"recalibration.{name}")
+    assert (fault.where, fault.stage, fault.place) == ("weights of", "recalibration", f"recalibration.{name}")
 
 
 def test_weights_that_overflow_inside_a_stage_name_the_layer():
@@ -111,13 +111,22 @@ def test_weights_that_overflow_inside_a_stage_name_the_layer():
     header[0].bias.data.fill_(3e38)
     header[2].weight.data.fill_(3e38)
     fault = first_fault(module, Step(training_batch(), 1))
-    assert (fault.phase, fault.place) == ("forward", "gaussian_head.scale_header.2")
+    assert (fault.where, fault.place) == ("result of", "gaussian_head.scale_header.2")
 
 
 def test_a_gradient_whose_norm_overflows_names_its_largest_part():
     """Each value is finite, the root of the sum of their squares is not."""
-    watch = faults._Watch()
-    slopes = {"encoder.a": torch.tensor([2e38]), "depth_head.b": torch.tensor([3e38]), "encoder.c": None}
-    faults._see_norm(watch, slopes)
-    assert (watch.fault.phase, watch.fault.stage) == ("backward", "depth_head")
-    assert watch.fault.place == "norm, largest of depth_head.b"
+    module = make_module("model=hull")
+    first = next(name for name, _ in module.model.depth_head.named_parameters())
+    real = module.losses
+    weight = module.model.depth_head.get_parameter(first)
+    other = next(module.model.gaussian_head.parameters())
+
+    def steep(*inputs):
+        total, values = real(*inputs)
+        return total + 3e38 * weight.flatten()[0] + 2e38 * other.flatten()[0], values
+
+    module.losses = steep
+    fault = first_fault(module, Step(training_batch(), 1))
+    assert (fault.where, fault.stage) == ("gradient from", "depth_head")
+    assert fault.place == f"norm, largest of depth_head.{first}"

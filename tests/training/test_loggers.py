@@ -13,7 +13,6 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import Memory, StepTime, resident_mb
 from ghgs_lit.training.clock import PARTS, StepClock
@@ -27,7 +26,8 @@ from ghgs_lit.training.loggers import (
     log_results,
     resume,
 )
-from ghgs_lit.training.validation_pictures import Attention, Pictures, PointClouds
+from ghgs_lit.training.validation_pictures import AttentionOptions, Pictures, PointClouds
+from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, flat_renderer
 
 
@@ -67,13 +67,13 @@ def run(tmp_path_factory):
     subject = GHGSModule(
         Staged(),
         flat_renderer,
-        Losses({"render_l1": 0.8, "chamfer": 1.0}),
-        Optimization(lr=0.05),
+        losses_of({"render_l1": 0.8, "chamfer": 1.0}),
+        Optimization(lr=0.05, end_factor=0.0),
         {"seed": 1},
     )
     trainer = L.Trainer(
         accelerator="cpu", max_steps=8, max_epochs=-1, default_root_dir=folder, logger=loggers(folder),
-        callbacks=[StepTime(), Memory(), Pictures(1), Attention(1), PointClouds(1)],
+        callbacks=[StepTime(), Memory(), Pictures(1), AttentionOptions().build(), PointClouds(1)],
         enable_checkpointing=False, enable_model_summary=False, enable_progress_bar=False,
         num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=2,
     )  # fmt: skip
@@ -101,7 +101,7 @@ def test_the_numbers_are_those_of_the_steps(run):
     found = events(run[0] / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
     assert sorted(rates) == [1, 3, 5, 7]
-    assert rates[7] == pytest.approx(0.05 * Optimization(lr=0.05).factor(7 / 8))
+    assert rates[7] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
     assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
     parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("time_ms/") and "step" not in tag]
     for place, whole in enumerate(found.Scalars("time_ms/step")):

@@ -126,13 +126,13 @@ def test_everything_else_moves_as_with_adamw():
 def test_a_resumed_run_goes_on_with_the_same_numbers():
     """Momenta, averages and both learning rates are in the state, as plain data."""
     whole, stopped = Small(), Small()
-    options = Optimization(lr=0.01, matrix_lr=0.02)
-    first = options.build(whole)
+    options = Optimization(lr=0.01, matrix_scale=2.0)
+    first = options.optimizer(whole)
     for seed in range(2):
         set_gradients(whole, seed)
         first.step()
     stopped.load_state_dict(whole.state_dict())
-    second = options.build(stopped)
+    second = options.optimizer(stopped)
     second.load_state_dict(deepcopy(first.state_dict()))
     for model, optimizer in ((whole, first), (stopped, second)):
         set_gradients(model, 9)

@@ -7,18 +7,17 @@ import signal
 import lightning.pytorch as L
 import pytest
 import torch
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.losses import Losses
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.checkpoints import AtomicCheckpointIO, Checkpoints
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
 from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
 from ghgs_lit.training.validation_pictures import Pictures
+from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, _Steps, flat_renderer
 
 STEPS = 16
@@ -48,15 +47,15 @@ class Cut(L.Callback):
 
 def module() -> GHGSModule:
     # Frozen parameters and points drawn at random: both must know where the run stands.
-    losses = Losses({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
-    optimization = Optimization(lr=0.05, warmup=0.1, freeze_until={"shift": 0.4})
+    losses = losses_of({"render_l1": 0.8, "chamfer": 1.0, "depth": 0.5}, chamfer_points=7)
+    optimization = Optimization(lr=0.05, warmup=0.1, end_factor=0.0, freeze_until={"shift": 0.4})
     return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
 
 def fit(folder, cut: Cut, resume=None, every=3, more=(), **options):
     torch.manual_seed(11 if resume else 12)  # what the process drew before must not matter
-    best = Checkpoints(filename="best", monitor="val/psnr", mode="max", save_on_train_epoch_end=False)
-    last = Checkpoints(filename="last", every_n_train_steps=every)
+    best = CheckpointOptions(filename="best", monitor="val/psnr", mode="max").build()
+    last = CheckpointOptions(filename="last", every_n_train_steps=every).build()
     trainer = L.Trainer(
         accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder,
         plugins=[AtomicCheckpointIO()],
@@ -254,26 +253,32 @@ def test_changed_options_of_the_optimizer_apply(tmp_path, monkeypatch):
     with pytest.raises(PowerCut):
         fit(tmp_path, Cut(8))
     changed = module()
-    changed.optimization = Optimization(lr=0.005, warmup=0.1, betas=(0.5, 0.9), freeze_until={"shift": 0.4})
+    changed.optimization = Optimization(
+        lr=0.005, warmup=0.1, end_factor=0.0, betas=(0.5, 0.9), freeze_until={"shift": 0.4}
+    )
     monkeypatch.setattr("tests.training.test_resume.module", lambda: changed)
     fit(tmp_path, Cut(), resume=tmp_path / "checkpoints" / "last.ckpt")
     rates = [float(row["train/learning_rate"]) for row in rows(tmp_path) if "train/learning_rate" in row]
-    parts = ((Optimization(lr=0.05, warmup=0.1), range(6)), (changed.optimization, range(6, STEPS)))
+    parts = (
+        (Optimization(lr=0.05, warmup=0.1, end_factor=0.0), range(6)),
+        (changed.optimization, range(6, STEPS)),
+    )
     expected = [part.lr * part.factor(step / STEPS) for part, steps in parts for step in steps]
     assert rates == pytest.approx(expected, rel=1e-5)
     assert changed.optimizers().param_groups[0]["betas"] == (0.5, 0.9)
 
 
-@pytest.mark.parametrize(("old", "new"), [(None, 0.02), (0.02, None)])
+@pytest.mark.parametrize(("old", "new"), [(None, 2.5), (2.5, None)])
 def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
     """Muon cannot go on from the averages of AdamW, nor AdamW from Muon's."""
     path = tmp_path / "a.ckpt"
     content = {"state_dict": {f"model.{k}": v for k, v in Standin().state_dict().items()}}
-    before, now = ({**CONFIG, "optimizer": {"lr": 0.05, "matrix_lr": rate}} for rate in (old, new))
-    content |= {"config": before, "format_version": 1, "global_step": 5, "optimizer_states": []}
+    before, now = (Optimization(lr=0.05, matrix_scale=scale) for scale in (old, new))
+    states = [before.optimizer(Standin()).state_dict()]
+    content |= {"config": CONFIG, "format_version": 1, "global_step": 5, "optimizer_states": states}
     torch.save(content, path)
-    with pytest.raises(InputError, match=r"optimizer\.matrix_lr: expected .*a\.ckpt; found"):
-        check_resume(path, Standin(), now)
+    with pytest.raises(InputError, match=r"optimizer\.matrix_scale: expected .*a\.ckpt; found"):
+        check_resume(path, Standin(), {**CONFIG, "optimizer": dict(now)})
 
 
 def test_an_optimizer_whose_state_was_changed_is_refused(tmp_path):
@@ -339,10 +344,10 @@ def test_one_way_to_start(tmp_path):
 def test_minutes_are_positive(minutes):
     """An impossible interval is refused with its key."""
     with pytest.raises(InputError, match="minutes"):
-        Checkpoints(filename="last", minutes=minutes)
+        CheckpointOptions(filename="last", minutes=minutes)
 
 
 def test_minutes_and_steps_exclude_one_another():
     """One callback saves by steps or by time; both would silently mean one of them."""
-    with pytest.raises(MisconfigurationException):
-        Checkpoints(filename="last", minutes=1, every_n_train_steps=3)
+    with pytest.raises(InputError, match="minutes: expected null where every_n_train_steps is given"):
+        CheckpointOptions(filename="last", minutes=1, every_n_train_steps=3)

@@ -203,7 +203,7 @@ def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
     path = tmp_path / "a.ckpt"
     checkpoint(path, config=config(f"encoder.trainable={trainable}"))
     model = GHGS.from_checkpoint(path).train()
-    optimizer = Optimization(lr=1e-3).build(model)
+    optimizer = Optimization(lr=1e-3).optimizer(model)
     held = {id(p) for group in optimizer.param_groups for p in group["params"]}
     before = {name: p.detach().clone() for name, p in model.named_parameters()}
     g = model(make_batch(1, 3)).gaussians

@@ -77,7 +77,7 @@ def test_true_depth_renders_the_input_again():
     alone = batch.masks.clone()
     alone[:, 1] = False
     batch = dataclasses.replace(batch, targets=own, masks=alone)
-    method = named("true_depth", Renderer("reference"))
+    method = named("true_depth", Renderer(backend="reference"))
     estimate = method(batch)
     assert torch.equal(estimate.depth, batch.depths)
     inside = batch.masks[0, 0]
@@ -117,6 +117,6 @@ def test_what_the_data_lacks_is_an_error(name, field):
 def test_every_baseline_predicts_the_targets(name):
     """Also of another size and number than the inputs, for several subjects."""
     batch = example_batch(subjects=2, views=3, targets=2)
-    image = named(name, Renderer("cpu") if name != "untrained" else flat_renderer)(batch).image
+    image = named(name, Renderer(backend="cpu") if name != "untrained" else flat_renderer)(batch).image
     assert image.shape == batch.targets.images.shape
     assert image.isfinite().all()

@@ -12,7 +12,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Targets
 from tests.helpers.scenes import painted_ellipsoid, ring
 
-RENDERER = Renderer("cpu")
+RENDERER = Renderer(backend="cpu")
 
 
 def scene(views=4, size=42):

@@ -14,7 +14,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, DepthMaps, Points, Targets
 from tests.helpers.scenes import make_batch, painted_ellipsoid, ring, with_soft_rims
 
-RENDERER = Renderer("cpu")
+RENDERER = Renderer(backend="cpu")
 
 
 def test_splats_have_the_surfaces_own_colors():

@@ -15,7 +15,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import off, painted_ellipsoid, ring
 
-RENDERER = Renderer("cpu")
+RENDERER = Renderer(backend="cpu")
 
 
 @dataclasses.dataclass

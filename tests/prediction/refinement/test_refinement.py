@@ -14,7 +14,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import painted_ellipsoid, ring
 
-RENDERER = Renderer("cpu")
+RENDERER = Renderer(backend="cpu")
 
 
 def scene(batch=1, views=4, size=56):

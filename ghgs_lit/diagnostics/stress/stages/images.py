@@ -5,7 +5,7 @@ from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case, except_for
-from ghgs_lit.geometry.chamfer import KINDS, chamfer
+from ghgs_lit.geometry.chamfer import chamfer
 from ghgs_lit.metrics.flip import flip_map
 from ghgs_lit.metrics.functional import psnr, ssim
 
@@ -76,20 +76,13 @@ def _clouds(family: str, g: Generator) -> Values:
 
 
 def _chamfer(v: Values) -> Values:
-    return {kind: chamfer(v["points"], v["surface"], kind) for kind in KINDS}
+    return {"chamfer": chamfer(v["points"], v["surface"])}
 
 
 def _chamfer_slowly(v: Values) -> Values:
     """All distances, in the precision of the inputs."""
     apart = (v["points"][:, None] - v["surface"]).square().sum(-1)
-    pairs = torch.cat((apart.amin(1), apart.amin(0))) * 2
-    root = torch.where(pairs > 0.02, pairs / 2, 0.01).sqrt()
-    costs = {
-        "squared": pairs,
-        "huber": torch.where(pairs > 0.02, 2 * (0.2 * root - 0.01), pairs),
-        "truncated": pairs.clamp(max=0.02),
-    }
-    return {kind: value.mean() for kind, value in costs.items()}
+    return {"chamfer": 2 * torch.cat((apart.amin(1), apart.amin(0))).mean()}
 
 
 STAGES = (

@@ -73,7 +73,7 @@ def _predict(name: str, v: Values) -> Values:
     return _dense(_model(name, v)(batch), batch)
 
 
-_LOSSES = Losses({"render_l1": 0.8, "render_ssim": 0.2, "chamfer": 1.0, "depth": 1.0}, chamfer="huber")
+_LOSSES = Losses(weights={"depth": 1.0})
 
 
 @torch.enable_grad()

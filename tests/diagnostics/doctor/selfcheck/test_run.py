@@ -92,9 +92,7 @@ def test_a_stage_that_is_wrong_fails_and_none_before_it(monkeypatch):
 def test_a_renderer_with_other_constants_fails(planted, row, monkeypatch):
     """Each of them is compiled into gsplat, and another version may have another."""
     right = cpu.rasterize
-    monkeypatch.setattr(
-        cpu, "rasterize", lambda g, c, s, *rest: right(g, c, dataclasses.replace(s, **planted), *rest)
-    )
+    monkeypatch.setattr(cpu, "rasterize", lambda g, c, s, *rest: right(g, c, s.replace(**planted), *rest))
     assert row in failures(renderer(settings(), CPU))
 
 

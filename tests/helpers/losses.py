@@ -1,0 +1,8 @@
+"""Losses of some terms alone."""
+
+from ghgs_lit.losses import Losses, LossWeights
+
+
+def losses_of(weights: dict[str, float], **options) -> Losses:
+    """Losses whose other terms have the weight 0."""
+    return Losses(weights={**dict.fromkeys(LossWeights.model_fields, 0.0), **weights}, **options)
