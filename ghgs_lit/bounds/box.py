@@ -60,6 +60,11 @@ class SubjectBox:
         for name in ("min_depth", "min_thickness"):
             require(getattr(self, name) > 0, f"bounds.{name}", "above 0", getattr(self, name))
 
+    @property
+    def is_bounded(self) -> bool:
+        """Whether there are bounds: all but :class:`NoBounds` give them."""
+        return True
+
     @torch.no_grad()
     def __call__(self, batch: Batch) -> DepthBounds:
         """Bounds of all pixels; reads masks and cameras."""

@@ -1,10 +1,14 @@
 """Depths without bounds."""
 
+from typing import ClassVar
+
 from ghgs_lit.types import Batch
 
 
 class NoBounds:
     """The stage of a model whose depths are not bounded, as in the authors' release."""
+
+    is_bounded: ClassVar[bool] = False
 
     def __call__(self, batch: Batch) -> None:
         """None: there are no bounds."""

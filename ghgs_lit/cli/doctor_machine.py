@@ -150,8 +150,8 @@ def _changes(config: Mapping[str, Any], training: bool) -> dict[str, Change]:
     """Keys that the configuration does not use yet."""
     encoder = config["encoder"]
     found: dict[str, Change] = {}
-    if encoder["tokens"] == "all" and not config["skip"].get("choices"):
-        found["skip=fast"] = lambda c: c["encoder"].update(tokens="subject")
+    if config["skip"]["tokens"] == "all" and not config["skip"].get("choices"):
+        found["skip=fast"] = lambda c: c["skip"].update(tokens="subject")
     if not training:
         return found
     if not encoder["checkpointing"] and encoder["trainable"] != "none":

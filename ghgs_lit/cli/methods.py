@@ -11,6 +11,7 @@ from ghgs_lit.evaluation.measure import Method, ModelMethod
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.loading import load_weights
 
 
 def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
@@ -23,7 +24,7 @@ def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[Mod
     """
     path, renderer = config["checkpoint"], build_renderer(config, device)
     model = GHGS.from_config(config, empty=STAGES)
-    model.load(path, device=device)
+    load_weights(model, path, device=device)
     model.precision = config["precision"]
     checkpoint = read_checkpoint(path)
     facts: dict[str, Any] = {

@@ -32,9 +32,11 @@ from ghgs_lit.prediction.export import output_options, write_prediction
 from ghgs_lit.prediction.export.video import write_mp4
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, pixels_moved
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.loading import load_weights
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
@@ -109,7 +111,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         print("\n".join(diagnosis.lines), flush=True)
     size = image_size("size", config["size"] or trained_size(read_checkpoint(config["checkpoint"])["config"]))
     model, renderer, device = load(config)
-    multiple = model.side_multiple
+    multiple = side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple}"
     require(not any(side % multiple for side in size), "size", expected, size)
     totals: dict[str, float] = {}
@@ -158,7 +160,7 @@ def load(config: dict[str, Any]) -> tuple[GHGS, Renderer, torch.device]:
     device = pick_device(config["device"])
     renderer = build_renderer(config, device)
     model = GHGS.from_config(config, empty=STAGES)
-    model.load(config["checkpoint"], device=device)
+    load_weights(model, config["checkpoint"], device=device)
     model.precision = config["precision"]
     return model.to(device).eval(), renderer, device
 

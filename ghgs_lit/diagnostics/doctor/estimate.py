@@ -163,7 +163,7 @@ def _without_values(config: Mapping[str, Any], scene: Scene, shapes: Shapes) -> 
     """The model and a batch; masks and cameras have values."""
     with torch.device("meta"):
         model = GHGS.from_config(config)
-    model.check_inputs = False
+    model.options = model.options.replace(check_inputs=False)
     with shapes.world:
         for module in model.modules():
             for name, p in module._parameters.items():
