@@ -61,7 +61,8 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
         InputError: it does not run on ``device``.
     """
     renderer = build(config["renderer"], "renderer")
-    resolve_backend(renderer.backend, device)
+    if (backend := getattr(renderer, "backend", None)) is not None:  # a plug-in's may have none
+        resolve_backend(backend, device)
     return renderer
 
 
