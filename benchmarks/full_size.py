@@ -20,7 +20,7 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import Job, inspect, time_jobs
-from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of, presets_of, readers_of_skip
+from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of, presets_of
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, top_level
 from ghgs_lit.types import Batch
 
@@ -34,7 +34,7 @@ def variants(cfg, presets: list[str], device: torch.device) -> list[Case]:
     chosen["literal"] = chosen["none"]
     shared = {name: config[name] for name in ("renderer", "precision")}
     source = Source("model", config, None)
-    cases = cases_of(source, chosen, readers_of_skip(cfg), {}, shared, device, seed=1)
+    cases = cases_of(source, chosen, {}, shared, device, seed=1)
     write_out(cases[-1].model)
     return cases
 

@@ -28,7 +28,7 @@ from ghgs_lit.cli.inputs import pick_device
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import order
-from ghgs_lit.diagnostics.benchmark.presets import Case, readers_of_skip
+from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, SecondsProbe, forward, top_level
 from ghgs_lit.kernels.allocation import keep_freed_memory
@@ -64,7 +64,7 @@ class Live:
         config = resolve(cfg)
         device = pick_device(config["device"])
         check_options(config, options.options)
-        cases = configured_cases(config, readers_of_skip(cfg), device)
+        cases = configured_cases(config, device)
         batch, photographs = scene(options.share, options.views, options.size, options.target)
         return cls(cases, batch.to(device), photographs, device)
 

@@ -4,14 +4,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import model_validator
 from torch import Tensor
 
-from ghgs_lit.errors import require
-from ghgs_lit.types import Decision
+from ghgs_lit.config.options import Amount, Index, Options, Text
+from ghgs_lit.errors import InputError
+from ghgs_lit.types import Decision, DecodedPixels
 
 
 class View(NamedTuple):
@@ -25,11 +27,6 @@ class View(NamedTuple):
         """What a choice of ``token_budgets`` lets the encoder see."""
         return cls("subject", budget) if isinstance(budget, int) else cls(budget)
 
-    @classmethod
-    def of_preset(cls, skip: Mapping[str, Any]) -> "View":
-        """What a node ``skip`` lets the encoder see."""
-        return cls(skip["tokens"], 0 if skip["tokens"] == "all" else skip["margin"])
-
 
 @contextmanager
 def seeing(encoder: Any, view: View) -> Iterator[None]:
@@ -42,19 +39,87 @@ def seeing(encoder: Any, view: View) -> Iterator[None]:
         encoder.tokens, encoder.margin = before
 
 
-@dataclass(frozen=True)
-class Preset:
-    """A preset of ``conf/skip``.
+class Preset(Options):
+    """What is left out of the work, and what that may cost."""
 
-    Args:
-        view: what the encoder sees.
-        budget_db: PSNR that it may lose against ``skip=none``.
-        is_exact: whether it promises the values of ``skip=none``, so that its loss is known for any weights.
-    """
+    name: Text = "exact"
+    """Name of the preset, for reports."""
+    tokens: Literal["all", "window", "subject"] = "all"
+    """Patches that the encoder works on: all, those of the smallest rectangle around the subject (window), or
+    the subject's."""
+    margin: Index = 1
+    """Patches around the window or the subject that stay."""
+    pixels: DecodedPixels = "subject"
+    """Pixels that the dense heads decode: whole views, or windows around the subject. The depth head decodes
+    all where recalibration.tokens=all: all tokens need a depth."""
+    budget_db: float | None = 0.001
+    """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it); null: no promise."""
+    max_rel_diff: Amount | None = 1e-5
+    """Largest difference of an attribute or a render from skip=none, as a share of its largest value, which
+    `ghgs benchmark` checks (1000 times with rounds); null: nothing is promised."""
 
-    view: View
-    budget_db: float
-    is_exact: bool
+    @property
+    def view(self) -> View:
+        """What the encoder sees."""
+        return View(self.tokens, 0 if self.tokens == "all" else self.margin)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the values of ``skip=none`` are promised, so that the loss is known for any weights."""
+        return self.max_rel_diff is not None
+
+
+class Choices(Options):
+    """Presets of which ``skip=auto`` gives each subject one; null: not that one."""
+
+    exact: Preset | None = None
+    """The same values without work that no output depends on."""
+    balanced: Preset | None = None
+    """The encoder works on a window around the subject."""
+    fast: Preset | None = None
+    """The encoder works on the subject alone."""
+
+
+class SkipOptions(Preset):
+    """A preset, or several to choose from."""
+
+    group = "skip"
+    choices: Choices = Choices()
+    """Presets to choose from with skip=auto; none: this one is a preset itself."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "SkipOptions":
+        """Refuse keys that would be ignored, and a budget in which there is no preset."""
+        if not self.presets:
+            return self
+        self.require(self.tokens == "all", "tokens", "all with skip=auto, which chooses it")
+        for name, preset in self.presets.items():
+            for key in ("pixels", "margin") if preset.tokens == "subject" else ("pixels",):
+                wanted, found = getattr(self, key), getattr(preset, key)
+                if found != wanted:
+                    raise InputError(
+                        f"choices.{name}.{key}: expected {wanted}, as skip.{key}; found {found!r}"
+                    )
+            if preset.budget_db is None:
+                raise InputError(f"choices.{name}.budget_db: expected a number; found None")
+        least = min(preset.budget_db for preset in self.presets.values())
+        enough = self.budget_db is not None and self.budget_db >= least
+        self.require(enough, "budget_db", f"{least:g} or more with skip=auto")
+        return self
+
+    @property
+    def presets(self) -> dict[str, Preset]:
+        """The presets to choose from, by name."""
+        return {name: preset for name, preset in self.choices if preset is not None}
+
+    def build(self) -> "AutoSkip | None":
+        """What chooses among the presets; None where there are none."""
+        if not self.presets:
+            return None
+        ordered = dict(sorted(self.presets.items(), key=lambda item: item[1].budget_db))
+        within = {name: preset for name, preset in ordered.items() if preset.budget_db <= self.budget_db}
+        beyond = {n: f"may lose {p.budget_db:g} dB" for n, p in ordered.items() if n not in within}
+        return AutoSkip(within, self.budget_db, beyond)
 
 
 @dataclass(frozen=True)
@@ -77,7 +142,7 @@ class AutoSkip:
 
     def trained_by(self, config: Mapping[str, Any]) -> "AutoSkip":
         """Without the presets that the training of ``config`` never showed: nobody knows what they lose."""
-        shown = {View.of_preset(config["skip"])} if config.get("skip") else {View("all")}
+        shown = {SkipOptions.read(config.get("skip") or {}, "skip").view}
         shown |= {View.of_budget(budget) for budget in config.get("token_budgets") or []}
         known = {n: p for n, p in self.presets.items() if p.is_exact or p.view in shown}
         unknown = {name: "not shown in training" for name in self.presets if name not in known}
@@ -111,41 +176,13 @@ class AutoSkip:
         for decision in decisions:
             shares[decision.preset].append(decision.products)
         parts = []
-        for name, found in sorted(shares.items(), key=lambda item: -len(item[1])):
-            if found:
-                times = f" for {len(found)} of {len(decisions)}" if len(decisions) > 1 else ""
-                parts.append(f"{name}{times} ({fmean(found):.0%})")
+        for name, products in sorted(shares.items(), key=lambda item: -len(item[1])):
+            if products:
+                times = f" for {len(products)} of {len(decisions)}" if len(decisions) > 1 else ""
+                parts.append(f"{name}{times} ({fmean(products):.0%})")
         why = f"the fewest products in the encoder within skip.budget_db={self.budget_db:g}"
         left_out = "".join(f"; not {name}: {reason}" for name, reason in self.left_out.items())
         return f"skip=auto: {', '.join(parts)}, {why} (100% is {next(iter(self.presets))}){left_out}"
-
-
-def auto_skip(skip: Mapping[str, Any]) -> AutoSkip | None:
-    """What the node ``skip`` says; None where it is a preset itself.
-
-    Raises:
-        InputError: no preset is in the budget, or a key would be ignored.
-    """
-    if not skip.get("choices"):
-        return None
-    expected = "all with skip=auto, which chooses it"
-    require(skip["tokens"] == "all", "skip.tokens", expected, skip["tokens"])
-    presets = {}
-    for name, node in skip["choices"].items():
-        place = f"skip.choices.{name}"
-        for key in ("pixels", "margin") if node["tokens"] == "subject" else ("pixels",):
-            require(node[key] == skip[key], f"{place}.{key}", f"{skip[key]}, as skip.{key}", node[key])
-        require(node["budget_db"] is not None, f"{place}.budget_db", "a number", None)
-        is_exact = node["max_rel_diff"] is not None
-        presets[name] = Preset(View.of_preset(node), node["budget_db"], is_exact)
-    ordered = dict(sorted(presets.items(), key=lambda item: item[1].budget_db))
-    limit, least = skip["budget_db"], next(iter(ordered.values())).budget_db
-    require(
-        limit is not None and limit >= least, "skip.budget_db", f"{least:g} or more with skip=auto", limit
-    )
-    within = {name: preset for name, preset in ordered.items() if preset.budget_db <= limit}
-    beyond = {n: f"may lose {p.budget_db:g} dB" for n, p in ordered.items() if n not in within}
-    return AutoSkip(within, limit, beyond)
 
 
 def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tensor, " B"]:

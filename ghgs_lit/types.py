@@ -17,13 +17,16 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _T = TypeVar("_T")
+
+#: What dense heads decode: whole views, or windows around the subject.
+DecodedPixels = Literal["all", "subject"]
 
 
 def map_tensors(value: _T, fn: Callable[[Tensor], Tensor]) -> _T:
@@ -250,6 +253,13 @@ class Tokens(_TensorStruct):
             part = self.select(slice(*torch.searchsorted(self.image, ends).tolist()))
         grid = (1, images.stop - images.start, h, w)
         return dataclasses.replace(part, image=part.image - images.start, grid=grid)
+
+    def in_precision(self, dtype: torch.dtype) -> "Tokens":
+        """The tokens in a precision; as they are where autocast chooses it."""
+        if torch.is_autocast_enabled(self.semantic.device.type) or self.latent[0].dtype == dtype:
+            return self
+        latent = tuple(layer.to(dtype) for layer in self.latent)
+        return dataclasses.replace(self, latent=latent, semantic=self.semantic.to(dtype))
 
     def maps(self, layer: int) -> Float[Tensor, "BV C h w"]:
         """One layer on the token grid; 0 at patches whose tokens were not kept."""

@@ -84,9 +84,9 @@ def test_checks_of_values_can_be_left_out():
     model = make_model("model=paper")
     with pytest.raises(InputError, match=r"batch\.images: expected finite values within \[0, 1\]"):
         model(bad)
-    model.check_inputs = False
+    model.options = model.options.replace(check_inputs=False)
     model(bad)
-    assert not GHGS.from_config(config("model.check_inputs=false")).check_inputs
+    assert not GHGS.from_config(config("model.check_inputs=false")).options.check_inputs
 
 
 @pytest.mark.parametrize("message", list(bad_batches()))

@@ -8,7 +8,7 @@ from ghgs_lit.bounds import SubjectBox
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.heads.depth import BOUNDED, DepthHead
+from ghgs_lit.heads.depth import BOUNDED, DepthHeadOptions
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Tokens
 from ghgs_lit.weights import names
@@ -110,7 +110,8 @@ def test_no_value_of_the_head_flips_or_explodes_a_depth(name):
     """Whatever a network says, depths lie between near and far, and so do their gradients."""
     batch = make_batch(1, 3)
     torch.manual_seed(0)
-    head = DepthHead(64, {"features": 16, "out_channels": [16] * 4}, name)
+    dpt = {"features": 16, "out_channels": [16] * 4}
+    head = DepthHeadOptions(dpt=dpt, parameterization=name).build(64)
     tokens = torch.zeros(3 * 16, 64)
     axes = (torch.arange(n) for n in (3, 4, 4))
     image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))

@@ -16,10 +16,11 @@ from ghgs_lit.config.ablation import ablation_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.heads.depth import DepthHead
-from ghgs_lit.heads.gaussian import GaussianHead
+from ghgs_lit.heads.depth import DepthHeadOptions
+from ghgs_lit.heads.gaussian import GaussianHeadOptions
 from ghgs_lit.model import GHGS
 from ghgs_lit.recalibration import RecalibrationOptions
+from ghgs_lit.surroundings import ModelOptions
 from ghgs_lit.types import Batch, Cameras, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
@@ -31,7 +32,7 @@ PRESETS = sorted(path.stem for path in (conf_dir() / "skip").glob("*.yaml"))
 class GivenTokens(nn.Module):
     """An encoder whose tokens come from a fixture."""
 
-    patch_size = 14
+    patch_size, bounds_input = 14, False
 
     def __init__(self, inputs):
         super().__init__()
@@ -55,12 +56,11 @@ def release_model(inputs, dtype):
     model = GHGS(
         NoBounds(),
         GivenTokens(inputs),
-        DepthHead(64, dpt, parameterization="inverse_linear"),
+        DepthHeadOptions(dpt=dpt, parameterization="inverse_linear").build(64),
         Unprojection(tokens="release", border=3),
         RecalibrationOptions(k=8, similarity="product_clamped", tokens="all").build(64),
-        GaussianHead(64, dpt, parameterization="release"),
-        pad="multiple",
-        frame="world",
+        GaussianHeadOptions(dpt=dpt, parameterization="release").build(64),
+        options=ModelOptions(pad="multiple", frame="world"),
     ).to(dtype)
     published = fixture("predict_gaussian_reduced", "state", dtype)
     model.load_state_dict({to_ours(key, RELEASE): value for key, value in published.items()})
@@ -224,8 +224,11 @@ def test_only_windows_around_the_subject_are_decoded():
     model(batch)
     assert [count for count, *_ in decoded] == [3, 2, 3, 2]
     assert all(max(size) < 56 for _, *size in decoded)
-    assert config("skip=exact")["depth_head"]["pixels"] == "subject"
-    assert GHGS.from_config(config("skip=exact", "compat=release")).depth_head.pixels == "all"
+    decoded.clear()
+    model.recalibration.tokens = "all"
+    model(batch)
+    assert decoded == [(6, 56, 56), *decoded[1:]]
+    assert [count for count, *_ in decoded[1:]] == [3, 2]
 
 
 @pytest.mark.parametrize("overrides", [["model=hull"], ["unprojection=release"]], ids=operator.itemgetter(0))
@@ -321,9 +324,12 @@ def test_a_missing_stage_and_a_bad_value_name_their_key():
 @pytest.mark.parametrize(
     ("overrides", "found"),
     [
-        (["model=paper", "bounds=none"], "NoBounds with bounded_inverse"),
+        (["model=paper", "bounds=none"], "NoBounds with a depth head between bounds"),
         (["model=hull", "depth_head.parameterization=inverse_linear"], "consistency_depths"),
-        (["model=paper", "depth_head.parameterization=inverse_linear"], "SubjectBox with inverse_linear"),
+        (
+            ["model=paper", "depth_head.parameterization=inverse_linear"],
+            "SubjectBox with a depth head without bounds",
+        ),
         (
             ["model=hull", "compat=release", "encoder.bounds_input=true"],
             "encoder.bounds_input: expected false",

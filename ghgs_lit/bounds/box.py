@@ -41,6 +41,11 @@ class SubjectBox(Options):
     tolerance: Index = 0
     """Views that may say "outside" of a point that counts as inside"""
 
+    @property
+    def is_bounded(self) -> bool:
+        """Whether there are bounds: all but :class:`NoBounds` give them."""
+        return True
+
     @torch.no_grad()
     def __call__(self, batch: Batch) -> DepthBounds:
         """Bounds of all pixels; reads masks and cameras."""

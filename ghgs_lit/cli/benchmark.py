@@ -28,7 +28,6 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     Source,
     cases_of,
     presets_of,
-    readers_of_skip,
 )
 from ghgs_lit.diagnostics.output import print_tables, save_figure
 from ghgs_lit.errors import InputError, choice, require
@@ -55,7 +54,7 @@ def run(cfg: DictConfig) -> None:
         if cfg.task == "peers":
             content = peers(cfg, config, directory, device)
         else:
-            cases = configured_cases(config, readers_of_skip(cfg), device)
+            cases = configured_cases(config, device)
             measured = _presets if cfg.task == "presets" else _scaling
             content = measured(cases, config, device)
         content = {"task": config["task"], "machine": machine_facts(device), **content}
@@ -93,14 +92,11 @@ def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
 _APPLIED = ("skip", "renderer", "precision")
 
 
-def configured_cases(
-    config: Mapping[str, Any], readers: Mapping[str, str], device: torch.device
-) -> list[Case]:
+def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
     """Every source in every preset; for errors the yardstick is always among them.
 
     Args:
         config: of ``ghgs benchmark``, resolved.
-        readers: of :func:`readers_of_skip`.
         device: of the models.
 
     Raises:
@@ -116,7 +112,7 @@ def configured_cases(
         given = {"model": config["checkpoint"], "vs": config["vs"]}
         sources = [Source.of_checkpoint(name, path) for name, path in given.items() if path is not None]
     shared = {name: config[name] for name in ("renderer", "precision")}
-    options = (presets, readers, config["knobs"] or {}, shared, device, config["seed"])
+    options = (presets, config["knobs"] or {}, shared, device, config["seed"])
     return [case for source in sources for case in cases_of(source, *options)]
 
 

@@ -14,10 +14,13 @@ from ghgs_lit.config.ablation import ablation_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.model import GHGS, OPTIONS, STAGES
+from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
+from ghgs_lit.stages import OPTIONS, STAGES
+from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.loading import load_weights
 from ghgs_lit.weights.reading import SHIPPED
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
@@ -29,8 +32,6 @@ MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 #: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
 FREE = (
     "bounds",
-    "depth_head.pixels",
-    "gaussian_head.pixels",
     "model.pad",
     "recalibration.k",
     "recalibration.neighborhood",
@@ -59,14 +60,15 @@ def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
         InputError: it does not run on ``device``.
     """
     renderer = build(config["renderer"], "renderer")
-    resolve_backend(renderer.backend, device)
+    if (backend := getattr(renderer, "backend", None)) is not None:  # a plug-in's may have none
+        resolve_backend(backend, device)
     return renderer
 
 
 def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
     """The model of ``config["checkpoint"]`` on a device, in evaluation mode and the configured precision."""
     model = GHGS.from_config(config, empty=STAGES)
-    model.load(config["checkpoint"], device=device)
+    load_weights(model, config["checkpoint"], device=device)
     model.precision = config["precision"]
     return model.to(device).eval()
 
@@ -77,7 +79,7 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     Raises:
         InputError: their sides are not divisible by the model's patch.
     """
-    size, multiple = data.options.size, model.side_multiple
+    size, multiple = data.options.size, side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 
@@ -138,7 +140,7 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
             _put(after, key, value)
         else:
             _require_same(before, key, value)
-    return _with_links(before, after, cfg)
+    return after
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
@@ -156,26 +158,6 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
         f"{own}, as the checkpoint was trained (recalibration.neighborhood=... and .similarity=... act)"
     )
     require(wanted == own, "ablation", expected, wanted)
-
-
-def _with_links(before: dict[str, Any], after: dict[str, Any], cfg: DictConfig) -> dict[str, Any]:
-    """``after`` with the values that follow others, such as ``gaussian_head.pixels: ${skip.pixels}``.
-
-    A checkpoint stores values without their links; ``cfg`` has the links. A value follows where what it is
-    linked to differs between ``before`` and ``after``.
-    """
-    nodes = {node: cfg[node] for node in MODEL_NODES if node in cfg}
-    plain = {node: OmegaConf.to_container(value, resolve=False) for node, value in nodes.items()}
-    links = {k: v for k, v in flatten(plain).items() if isinstance(v, str) and v.startswith("${")}
-    old, new = OmegaConf.create(before), OmegaConf.create(after)
-    for key, link in links.items():
-        for tree in (old, new):
-            OmegaConf.update(tree, key, link, force_add=True)
-    for key in links:
-        own, changed = (OmegaConf.select(tree, key, throw_on_resolution_failure=False) for tree in (old, new))
-        if own != changed:
-            _put(after, key, changed)
-    return after
 
 
 def _plain(cfg: DictConfig, key: str) -> Any:

@@ -42,6 +42,7 @@ from ghgs_lit.prediction.export import (
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.prediction.refinement import Refinement
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -117,7 +118,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     size = image_size("size", config["size"] or trained_size(read_checkpoint(config["checkpoint"])["config"]))
     device = pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
-    multiple = model.side_multiple
+    multiple = side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple}"
     require(not any(side % multiple for side in size), "size", expected, size)
     totals: dict[str, float] = {}

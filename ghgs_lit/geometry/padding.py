@@ -4,6 +4,7 @@ Predictions are cut back, so that results are in the photograph's own pixels.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch.nn.functional as F
@@ -38,10 +39,11 @@ class Padding:
         """Bounds of the padded images; in the border they are depths without a meaning."""
         return None if bounds is None else DepthBounds(self.pad(bounds.near, 1.0), self.pad(bounds.far, 1.0))
 
-    def pad_batch(self, batch: Batch) -> Batch:
+    def pad_batch(self, batch: Batch) -> "PaddedBatch":
         """The batch as if every input had been photographed with the border; targets stay."""
+        kept = {field.name: getattr(batch, field.name) for field in dataclasses.fields(Batch)}
         return dataclasses.replace(
-            batch,
+            PaddedBatch(**kept, photographs=batch, padding=self),
             images=self.pad(batch.images.movedim(2, -1)).movedim(-1, 2),
             masks=self.pad(batch.masks, False),
             depths=None if batch.depths is None else self.pad(batch.depths),
@@ -75,6 +77,21 @@ class Padding:
         """The widths of the border in the order of ``F.pad``: last axis first, each before and after."""
         below, right = self.height - self.full[0] + self.top, self.width - self.full[1] + self.left
         return [0, 0] * (maps.dim() - 4) + [-self.left, right, -self.top, below]
+
+
+@dataclass(frozen=True)
+class PaddedBatch(Batch):
+    """Photographs with a border, and the batch without it."""
+
+    photographs: Batch | None = None
+    padding: Padding | None = None
+
+
+def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
+    """Bounds of all pixels, from the photographs themselves: a border invents something at their edge."""
+    if not isinstance(batch, PaddedBatch):
+        return stage(batch)
+    return batch.padding.pad_bounds(stage(batch.photographs))
 
 
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:

@@ -1,4 +1,4 @@
-"""Dense heads whose widths follow the encoder's, run on windows around the subject."""
+"""A dense head run on windows around the subject."""
 
 import functools
 import itertools
@@ -18,29 +18,6 @@ from ghgs_lit.types import Tokens
 
 #: Values of the largest map that are held at once where no gradient is kept (32 MB in float32).
 _LARGEST = 1 << 23
-
-
-def proportioned_dpt(
-    dim_latent: int,
-    output_dim: int,
-    features: int | None = None,
-    out_channels: Sequence[int] | None = None,
-    **options,
-) -> DPTHead:
-    """A :class:`DPTHead` whose widths keep the published proportions to its tokens.
-
-    Args:
-        dim_latent: width of the tokens, 2048 as published.
-        output_dim: channels of the result.
-        features: None for 1/8 of the tokens' width (256 as published).
-        out_channels: None for 1/8, 1/4, 1/2 and 1/2 of it (256, 512, 1024, 1024 as published).
-        options: further options of :class:`DPTHead`.
-    """
-    if features is None:
-        features = _multiple(dim_latent / 8, 8)
-    if out_channels is None:
-        out_channels = [_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2)]
-    return DPTHead(dim_latent, features, out_channels, output_dim, **options)
 
 
 @dataclass(frozen=True)
@@ -91,7 +68,3 @@ def _runs(windows: Sequence[Window | None], most: int) -> Iterator[slice]:
         for part in even_parts(count, most) if has_window else ():
             yield slice(start + part.start, start + part.stop)
         start += count
-
-
-def _multiple(value: float, of: int) -> int:
-    return max(of, of * round(value / of))

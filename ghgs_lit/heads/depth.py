@@ -1,22 +1,25 @@
 """The depth stage: one z-depth and one confidence for each pixel (paper, section 3.2)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from math import log
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.heads.activations import CONFIDENCES, bounded_sigmoid
-from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
+from ghgs_lit.heads.dense import Part, decode
+from ghgs_lit.heads.dpt import DPTHead, DPTOptions
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.heads.window import subject_windows
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Tokens
+from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, DepthMaps, Tokens
 
 
 def _bounded_inverse(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
@@ -24,16 +27,12 @@ def _bounded_inverse(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
     return near * far / (far * (1 - fraction) + near * fraction)
 
 
-def _log(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    return near * torch.exp(fraction * torch.log(far / near))
-
-
 def _linear(fraction: Tensor, near: Tensor, far: Tensor) -> Tensor:
     return near + (far - near) * fraction
 
 
 #: By name, the depth at a fraction of the way from near (0) to far (1).
-BOUNDED = {"bounded_inverse": _bounded_inverse, "log": _log, "linear": _linear}
+BOUNDED = {"bounded_inverse": _bounded_inverse, "linear": _linear}
 
 
 def bounded_depth(
@@ -54,48 +53,52 @@ def inverse_linear(x: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     return torch.where(is_pole, torch.inf, 1 / torch.where(is_pole, 1.0, shifted))
 
 
+class DepthHeadOptions(Options):
+    """Tokens to one depth and one confidence for each pixel, by a dense head."""
+
+    group = "depth_head"
+    dpt: DPTOptions = DPTOptions()
+    """The dense head."""
+    guide: bool = False
+    """The dense head also sees photographs, masks and bounds at full resolution; the paper: false."""
+    consistency_depths: int = Field(0, ge=0, le=4096)
+    """Depths between near and far at which the guide shows photo-consistency; the paper: 0."""
+    parameterization: Literal["bounded_inverse", "linear", "inverse_linear"] = "bounded_inverse"
+    """bounded_inverse, linear: in 1 / z or in z between the near and far of each pixel; inverse_linear:
+    without bounds, for the authors' weights only."""
+    start: float = Field(0.5, gt=0, lt=1)
+    """Depth at which training starts, as a share of the way from near to far."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "DepthHeadOptions":
+        expected = "0, or a positive number where there are a guide and bounds"
+        self.require(
+            self.consistency_depths == 0 or (self.guide and self.is_bounded), "consistency_depths", expected
+        )
+        return self
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether depths lie between bounds."""
+        return self.parameterization in BOUNDED
+
+    def build(self, dim_latent: int) -> "DepthHead":
+        return DepthHead(self, dim_latent)
+
+
 class DepthHead(nn.Module):
     """Depth and confidence of each pixel from the four layers of tokens, by a dense head.
 
     Args:
+        options: of the head.
         dim_latent: width of the tokens (from the encoder).
-        dpt: options of the dense head; widths that are not given follow the encoder's.
-        parameterization: ``bounded_inverse``, ``log`` or ``linear`` between the near and far of each pixel;
-            ``inverse_linear``, without bounds, for the authors' checkpoints only.
-        start: fraction of the way from near to far at which training starts.
-        pixels: ``all``, or ``subject``: only windows around the subject are decoded; elsewhere depths are
-            meaningless.
-        guide: let the dense head see photographs, masks and bounds at full resolution.
-        consistency_depths: the guide also shows the :func:`photo_consistency` at this number of depths
-            between near and far; 0: none.
     """
 
-    def __init__(
-        self,
-        dim_latent: int,
-        dpt: Mapping | None = None,
-        parameterization: str = "bounded_inverse",
-        start: float = 0.5,
-        pixels: str = "all",
-        guide: bool = False,
-        consistency_depths: int = 0,
-    ):
+    def __init__(self, options: DepthHeadOptions, dim_latent: int):
         super().__init__()
-        choice("depth_head.parameterization", parameterization, (*BOUNDED, "inverse_linear"))
-        choice("depth_head.pixels", pixels, ("all", "subject"))
-        require(0 < start < 1, "depth_head.start", "a fraction between 0 and 1", start)
-        self.parameterization, self.start = parameterization, log(start / (1 - start))
-        self.pixels = pixels
-        guided_by_bounds = guide and self.is_bounded
-        require(
-            consistency_depths == 0 or (consistency_depths > 0 and guided_by_bounds),
-            "depth_head.consistency_depths",
-            "0, or a positive number where there are a guide and bounds",
-            consistency_depths,
-        )
-        self.consistency_depths = consistency_depths
-        channels = guide * PHOTO_CHANNELS + guided_by_bounds * BOUNDS_CHANNELS + consistency_depths
-        self.dpt = proportioned_dpt(dim_latent, 2, guide_channels=channels, **(dpt or {}))
+        self.options, self.start = options, log(options.start / (1 - options.start))
+        seen = options.guide * (PHOTO_CHANNELS + options.is_bounded * BOUNDS_CHANNELS)
+        self.dpt = DPTHead(options.dpt, dim_latent, 2, seen + options.consistency_depths)
         if self.is_bounded:
             last = self.dpt.scratch.output_conv2[-1]
             nn.init.zeros_(last.weight)
@@ -104,15 +107,18 @@ class DepthHead(nn.Module):
     @property
     def is_bounded(self) -> bool:
         """Whether depths lie between bounds, which :meth:`forward` then needs."""
-        return self.parameterization in BOUNDED
+        return self.options.is_bounded
 
-    def forward(self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None) -> DepthMaps:
+    def forward(
+        self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels = "all"
+    ) -> DepthMaps:
         """Depths of all pixels; those of the subject are valid.
 
         Args:
             tokens: from the encoder.
             batch: images, masks and cameras are read.
             bounds: None where :attr:`is_bounded` is false.
+            pixels: ``subject``: only windows around the subject are decoded; other depths have no meaning.
 
         Returns:
             Values that are not finite are replaced by 1 m and are not valid.
@@ -120,11 +126,11 @@ class DepthHead(nn.Module):
         guide = None
         if self.dpt.guide is not None:
             maps = [] if bounds is None else [relative_bounds(bounds, batch.masks)]
-            if self.consistency_depths:
-                maps.append(photo_consistency(batch, bounds, self.consistency_depths))
+            if self.options.consistency_depths:
+                maps.append(photo_consistency(batch, bounds, self.options.consistency_depths))
             guide = photo_guide(batch, *maps)
         wanted = windows = None
-        if self.pixels == "subject":
+        if pixels == "subject":
             # Whole patches: the token points of the release depend on pixels beside the mask.
             p, size = tokens.patch_size, tuple(batch.masks.shape[2:])
             patches = patches_around_subject(batch.masks, p, 0)
@@ -134,7 +140,7 @@ class DepthHead(nn.Module):
             ]
         value, confidence = _whole(decode(self.dpt, tokens, guide, windows), batch, wanted)
         if self.is_bounded:
-            depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.parameterization)
+            depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.options.parameterization)
         else:
             depth = inverse_linear(value)
         finite = depth.isfinite()

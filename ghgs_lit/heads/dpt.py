@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from pydantic import model_validator
 from torch import Tensor, nn
 
+from ghgs_lit.config.options import MultipleOfFour, Options, Width
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.guide import Guide, GuidePyramid
@@ -24,9 +26,41 @@ LEVELS = 4
 #: Cells of the three finer levels for each patch, along an axis; the coarsest has a cell for two patches.
 CELLS = (4, 2, 1)
 NORM_EPS = 1e-5
+#: Channels before the last convolution, as published.
+HIDDEN = 32
 
 #: Values of a map at full resolution that are held at once where no gradient is kept, and least rows.
 _LARGEST, _ROWS = 1 << 21, 8
+
+
+class DPTOptions(Options):
+    """Widths of a dense head, and how its residual units begin."""
+
+    features: Width | None = None
+    """Channels of the fused maps, a multiple of 8; null: encoder.dim_latent / 8 (256 as published)."""
+    out_channels: tuple[MultipleOfFour, MultipleOfFour, MultipleOfFour, MultipleOfFour] | None = None
+    """Channels of the four levels, fine to coarse, multiples of 4; null: encoder.dim_latent x (1/8, 1/4, 1/2,
+    1/2) (256, 512, 1024, 1024 as published)."""
+    rectified_skip: bool = True
+    """Residual units add what they rectified, as published weights expect; in training it can die."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "DPTOptions":
+        self.require(self.features is None or self.features % 8 == 0, "features", "a multiple of 8 or null")
+        return self
+
+    def widths(self, dim_latent: int) -> tuple[int, tuple[int, ...]]:
+        """``features`` and ``out_channels`` for tokens of a width; null keeps the published proportions."""
+        features = self.features or _multiple(dim_latent / 8, 8)
+        levels = (_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2))
+        return features, self.out_channels or tuple(levels)
+
+    def build(self, dim_latent: int, output_dim: int, guide_channels: int = 0) -> "DPTHead":
+        return DPTHead(self, dim_latent, output_dim, guide_channels)
+
+
+def _multiple(value: float, of: int) -> int:
+    return max(of, of * round(value / of))
 
 
 def _conv3(inputs: int, outputs: int, bias: bool = True) -> nn.Conv2d:
@@ -133,38 +167,20 @@ class DPTHead(nn.Module):
     """Tokens of four layers to ``output_dim`` raw channels for each pixel.
 
     Args:
-        dim_in: width of a token of ``Tokens.latent``.
-        features: channels of the fused maps (a multiple of 8).
-        out_channels: channels of the four levels (multiples of 4), fine to coarse.
+        options: widths and residual units.
+        dim_latent: width of a token of ``Tokens.latent``.
         output_dim: channels of the result; activations are the caller's.
-        hidden: channels before the last convolution (32 as published).
         guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
             sharp; 0: none, as published.
-        rectified_skip: of each :class:`ResidualUnit`, as published.
     """
 
-    def __init__(
-        self,
-        dim_in: int,
-        features: int,
-        out_channels: Sequence[int],
-        output_dim: int,
-        hidden: int = 32,
-        guide_channels: int = 0,
-        rectified_skip: bool = True,
-    ):
+    def __init__(self, options: DPTOptions, dim_latent: int, output_dim: int, guide_channels: int = 0):
         super().__init__()
-        require(features % 8 == 0, "features", "a multiple of 8", features)
-        require(
-            len(out_channels) == LEVELS and all(c % 4 == 0 for c in out_channels),
-            "out_channels",
-            "four multiples of 4",
-            list(out_channels),
-        )
+        features, out_channels = options.widths(dim_latent)
         self.full_channels = features // 2
         c0, c1, _, c3 = out_channels
-        self.norm = nn.LayerNorm(dim_in, eps=NORM_EPS)
-        self.projects = nn.ModuleList(nn.Conv2d(dim_in, c, 1) for c in out_channels)
+        self.norm = nn.LayerNorm(dim_latent, eps=NORM_EPS)
+        self.projects = nn.ModuleList(nn.Conv2d(dim_latent, c, 1) for c in out_channels)
         self.resize_layers = nn.ModuleList(
             (
                 nn.ConvTranspose2d(c0, c0, 4, stride=4),
@@ -173,7 +189,7 @@ class DPTHead(nn.Module):
                 _Halving(c3, c3, 3, stride=2, padding=1),
             )
         )
-        self.scratch = Scratch(out_channels, features, hidden, output_dim, rectified_skip)
+        self.scratch = Scratch(out_channels, features, HIDDEN, output_dim, options.rectified_skip)
         self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 
     def forward(

@@ -1,17 +1,19 @@
 """The Gaussian stage: one Gaussian for each pixel of the subject (paper, section 3.3)."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import log
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
+from pydantic import model_validator
 from torch import Tensor, nn
 
-from ghgs_lit.errors import choice, require
+from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
 from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
@@ -19,13 +21,23 @@ from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.geometry.rotations import multiply_quaternions, rotate
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
-from ghgs_lit.heads.dense import Part, decode, proportioned_dpt
+from ghgs_lit.heads.dense import Part, decode
+from ghgs_lit.heads.dpt import DPTHead, DPTOptions
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.precision import without_float16
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Tokens, true_places
+from ghgs_lit.types import (
+    Batch,
+    DecodedPixels,
+    DepthBounds,
+    DepthMaps,
+    Gaussians,
+    Points,
+    Tokens,
+    true_places,
+)
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
 
@@ -87,58 +99,61 @@ class RawGaussians:
         )
 
 
-class FootprintAttributes:
+class FootprintAttributes(Options):
     """Raw values to attributes in units of a pixel's footprint; raw zeros give a splat on the surface.
 
-    A pixel's footprint is ``z / f`` metres.
-
-    Args:
-        offset_limit: largest offset along each axis, in metres.
-        scale_floor: least scale in footprints; it leaves no holes when splats are rendered at a higher
-            resolution.
-        scale_cap: largest scale in footprints.
-        scale_start: scale in footprints at which training starts.
-        thickness_start: the same of the third axis (None: as the others).
-        inward: distance in footprints along the third axis to which training starts moving the splats: with
-            axes of the surface, away from the camera. What a splat covers beside its pixel then ends at the
-            silhouette.
-        opacity_floor: least opacity: below 1/255 a splat has no gradient left.
-        opacity_start: opacity at which training starts.
+    A pixel's footprint is ``z / f`` metres. The paper gives no values.
     """
 
-    def __init__(
-        self,
-        offset_limit: float = 0.05,
-        scale_floor: float = 0.15,
-        scale_cap: float = 4.0,
-        scale_start: float = 0.3,
-        thickness_start: float | None = None,
-        inward: float = 0.0,
-        opacity_floor: float = 0.1,
-        opacity_start: float = 0.9,
-    ):
-        key = "gaussian_head.attributes"
-        require(offset_limit >= 0, f"{key}.offset_limit", "0 or more metres", offset_limit)
-        thickness_start = scale_start if thickness_start is None else thickness_start
-        starts = {"scale_start": scale_start, "thickness_start": thickness_start}
-        for name, start in starts.items():
-            expected = f"0 < scale_floor < {name} < scale_cap"
-            found = (scale_floor, start, scale_cap)
-            require(0 < scale_floor < start < scale_cap, f"{key}.{name}", expected, found)
-        require(inward >= 0, f"{key}.inward", "0 or more footprints", inward)
-        require(
-            0 <= opacity_floor < opacity_start < 1,
-            f"{key}.opacity_start",
-            "0 <= opacity_floor < opacity_start < 1",
-            (opacity_floor, opacity_start),
-        )
-        self.offset_limit, self.scale_floor, self.opacity_floor = offset_limit, scale_floor, opacity_floor
-        self.scale_range = log(scale_cap / scale_floor)
-        self.scale_bias, self.thickness_bias = (
-            _logit(log(start / scale_floor) / self.scale_range) for start in starts.values()
-        )
-        self.inward = inward
-        self.opacity_bias = _logit((opacity_start - opacity_floor) / (1 - opacity_floor))
+    offset_limit: Amount = 0.05
+    """Largest offset along each axis, in metres."""
+    scale_floor: Positive = 0.15
+    """Least scale in footprints; it leaves no holes when splats are rendered at a higher resolution."""
+    scale_start: Positive = 0.25
+    """Scale at which training starts, in footprints."""
+    thickness_start: Positive | None = None
+    """Scale of the third axis at which training starts, in footprints; null: as the others."""
+    inward: Amount = 0.0
+    """Distance along the third axis to which training starts moving the splats, in footprints: with axes of
+    the surface, away from the camera. What a splat covers beside its pixel then ends at the silhouette."""
+    scale_cap: Positive = 4.0
+    """Largest scale in footprints."""
+    opacity_floor: Share = 0.1
+    """Least opacity: below 1/255 a splat has no gradient left."""
+    opacity_start: Share = 0.8
+    """Opacity at which training starts."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "FootprintAttributes":
+        for name, start in self._starts.items():
+            between = self.scale_floor < start < self.scale_cap
+            limits = f"between scale_floor={self.scale_floor:g} and scale_cap={self.scale_cap:g}"
+            self.require(between or getattr(self, name) is None, name, f"a number {limits}")
+        between = self.opacity_floor < self.opacity_start < 1
+        expected = f"a number above opacity_floor={self.opacity_floor:g} and below 1"
+        self.require(between, "opacity_start", expected)
+        return self
+
+    @property
+    def _starts(self) -> dict[str, float]:
+        thickness = self.scale_start if self.thickness_start is None else self.thickness_start
+        return {"scale_start": self.scale_start, "thickness_start": thickness}
+
+    @property
+    def scale_range(self) -> float:
+        """Logarithm of the largest scale over the least."""
+        return log(self.scale_cap / self.scale_floor)
+
+    @property
+    def scale_biases(self) -> tuple[float, float]:
+        """What is added to raw scales, of the first two axes and of the third, so that 0 is the start."""
+        starts = self._starts.values()
+        return tuple(_logit(log(start / self.scale_floor) / self.scale_range) for start in starts)
+
+    @property
+    def opacity_bias(self) -> float:
+        """What is added to raw opacities, so that 0 is the start."""
+        return _logit((self.opacity_start - self.opacity_floor) / (1 - self.opacity_floor))
 
     def __call__(
         self,
@@ -149,7 +164,8 @@ class FootprintAttributes:
         footprint: Float[Tensor, " N"],
     ) -> Attributes:
         identity = F.pad(rotation.new_ones(1), (0, 3))
-        scale = torch.cat((scale[:, :2] + self.scale_bias, scale[:, 2:] + self.thickness_bias), 1)
+        across, thickness = self.scale_biases
+        scale = torch.cat((scale[:, :2] + across, scale[:, 2:] + thickness), 1)
         scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale))
         shown = bounded_sigmoid(opacity + self.opacity_bias)
         return (
@@ -171,6 +187,47 @@ def release_attributes(
     return offset, F.softplus(scale, beta=100), unit(rotation), opacity.sigmoid()
 
 
+class GaussianHeadOptions(Options):
+    """Recalibrated tokens to one Gaussian for each pixel of the subject."""
+
+    group = "gaussian_head"
+    dpt: DPTOptions = DPTOptions()
+    """The dense head."""
+    guide: bool = False
+    """The dense head also sees photographs, masks and depths at full resolution; the paper: false."""
+    photo_consistency: bool = False
+    """The guide shows photo-consistency at the predicted depth: a splat off the surface can become
+    transparent; the paper: false."""
+    color_limit: Share = 0.0
+    """Largest change of a colour from its pixel's, in each channel, which makes up for the blur of splats and
+    for dark rims; 0: none (the paper)."""
+    low_pass: Amount = 0.3
+    """px^2 that splats are made to be widened by when they are drawn; gsplat's default."""
+    antialiased: bool = False
+    """Splats are made to lose the opacity that this adds (Mip-Splatting)."""
+    channels: Width = 32
+    """Width of the descriptor of a pixel (32 as published)."""
+    hidden: tuple[Width, Width] = (128, 32)
+    """Widths inside the networks of the attributes (as published)."""
+    parameterization: Literal["footprint", "release"] = "footprint"
+    """footprint: attributes in units of a pixel's footprint, raw values start at 0; release: offsets and
+    scales in metres, without bound, PyTorch's initialisation."""
+    axes: Literal["world", "surface"] = "world"
+    """Axes of offsets, scales and rotations: the world's, or normal and tangents of the predicted depth,
+    which look alike from every camera (not the paper's)."""
+    attributes: FootprintAttributes = FootprintAttributes()
+    """With parameterization=footprint."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "GaussianHeadOptions":
+        allowed = self.guide or not self.photo_consistency
+        self.require(allowed, "photo_consistency", "false where there is no guide")
+        return self
+
+    def build(self, dim_latent: int) -> "GaussianHead":
+        return GaussianHead(self, dim_latent)
+
+
 class GaussianHead(nn.Module):
     """A dense head over the recalibrated tokens, then four small networks for each pixel of the subject.
 
@@ -178,74 +235,42 @@ class GaussianHead(nn.Module):
     ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, with linear layers 0, 2 and 4.
 
     Args:
+        options: of the head.
         dim_latent: width of the tokens (from the encoder).
-        dpt: options of the dense head; widths that are not given follow the encoder's.
-        channels: of the dense head's result, a descriptor of each pixel.
-        hidden: two widths inside the four networks.
-        parameterization: ``footprint`` (:class:`FootprintAttributes`, raw values start at 0) or
-            ``release`` (:func:`release_attributes`, PyTorch's initialisation).
-        attributes: options of :class:`FootprintAttributes`.
-        axes: of offsets, scales and rotations: those of the ``world``, or of the ``surface`` around each
-            pixel's depth (:func:`surface_axes`), which look alike from every camera.
-        pixels: ``subject`` decodes windows around the subject and runs the four networks on its pixels,
-            ``all`` computes every pixel and selects afterwards; the Gaussians are the same.
-        guide: let the dense head see photographs, masks and depths at full resolution.
-        photo_consistency: the guide also shows the :func:`photo_consistency` at the predicted depth: a splat
-            off the surface can become transparent.
-        color_limit: largest change of a colour from its pixel's, in each channel, which makes up for the blur
-            of splats and for dark rims; 0: none (the paper).
-        low_pass, antialiased: of the :class:`ghgs_lit.types.Gaussians`.
     """
 
-    def __init__(
-        self,
-        dim_latent: int,
-        dpt: Mapping | None = None,
-        channels: int = 32,
-        hidden: Sequence[int] = (128, 32),
-        parameterization: str = "footprint",
-        attributes: Mapping | None = None,
-        axes: str = "world",
-        pixels: str = "subject",
-        guide: bool = False,
-        photo_consistency: bool = False,
-        color_limit: float = 0.0,
-        low_pass: float = 0.3,
-        antialiased: bool = False,
-    ):
+    def __init__(self, options: GaussianHeadOptions, dim_latent: int):
         super().__init__()
-        choice("gaussian_head.parameterization", parameterization, ("footprint", "release"))
-        choice("gaussian_head.pixels", pixels, ("subject", "all"))
-        choice("gaussian_head.axes", axes, ("world", "surface"))
-        require(len(hidden) == 2, "gaussian_head.hidden", "two widths", list(hidden))
-        allowed = guide or not photo_consistency
-        require(allowed, "gaussian_head.photo_consistency", "false where there is no guide", True)
-        require(low_pass >= 0, "gaussian_head.low_pass", "0 or more", low_pass)
-        require(color_limit >= 0, "gaussian_head.color_limit", "0 or more", color_limit)
-        self.pixels, self.axes = pixels, axes
-        self.low_pass, self.antialiased = low_pass, antialiased
-        self.photo_consistency, self.color_limit = photo_consistency, color_limit
-        guided = PHOTO_CHANNELS + 1 + photo_consistency if guide else 0
-        self.decoder = proportioned_dpt(dim_latent, channels, guide_channels=guided, **(dpt or {}))
+        self.options, self.channels = options, options.channels
+        channels, hidden = options.channels, options.hidden
+        guided = PHOTO_CHANNELS + 1 + options.photo_consistency if options.guide else 0
+        self.decoder = DPTHead(options.dpt, dim_latent, channels, guided)
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
         self.rot_header = _mlp((channels, *hidden, 4), nn.ReLU)
         self.opacity_header = _mlp((channels, *hidden, 1), nn.ReLU)
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         from_zero = []
-        if color_limit > 0:
+        if options.color_limit > 0:
             self.color_header = _mlp((channels, *hidden, 3), nn.ReLU)
             headers.append(self.color_header)
             from_zero.append(self.color_header)
         self.attributes = release_attributes
-        if parameterization == "footprint":
-            self.attributes = FootprintAttributes(**(attributes or {}))
+        if options.parameterization == "footprint":
+            self.attributes = options.attributes
             from_zero = headers
         for header in from_zero:
             nn.init.zeros_(header[-1].weight)
             nn.init.zeros_(header[-1].bias)
 
-    def forward(self, tokens: Tokens, batch: Batch, points: Points, depth_maps: DepthMaps) -> RawGaussians:
+    def forward(
+        self,
+        tokens: Tokens,
+        batch: Batch,
+        points: Points,
+        depth_maps: DepthMaps,
+        pixels: DecodedPixels = "subject",
+    ) -> RawGaussians:
         """Raw attributes of the valid pixels in the order of element, view, row, column.
 
         Args:
@@ -253,14 +278,17 @@ class GaussianHead(nn.Module):
             batch: images, masks and cameras are read.
             points: of the pixels.
             depth_maps: of the same pixels.
+            pixels: ``subject`` decodes windows around the subject and runs the networks on its pixels,
+                ``all`` computes every pixel and selects afterwards; the result is the same.
         """
         views, height, width = points.valid.shape[1:]
         counts = points.valid.flatten(0, 1).sum((1, 2)).tolist()
-        places = true_places(points.valid, sum(counts))
-        image, pixel = places // (height * width), places % (height * width)
-        windows = None if self.pixels == "all" else subject_windows(batch.extents, (height, width))
+        index = true_places(points.valid, sum(counts))
+        image, pixel = index // (height * width), index % (height * width)
+        windows = None if pixels == "all" else subject_windows(batch.extents, (height, width))
         parts = decode(self.decoder, tokens, self._guide(batch, points, depth_maps), windows)
-        raw = zip(*(self._of_subject(part, image, pixel, counts) for part in parts), strict=True)
+        of_part = self._of_subject if pixels == "subject" else self._of_all
+        raw = zip(*(of_part(part, image, pixel, counts) for part in parts), strict=True)
         values = [torch.cat(values) for values in raw]
         splits = tuple(sum(counts[first : first + views]) for first in range(0, len(counts), views))
         return RawGaussians(*values[:5], values[5] if len(values) > 5 else None, image, pixel, splits)
@@ -281,7 +309,7 @@ class GaussianHead(nn.Module):
         offset, scales, quaternions, opacities = self.attributes(
             raw.offset, raw.scale, raw.rotation, raw.opacity, footprint
         )
-        if self.axes == "surface":
+        if self.options.axes == "surface":
             axes = surface_axes(depth_maps, batch.cameras, image, pixel)
             offset, quaternions = rotate(axes, offset), multiply_quaternions(axes, quaternions)
         if batch.alpha is not None:
@@ -292,19 +320,21 @@ class GaussianHead(nn.Module):
             quaternions=quaternions,
             scales=scales,
             opacities=opacities,
-            colors=colors if raw.color is None else colors + self.color_limit * bounded_tanh(raw.color),
+            colors=colors
+            if raw.color is None
+            else colors + self.options.color_limit * bounded_tanh(raw.color),
             splits=raw.splits,
             image=image,
             pixel=pixel,
-            low_pass=self.low_pass,
-            antialiased=self.antialiased,
+            low_pass=self.options.low_pass,
+            antialiased=self.options.antialiased,
         )
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
         if self.decoder.guide is None:
             return None
         maps = [relative_depth(at_least_float32(depth_maps.depth), points.valid)]
-        if self.photo_consistency:
+        if self.options.photo_consistency:
             depth = at_least_float32(depth_maps.depth.detach())
             maps.append(photo_consistency(batch, DepthBounds(depth, depth), 1))
         return photo_guide(batch, *maps)
@@ -313,25 +343,36 @@ class GaussianHead(nn.Module):
         self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
     ) -> Sequence[Tensor]:
         """Descriptors and raw values (:meth:`_raw`) of a part at its pixels; each image has ``counts``."""
-        descriptors, begin = part.maps.permute(0, 2, 3, 1), part.images.start
-        own = slice(sum(counts[:begin]), sum(counts[: part.images.stop]))
-        (top, _, _), (left, _, width) = part.window
-        row, column = pixel[own] // width - top, pixel[own] % width - left
-        if self.pixels == "subject":
-            chosen = descriptors[image[own] - begin, row, column]
-            return chosen, *self._raw(chosen)
+        row, column, within = _in_part(part, pixel, counts)
+        chosen = part.maps.permute(0, 2, 3, 1)[image[within] - part.images.start, row, column]
+        return chosen, *self._raw(chosen)
+
+    def _of_all(
+        self, part: Part, image: Int[Tensor, " N"], pixel: Int[Tensor, " N"], counts: Sequence[int]
+    ) -> Sequence[Tensor]:
+        """:meth:`_of_subject` by way of every pixel of the part."""
+        row, column, _ = _in_part(part, pixel, counts)
         # One image at a time: the networks' hidden layers are wider than the maps.
-        places = zip(*(place.split(counts[part.images]) for place in (row, column)), strict=True)
+        of_images = zip(*(values.split(counts[part.images]) for values in (row, column)), strict=True)
         each = [
-            [values[place] for values in (maps, *self._raw(maps))]
-            for maps, place in zip(descriptors, places, strict=True)
+            [values[index] for values in (maps, *self._raw(maps))]
+            for maps, index in zip(part.maps.permute(0, 2, 3, 1), of_images, strict=True)
         ]
         return [torch.cat(values) for values in zip(*each, strict=True)]
 
     def _raw(self, descriptors: Float[Tensor, "*n c"]) -> tuple[Tensor, ...]:
         """Raw offset, scale, rotation, opacity and, where there is a network for it, color."""
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
-        if self.color_limit > 0:
+        if self.options.color_limit > 0:
             headers.append(self.color_header)
         offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
         return offset, scale, rotation, opacity[..., 0], *color
+
+
+def _in_part(
+    part: Part, pixel: Int[Tensor, " N"], counts: Sequence[int]
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"], slice]:
+    """Rows and columns in a part's maps of the pixels that lie in it, and which pixels these are."""
+    within = slice(sum(counts[: part.images.start]), sum(counts[: part.images.stop]))
+    (top, _, _), (left, _, width) = part.window
+    return pixel[within] // width - top, pixel[within] % width - left, within

@@ -11,12 +11,14 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 
-from ghgs_lit.errors import require
+from ghgs_lit.config.options import Count, Options, Width
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32, unproject_maps
 from ghgs_lit.heads.activations import bounded_tanh
@@ -25,7 +27,7 @@ from ghgs_lit.kernels.parts import at_once, even_parts
 from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, observe
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points
+from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Prediction
 
 #: Gaussians whose views go through the network at once.
 _AT_ONCE = 2048
@@ -56,8 +58,50 @@ class State:
     depth_maps: DepthMaps
 
 
+def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
+    """What the last of several states predicts.
+
+    Args:
+        states: before the first round and after each.
+        keeps_drafts: whether the prediction has the Gaussians before each round.
+    """
+    last = states[-1]
+    return Prediction(
+        last.gaussians,
+        last.depth_maps.depth,
+        last.depth_maps.valid,
+        last.points,
+        last.depth_maps,
+        rounds=tuple(state.depth_maps for state in states),
+        drafts=tuple(state.gaussians for state in states[:-1]) if keeps_drafts else (),
+    )
+
+
 #: Gaussians from raw attributes at points: ``GaussianHead.activate``.
 Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
+
+
+class RoundsOptions(Options):
+    """Rounds that render the inputs, compare them with the photographs and correct the Gaussians."""
+
+    group = "rounds"
+    count: Count = 2
+    """Number of rounds; in prediction any number."""
+    training_counts: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 2, 3)
+    """Numbers of rounds, of which each training step draws one, so that any number works."""
+    hidden: Width = 48
+    """Width of the network."""
+    depths: Count = 8
+    """Number of depths around the current one at which a round compares the photographs."""
+    reach: float = Field(0.25, gt=0, le=1)
+    """How far these lie from it in the first round, as a share of the distance from near to far."""
+    gains: bool = True
+    """Photographs of cameras whose exposure differs are made alike first."""
+    exchange: Width | None = 16
+    """Channels in which Gaussians of neighbouring pixels tell each other what they know; null: none."""
+
+    def build(self, channels: int) -> "Rounds":
+        return Rounds(self, channels)
 
 
 class Rounds(nn.Module):
@@ -67,37 +111,17 @@ class Rounds(nn.Module):
     within the bounds of their activations: more rounds than were trained do not diverge.
 
     Args:
-        channels: of the Gaussian head's descriptors.
-        count: number of rounds outside of training.
-        training_counts: numbers of rounds, of which each training step draws one, so that any number works.
-        hidden: width of the network.
-        depths: at how many depths around the current one a round compares the photographs.
-        reach: how far these lie from it in the first round, as a share of the distance from near to far.
-        gains: whether photographs of cameras whose exposure differs are made alike first.
-        exchange: channels in which Gaussians of neighbouring pixels tell each other what they know after each
-            look (:class:`Exchange`); None: they do not.
+        options: of the rounds.
+        channels: width of the Gaussian head's descriptors.
+
+    Attributes:
+        count: number of rounds outside of training; it may be changed at any time.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        count: int = 2,
-        training_counts: Sequence[int] = (1, 2, 3),
-        hidden: int = 48,
-        depths: int = 8,
-        reach: float = 0.25,
-        gains: bool = False,
-        exchange: int | None = None,
-    ):
+    def __init__(self, options: RoundsOptions, channels: int):
         super().__init__()
-        require(count >= 1, "rounds.count", "1 or more", count)
-        drawn = len(training_counts) > 0 and min(training_counts) >= 1
-        require(drawn, "rounds.training_counts", "numbers of 1 or more", list(training_counts))
-        require(0 < reach <= 1, "rounds.reach", "a share above 0, at most 1", reach)
-        expected = "null or a number of channels"
-        require(exchange is None or exchange >= 1, "rounds.exchange", expected, exchange)
-        self.count, self.training_counts = count, tuple(training_counts)
-        self.depths, self.reach, self.gains = depths, reach, gains
+        self.options, self.count = options, options.count
+        hidden, depths = options.hidden, options.depths
         self.view = nn.Sequential(
             nn.Linear(CHANNELS, hidden),
             nn.ReLU(inplace=True),
@@ -113,7 +137,7 @@ class Rounds(nn.Module):
             nn.ReLU(inplace=True),
         )
         self.memory = nn.Linear(hidden, hidden)
-        self.exchange = None if exchange is None else Exchange(hidden, exchange)
+        self.exchange = None if options.exchange is None else Exchange(hidden, options.exchange)
         self.change = nn.Sequential(nn.Linear(hidden, 1 + RAW_VALUES))
         nn.init.zeros_(self.change[-1].weight)
         nn.init.zeros_(self.change[-1].bias)
@@ -126,7 +150,7 @@ class Rounds(nn.Module):
             activate: of the Gaussian head.
             batch: photographs, masks and cameras are read.
         """
-        if self.gains:
+        if self.options.gains:
             gaussians, batch = equalized(state.gaussians, batch)
             state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
@@ -137,7 +161,8 @@ class Rounds(nn.Module):
         return tuple(states)
 
     def _drawn(self) -> int:
-        return self.training_counts[int(torch.randint(len(self.training_counts), ()))]
+        counts = self.options.training_counts
+        return counts[int(torch.randint(len(counts), ()))]
 
     def _round(
         self, state: State, batch: Batch, memory: Tensor, windows: Windows | None, size: float
@@ -145,7 +170,7 @@ class Rounds(nn.Module):
         """New depths and changes of raw attributes, and what the next round remembers."""
         gaussians = state.gaussians.detach()
         each = observe(gaussians, batch)
-        search = self._search(state, batch, size * self.reach)
+        search = self._search(state, batch, size * self.options.reach)
         rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
         # In parts that fit a CPU's cache: half the time. Backward the number of operators counts for more.
         count = len(memory)
@@ -183,7 +208,7 @@ class Rounds(nn.Module):
 
         thickness = at(far - near)
         share = at(depth - near) / torch.where(thickness > 0, thickness, 1)
-        matches = at(photo_consistency(batch, DepthBounds(low, high), self.depths))
+        matches = at(photo_consistency(batch, DepthBounds(low, high), self.options.depths))
         return Search(matches, torch.stack((share, thickness), -1), at(depth - low), at(high - depth))
 
 

@@ -9,7 +9,7 @@ from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_fi
 from ghgs_lit.weights.reading import cast
 
 _NOWHERE = {"resume": None, "init_from": None}  # paths of the machine that trained it
-_FACTS = ("imported",)  # what :meth:`GHGS.load` reads beside weights and configuration
+_FACTS = ("imported",)  # what loading reads beside weights and configuration
 
 
 def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:

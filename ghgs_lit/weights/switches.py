@@ -2,12 +2,21 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 from omegaconf import OmegaConf
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import lookup
+from ghgs_lit.config.options import Options
+
+
+class CompatOptions(Options):
+    """Name of the code that a configuration reproduces; ``conf/compat`` sets the switches themselves."""
+
+    group = "compat"
+    name: Literal["none", "release"] = "none"
+    """none: the model as configured; release: the authors' code."""
 
 
 @cache

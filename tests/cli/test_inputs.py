@@ -58,7 +58,7 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
     ]
     model = inputs.model_of(checkpoint, composed(verb, f"checkpoint={checkpoint}", *said))
     assert model == config(*TRAINED, *said)
-    assert model["gaussian_head"]["pixels"] == model["depth_head"]["pixels"] == "all"
+    assert model["skip"]["pixels"] == "all"
     model = inputs.model_of(
         checkpoint, composed(verb, f"checkpoint={checkpoint}", "recalibration.tokens=all")
     )
@@ -71,7 +71,7 @@ def test_what_is_said_of_the_model_acts_on_a_checkpoint(composed, checkpoint, ve
         ("encoder=vggt_small", "encoder.width: expected 32, which the checkpoint's weights"),
         ("recalibration.num_heads=1", "recalibration.num_heads: expected 2,"),
         ("gaussian_head.color_limit=0.25", "gaussian_head.color_limit: expected 0.5,"),
-        ("depth_head.parameterization=log", "depth_head.parameterization: expected 'linear',"),
+        ("depth_head.parameterization=bounded_inverse", "depth_head.parameterization: expected 'linear',"),
         ("compat=release", "compat.name: expected 'none',"),
         ("model=paper", "model.name: expected 'hull',"),
         ("ablation=neither", "ablation: expected full, .*recalibration.neighborhood=.* act"),

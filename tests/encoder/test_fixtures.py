@@ -17,7 +17,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.heads.activations import split_activated
-from ghgs_lit.heads.dpt import DPTHead
+from ghgs_lit.heads.dpt import DPTOptions
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
 from tests.helpers.encoders import make_encoder
@@ -119,7 +119,8 @@ def test_rotary_positions(name, dtype):
 def test_dpt(name, dtype):
     """The DPT head reproduces the published numbers."""
     case, groups = CASES[name], _load(name)
-    head = DPTHead(**case["options"])
+    options = {key: case["options"][key] for key in ("features", "out_channels")}
+    head = DPTOptions(**options).build(case["options"]["dim_in"], case["options"]["output_dim"])
     head.load_state_dict(groups["state"])
     head.to(dtype)
     inputs = _inputs(groups, dtype)
@@ -175,8 +176,7 @@ def test_published_names_and_shapes():
             layers=(4, 11, 17, 23),
             trainable="none",
         )
-        levels = (256, 512, 1024, 1024)
-        heads = {"pos_head": DPTHead(2048, 256, levels, 2), "decoder": DPTHead(2048, 256, levels, 32)}
+        heads = {"pos_head": DPTOptions().build(2048, 2), "decoder": DPTOptions().build(2048, 32)}
     for name, module in {"aggregator": encoder.aggregator, **heads}.items():
         shapes = {key: list(value.shape) for key, value in module.state_dict().items()}
         assert shapes == published[name]

@@ -152,7 +152,7 @@ def test_what_is_said_of_a_checkpoints_model_acts_and_is_recorded(trained, tmp_p
     assert (before["provenance"]["ablation"], source["ablation"]) == ("full", "no_semantic")
     ran = source["model_config"]
     assert (ran["recalibration"]["k"], ran["recalibration"]["similarity"]) == (1, "none")
-    assert (ran["skip"]["name"], ran["gaussian_head"]["pixels"]) == ("none", "all")
+    assert (ran["skip"]["name"], ran["skip"]["pixels"]) == ("none", "all")
     assert source["config"]["recalibration"] == ran["recalibration"]
     assert source["training"] == {"steps": 3}
     assert source["checkpoint_config"]["recalibration"]["similarity"] == "product"

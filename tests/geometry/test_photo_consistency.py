@@ -11,7 +11,7 @@ from ghgs_lit.bounds import VisualHull
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.photo_consistency import TOLERANCE, photo_consistency
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.heads.depth import DepthHead
+from ghgs_lit.heads.depth import DepthHeadOptions
 from ghgs_lit.types import DepthBounds
 from tests.heads.test_gaussian import make_head, run, shake
 from tests.helpers.scenes import make_batch, ring
@@ -140,7 +140,7 @@ def test_heads_ask_for_what_photo_consistency_needs():
     """Photo-consistency without a guide would be computed and never seen."""
     for options in ({"guide": False, "consistency_depths": 4}, {"guide": True, "consistency_depths": -1}):
         with pytest.raises(InputError, match=r"depth_head\.consistency_depths"):
-            DepthHead(64, **options)
+            DepthHeadOptions(**options)
     with pytest.raises(InputError, match=r"gaussian_head\.photo_consistency"):
         make_head(photo_consistency=True)
 

@@ -7,8 +7,8 @@ from ghgs_lit.bounds import NoBounds, SubjectBox, VisualHull
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.heads.dense import proportioned_dpt
-from ghgs_lit.heads.depth import BOUNDED, DepthHead, inverse_linear
+from ghgs_lit.heads.depth import BOUNDED, DepthHead, DepthHeadOptions, inverse_linear
+from ghgs_lit.heads.dpt import DPTOptions
 from ghgs_lit.types import Cameras, Tokens
 from tests.helpers.scenes import fixture, make_batch, ring
 
@@ -32,7 +32,8 @@ def predict(head, batch, bounds=None):
 
 def make_head(**options):
     torch.manual_seed(1)
-    return DepthHead(64, dpt={"features": 16, "out_channels": [16, 16, 16, 16]}, **options)
+    dpt = {"features": 16, "out_channels": [16, 16, 16, 16]}
+    return DepthHead(DepthHeadOptions(dpt=dpt, **options), 64)
 
 
 def square_cameras(name, dtype, size):
@@ -69,7 +70,6 @@ def test_parameterizations_stay_in_bounds_and_keep_their_gradient(name):
     middle = BOUNDED[name](torch.tensor(0.5), near, far)
     expected = {
         "bounded_inverse": 2 / (1 / near + 1 / far),
-        "log": (near * far).sqrt(),
         "linear": (near + far) / 2,
     }
     torch.testing.assert_close(middle, expected[name])
@@ -129,7 +129,7 @@ def test_the_releases_parameterization_has_either_sign_and_no_bounds():
 
 def test_widths_follow_the_published_ones():
     """Published weights must fit the default widths."""
-    head = proportioned_dpt(2048, 2)
+    head = DPTOptions().build(2048, 2)
     shapes = [tuple(p.weight.shape[:2]) for p in head.projects]
     assert shapes == [(256, 2048), (512, 2048), (1024, 2048), (1024, 2048)]
     assert head.scratch.output_conv1.weight.shape[:2] == (128, 256)
@@ -139,7 +139,7 @@ def test_widths_follow_the_published_ones():
     ("options", "key"),
     [
         ({"parameterization": "linar"}, "depth_head.parameterization: expected one of bounded_inverse"),
-        ({"pixels": "some"}, "depth_head.pixels"),
+        ({"pixels": "all"}, "depth_head key: expected one of .*; found 'pixels'"),
         ({"start": 1.0}, "depth_head.start"),
     ],
 )

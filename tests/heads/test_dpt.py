@@ -9,7 +9,7 @@ from torch import nn
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import split_activated
-from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
+from ghgs_lit.heads.dpt import DPTHead, DPTOptions, ResidualUnit, _pointwise
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
 
@@ -23,9 +23,10 @@ def _tokens(b=1, v=2, h=3, w=2, patch_size=14, width=16, dtype=torch.float32, se
     return Tokens(latent, latent[0], image, row, column, (b, v, h, w), patch_size)
 
 
-def _head(seed=0, **options) -> DPTHead:
+def _head(seed=0, guide_channels=0, **options) -> DPTHead:
     torch.manual_seed(seed)
-    return DPTHead(**{"dim_in": 16, "features": 8, "out_channels": (4, 8, 8, 12), "output_dim": 3, **options})
+    options = DPTOptions(**{"features": 8, "out_channels": (4, 8, 8, 12), **options})
+    return options.build(16, 3, guide_channels)
 
 
 @pytest.mark.parametrize("patch_size", [7, 8, 10, 14])
@@ -118,7 +119,7 @@ def test_a_guide_keeps_images_apart_and_is_local():
 
 def test_last_projection_is_wide_under_autocast():
     """Half precision in the last projection would cost centimetres."""
-    head = _head(features=32, hidden=32)
+    head = _head(features=32)
     tokens = _tokens(v=2, h=5, w=5)
     with torch.no_grad():
         exact = head(tokens)
@@ -130,7 +131,7 @@ def test_last_projection_is_wide_under_autocast():
 
 def test_float16_overflows_no_dense_head():
     """Maps of a head whose weights have grown exceed 65 504; in float16 every depth was lost."""
-    head, tokens = _head(features=32, hidden=32), _tokens(v=2, h=5, w=5)
+    head, tokens = _head(features=32), _tokens(v=2, h=5, w=5)
     with torch.no_grad():
         for name, parameter in head.named_parameters():
             if not name.startswith("norm"):
@@ -218,9 +219,9 @@ def test_activations_are_wide():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"features": 12}, "features: expected a multiple of 8; found 12"),
-        ({"out_channels": (4, 8, 8)}, "out_channels: expected four multiples of 4"),
-        ({"out_channels": (4, 8, 8, 10)}, "out_channels: expected four multiples of 4"),
+        ({"features": 12}, "features: expected a multiple of 8 or null; found 12"),
+        ({"out_channels": (4, 8, 8)}, "out_channels: expected a list of 4 values"),
+        ({"out_channels": (4, 8, 8, 10)}, "out_channels: expected a multiple of 4"),
     ],
 )
 def test_impossible_options_are_refused(options, message):

@@ -10,7 +10,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.unprojection import Unprojection
-from ghgs_lit.heads.gaussian import GaussianHead
+from ghgs_lit.heads.gaussian import GaussianHead, GaussianHeadOptions
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.types import DepthMaps
 from tests.heads.test_depth import make_tokens
@@ -21,14 +21,15 @@ HEADERS = ("offset_header", "scale_header", "rot_header", "opacity_header")
 
 def make_head(**options):
     torch.manual_seed(4)
-    return GaussianHead(64, dpt={"features": 16, "out_channels": [16, 16, 16, 16]}, **options)
+    dpt = {"features": 16, "out_channels": [16, 16, 16, 16]}
+    return GaussianHead(GaussianHeadOptions(dpt=dpt, **options), 64)
 
 
-def run(head, batch, masks=None):
+def run(head, batch, masks=None, pixels="subject"):
     maps = DepthMaps(batch.depths, batch.masks if masks is None else masks, batch.depths)
     tokens = make_tokens(batch)
     points = Unprojection()(maps, tokens, batch)
-    return head.activate(head(tokens, batch, points, maps), batch, points, maps)
+    return head.activate(head(tokens, batch, points, maps, pixels), batch, points, maps)
 
 
 def shake(head, scale=1.0):
@@ -63,8 +64,8 @@ def test_training_starts_with_small_opaque_splats_on_the_surface():
     points = Unprojection()(maps, make_tokens(batch), batch)
     assert torch.equal(gaussians.means, points.pixels[batch.masks])
     footprint = batch.depths[batch.masks] / batch.cameras.intrinsics[0, 0, 0, 0]
-    torch.testing.assert_close(gaussians.scales, 0.3 * footprint[:, None].expand(-1, 3))
-    torch.testing.assert_close(gaussians.opacities, torch.full_like(gaussians.opacities, 0.9))
+    torch.testing.assert_close(gaussians.scales, 0.25 * footprint[:, None].expand(-1, 3))
+    torch.testing.assert_close(gaussians.opacities, torch.full_like(gaussians.opacities, 0.8))
     assert torch.equal(gaussians.quaternions, torch.tensor([1.0, 0, 0, 0]).expand(len(gaussians), 4))
     assert torch.equal(gaussians.colors, batch.images.permute(0, 1, 3, 4, 2)[batch.masks])
 
@@ -134,7 +135,7 @@ def test_attributes_stay_within_their_bounds(scale):
     batch = make_batch()
     gaussians = run(shake(make_head(), scale), batch)
     start = run(make_head(), batch)
-    footprint = start.scales / 0.3
+    footprint = start.scales / 0.25
     assert ((gaussians.means - start.means).abs() <= 0.05 + 1e-6).all()
     ratio = gaussians.scales / footprint
     assert ((ratio >= 0.15 * 0.999) & (ratio <= 4 * 1.001)).all()
@@ -166,7 +167,7 @@ def test_scale_does_not_pull_on_the_depth():
 def test_heads_on_every_pixel_give_the_same_gaussians():
     """skip=exact must not change the Gaussians of skip=none."""
     batch = make_batch(2, 3)
-    subject, every = (run(shake(make_head(pixels=pixels)), batch) for pixels in ("subject", "all"))
+    subject, every = (run(shake(make_head()), batch, pixels=pixels) for pixels in ("subject", "all"))
     for name in ("means", "quaternions", "scales", "opacities", "colors"):
         a, b = getattr(subject, name), getattr(every, name)
         assert (a - b).abs().max() <= 1e-5 * b.abs().max()
@@ -200,7 +201,7 @@ def test_attributes_are_wide_under_autocast():
     ("options", "key"),
     [
         ({"parameterization": "ours"}, "gaussian_head.parameterization"),
-        ({"pixels": "some"}, "gaussian_head.pixels"),
+        ({"pixels": "all"}, "gaussian_head key: expected one of .*; found 'pixels'"),
         ({"hidden": [32]}, "gaussian_head.hidden"),
         ({"attributes": {"scale_start": 0.1}}, "gaussian_head.attributes.scale_start"),
         ({"attributes": {"thickness_start": 0.0}}, "gaussian_head.attributes.thickness_start"),

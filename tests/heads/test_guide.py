@@ -9,10 +9,10 @@ from ghgs_lit.bounds import VisualHull
 from ghgs_lit.encoder import VGGTOptions
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.relative_depth import UNIT, relative_bounds, relative_depth
-from ghgs_lit.heads.depth import DepthHead
 from ghgs_lit.heads.guide import GuidePyramid, photo_guide
 from ghgs_lit.heads.window import Window
 from ghgs_lit.types import DepthBounds
+from tests.heads.test_depth import make_head
 from tests.helpers.scenes import make_batch
 
 
@@ -71,8 +71,7 @@ def test_depth_follows_the_guide():
     other = dataclasses.replace(batch, images=batch.images.flip(-1))
     tokens = make_encoder()(batch.images, batch.masks)
     for guided in (True, False):
-        torch.manual_seed(1)
-        head = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, guide=guided)
+        head = make_head(guide=guided)
         torch.nn.init.normal_(head.dpt.scratch.output_conv2[-1].weight)
         bounds = VisualHull()(batch)
         same = torch.equal(head(tokens, batch, bounds).depth, head(tokens, other, bounds).depth)
@@ -83,8 +82,7 @@ def test_the_guide_is_asked_for_and_refused():
     """A guide that is missing or unexpected must be named."""
     batch = make_batch()
     tokens = make_encoder()(batch.images, batch.masks)
-    guided = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}, guide=True).dpt
-    plain = DepthHead(64, {"features": 16, "out_channels": [8, 8, 8, 8]}).dpt
+    guided, plain = make_head(guide=True).dpt, make_head().dpt
     with pytest.raises(InputError, match="guide"):
         guided(tokens)
     with pytest.raises(InputError, match="guide"):

@@ -12,7 +12,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.losses import terms
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
-from ghgs_lit.rounds import Rounds
+from ghgs_lit.rounds import RoundsOptions
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.types import Targets
 from tests.helpers.losses import losses_of
@@ -115,8 +115,8 @@ def test_half_precision_gives_finite_values():
 def test_options_are_checked():
     with pytest.raises(InputError, match=r"rounds\.reach"):
         GHGS.from_config(config(*RECURRENT, "rounds.reach=0"))
-    with pytest.raises(InputError, match=r"rounds\.exchange: expected null or a number of channels"):
-        Rounds(8, exchange=0)
+    with pytest.raises(InputError, match=r"rounds\.exchange: expected an integer >= 1 and <= 65536 or null"):
+        RoundsOptions(exchange=0)
     resolve(compose("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"]))
     assert model("rounds.exchange=null").rounds.exchange is None
     with pytest.raises(InputError, match=r"rounds: expected .* bounds"):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from ghgs_lit.config import build
@@ -17,6 +17,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import read_checkpoint, require_fit
+from ghgs_lit.weights.loading import check_preset, load_weights
 
 #: The preset that all others are compared with.
 YARDSTICK = "none"
@@ -105,17 +106,6 @@ def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str,
     }
 
 
-def readers_of_skip(cfg: DictConfig) -> dict[str, str]:
-    """Keys of the stages that follow the preset, with their interpolations of ``skip``.
-
-    A checkpoint has the values that they had in training; with these another preset can be set.
-    """
-    raw = OmegaConf.to_container(OmegaConf.masked_copy(cfg, list(MODEL_NODES)), resolve=False)
-    return {
-        key: value for key, value in flatten(raw).items() if isinstance(value, str) and "${skip." in value
-    }
-
-
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     """Every choice of one value for each knob.
 
@@ -132,7 +122,6 @@ def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def case_config(
     source: Source,
     skip: Mapping[str, Any],
-    readers: Mapping[str, str],
     knobs: Mapping[str, Any],
     shared: Mapping[str, Any],
 ) -> dict[str, Any]:
@@ -141,7 +130,6 @@ def case_config(
     Args:
         source: gives the model's nodes.
         skip: the values of the preset.
-        readers: of :func:`readers_of_skip`.
         knobs: values by key.
         shared: nodes that all cases have (``renderer``, ``precision``).
 
@@ -149,11 +137,7 @@ def case_config(
         InputError: a knob that the configuration does not have.
     """
     own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
-    known = flatten(own)
     node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
-    for key, text in readers.items():
-        if key in known:
-            OmegaConf.update(node, key, text)
     for key, value in knobs.items():
         if OmegaConf.select(node, key, default=None) is None:
             require(key in flatten(OmegaConf.to_container(node)), f"knobs.{key}", "an existing key", key)
@@ -164,7 +148,6 @@ def case_config(
 def cases_of(
     source: Source,
     presets: Mapping[str, Mapping[str, Any]],
-    readers: Mapping[str, str],
     knobs: Mapping[str, Sequence[Any]],
     shared: Mapping[str, Any],
     device: torch.device,
@@ -173,7 +156,7 @@ def cases_of(
     """The cases of one source; they share one copy of the weights.
 
     Args:
-        source, readers, shared: as for :func:`case_config`.
+        source, shared: as for :func:`case_config`.
         presets: of :func:`presets_of`; the yardstick comes first, without knobs, where it is among them.
         knobs: values of each knob, by key; every preset is measured with every combination.
         device: of the models.
@@ -189,7 +172,7 @@ def cases_of(
     cases = []
     for name, change in choices:
         skip = presets[name]
-        config = case_config(source, skip, readers, change, shared)
+        config = case_config(source, skip, change, shared)
         model = _model(source, config, state, seed, device).to(device).eval()
         state = state or model.state_dict()
         model.precision = config["precision"]
@@ -211,10 +194,10 @@ def _model(
         return random_model(config, seed)
     model = GHGS.from_config(config, empty=STAGES)
     if not state:
-        model.load(source.checkpoint, device=device)
+        load_weights(model, source.checkpoint, device=device)
         return model
     require_fit(model, state, "knobs")
     model.load_state_dict(state, assign=True)
     if source.checkpoint is not None:
-        model.check_preset(read_checkpoint(source.checkpoint), source.checkpoint)
+        check_preset(model, read_checkpoint(source.checkpoint), source.checkpoint)
     return model
