@@ -71,7 +71,7 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     Raises:
         InputError: their sides are not divisible by the model's patch.
     """
-    size, multiple = data.options.size, model.side_multiple
+    size, multiple = data.dataset.size, model.side_multiple
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 
