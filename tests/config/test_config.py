@@ -66,13 +66,11 @@ def test_every_object_outside_the_model_is_built(group, name, tmp_path):
     if node is None:
         return
     extra = {
-        "data": {"views": cfg.views, "targets": cfg.targets, "seed": 0, "root": str(tmp_path)},
+        "data": {"views": cfg.views, "targets": cfg.targets, "seed": 0},
         "logger": {"save_dir": str(tmp_path)},
         # A Trainer for a GPU refuses to be made where there is none.
         "trainer": {"accelerator": "cpu"},
     }.get(group, {})
-    if name == "synthetic":
-        extra.pop("root")
     for key, part in nodes_with_kind(node, group):
         if key == "logger.wandb" and importlib.util.find_spec("wandb") is None:
             with pytest.raises(InputError, match=r"ghgs-lit\[wandb\]"):

@@ -36,7 +36,9 @@ def leaves(verb, *overrides):
 def has_options(key):
     """Whether a dotted key belongs to typed options (tests/config/test_options.py)."""
     kinds = registry.KINDS.get(key.split(".")[0])
-    return kinds is not None and all(issubclass(class_of(key.split(".")[0], kind, key), Options) for kind in kinds)
+    return kinds is not None and all(
+        issubclass(class_of(key.split(".")[0], kind, key), Options) for kind in kinds
+    )
 
 
 def assert_typed(found):

@@ -134,7 +134,7 @@ def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
 
 def test_nothing_is_admitted_by_a_configuration(project):
     """A checkpoint of somebody else cannot have foreign code imported."""
-    for kind in ("my_people", "my_people.MyDataModule", "os.system"):
+    for kind in ("my_people", "my_people.MyPeople", "os.system"):
         with pytest.raises(InputError, match=r"data\.kind: expected one of"):
             build(node(project, kind=kind), "data")
     assert "my_people" not in sys.modules
@@ -153,6 +153,7 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
         with pytest.raises(InputError, match="my_people"):
             build(node(project), "data")
         admit()
+        plugins._installed.cache_clear()
         assert build(node(project), "data", **KEYS).dataset.name == "m"
         monkeypatch.delenv(plugins.VARIABLE, raising=False)
         registry._REGISTERED.clear()

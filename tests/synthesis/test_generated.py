@@ -130,13 +130,9 @@ def test_generated_people_must_have_the_views_that_are_asked_for(tmp_path):
         InputError, match=r"data\.render\.views: expected \[0, 2, 3, 4\] for targets=release; found \[0\]"
     ):
         synthetic(tmp_path, render={"size": 28, "views": [0]})
-    with pytest.raises(
-        InputError, match=r"data\.people\.val: expected an integer >= 1 and .*; found 0"
-    ):
+    with pytest.raises(InputError, match=r"data\.people\.val: expected an integer >= 1 and .*; found 0"):
         synthetic(tmp_path, people={"train": 2, "val": 0})
-    with pytest.raises(
-        InputError, match=r"data\.active\.train: expected an integer >= 0 and .*; found -1"
-    ):
+    with pytest.raises(InputError, match=r"data\.active\.train: expected an integer >= 0 and .*; found -1"):
         synthetic(tmp_path, active={"train": -1})
 
 

@@ -132,7 +132,7 @@ def test_what_varies_changes_nothing_else(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"radius": [3, 2]}, r"radius: expected \[least, greatest\]; found \[3, 2\]"),
+        ({"radius": [3, 2]}, r"radius: expected \[least, greatest\]; found \[3\.0, 2\.0\]"),
         (
             {"fill": [0.5, 1.2]},
             r"fill: expected a list of 2 values \(each a number > 0 and < 1\) or null; found \[0\.5, 1\.2\]",
