@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, TypeVar
 
+from omegaconf import OmegaConf
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -114,6 +115,8 @@ class Options(BaseModel, metaclass=_Checked):
         """
         if isinstance(values, cls):
             return values
+        if OmegaConf.is_config(values):
+            values = OmegaConf.to_container(values, resolve=True)
         if not isinstance(values, Mapping):
             raise InputError(f"{key}: expected a mapping of its keys; found {values!r}")
         try:
