@@ -17,7 +17,6 @@ from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, wit
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
-from ghgs_lit.config.settings import from_config
 from ghgs_lit.diagnostics.benchmark import report, scaling
 from ghgs_lit.diagnostics.benchmark.board import write_board
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
@@ -170,7 +169,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
 
 def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
     """Measure how cost grows, on analytic scenes."""
-    axes = from_config(scaling.Axes, "scaling", config["scaling"])
+    axes = scaling.Axes(**config["scaling"])
     timing = config["timing"]
     total = scaling.passes(len(cases), axes, timing["warmup"] + timing["repeats"])
     with Progress() as bar:

@@ -9,7 +9,6 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.config.settings import from_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
@@ -37,7 +36,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
         targets=_listed("evaluation.targets", evaluation["targets"], str),
         metrics=_listed("columns", config["columns"], str),
         reported=config["reported"],
-        test=from_config(t.PairedTest, "test", config["test"]),
+        test=t.PairedTest(**config["test"]),
         unit=unit,
         illustration=config["illustration"],
     )

@@ -288,14 +288,13 @@ def composed(name, root, *overrides):
 )
 def test_named_protocols(rendered, experiment, size, inputs, targets):
     """Each experiment= has its publication's size, inputs and targets."""
-    data, cfg = composed(experiment, rendered, "data.depths=false")
+    data, cfg = composed(experiment, rendered)
     assert data.dataset.size == (size, size)
     assert list(cfg.evaluation.targets) == [data.targets.name]
     batch = next(iter(data.evaluation_loader(targets=data.targets)))
     assert list(batch.views[0]) == inputs
     assert list(batch.targets.names[0]) == targets
     assert batch.images.shape[-2:] == (size, size)
-    assert batch.depths is None
     training = data.training_batch(0)
     assert {name[-1] for name in training.targets.names[0]} <= {"2", "3", "4"}
     assert len(training.targets.names[0]) == (3 if experiment == "thuman2_ghg" else 1)
