@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -100,7 +99,7 @@ class Synthetic(_Renderable):
     cache_dir: options.Path | None = None
     """Folder of the caches; null: $GHGS_CACHE or ~/.cache/ghgs_lit."""
 
-    @cached_property
+    @property
     def root(self) -> str:
         """The cache's folder, which is named after everything that the photographs depend on."""
         made_with = identity(self.rig.build(), self.render, self.people_seed) | {"people": people_version()}

@@ -15,9 +15,9 @@ from ghgs_lit.synthesis.jobs import RenderOptions
 from tests.helpers.people import RELEASE, RIG, V4, box_person, equal
 
 
-def built(*overrides, **extra):
+def built(*overrides):
     cfg = compose("prepare", overrides)
-    return build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed, **extra)
+    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
 
 
 @pytest.mark.parametrize("views", ["v3", "v4", "v5", "random"])
@@ -37,7 +37,7 @@ def test_configuration_groups_build(views, targets, tmp_path):
         by_name.view,
         by_name.per_subject,
     )
-    synthetic = built(f"views={views}", f"targets={targets}", cache_dir=str(tmp_path))
+    synthetic = built(f"views={views}", f"targets={targets}", f"data.cache_dir={tmp_path}")
     assert isinstance(synthetic.dataset, Synthetic)
 
 
