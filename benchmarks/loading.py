@@ -58,7 +58,7 @@ def main() -> None:
             measured, samples = rate(data, arguments.seconds)
             table.add_row(str(workers), f"{measured:.1f}", f"{1000 / measured:.1f}", str(samples))
     Console().print(
-        f"{data.dataset.name}, {data.options.size[0]} x {data.options.size[1]}, {os.cpu_count()} cores"
+        f"{data.dataset.name}, {data.dataset.size[0]} x {data.dataset.size[1]}, {os.cpu_count()} cores"
     )
     Console().print(table)
 

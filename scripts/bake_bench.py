@@ -11,23 +11,25 @@ from pathlib import Path
 
 import numpy as np
 
-from ghgs_lit.config.settings import from_config
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.sampling import RING_VIEW
 from ghgs_lit.synthesis import bench
-from ghgs_lit.synthesis.jobs import RenderSettings, SyntheticSource, render_people
+from ghgs_lit.synthesis.jobs import RenderOptions, SyntheticSource, everything, render_people
 from ghgs_lit.synthesis.rig import Rig
 
 
 def main() -> None:
     data = bench.definition()["data"]
-    seed, rig = data["people_seed"], from_config(Rig, "rig", data["rig"])
-    settings = RenderSettings(
+    seed, rig = data["people_seed"], Rig(height=data["rig"]["height"])
+    wanted = data["render"]
+    settings = RenderOptions(
         size=bench.definition()["size"],
         positions=bench.POSITIONS,
         views=(RING_VIEW,),
-        **data["render"],
+        samples=wanted["samples"],
+        quality=wanted["quality"],
     )
+    bench.check_settings({"people_seed": seed, **everything(rig, settings)})
     with tempfile.TemporaryDirectory() as folder:
         root, people = Path(folder), {bench.SPLIT: bench.names()}
         render_people(root, people, SyntheticSource(seed), rig, settings, seed)

@@ -1,18 +1,16 @@
-"""A data set of your own: a reader that finds photographs on disk, its settings, and a DataModule for them.
+"""A data set of your own: a reader that finds photographs on disk, and its options.
 
 Copy this file and ``conf/data/my_people.yaml``, then change what is marked. As it stands it reads
 ``<root>/<train|val>/<person>/<camera>.png`` (RGBA, alpha is the mask) with ``cameras.npz`` beside them:
 ``intrinsics`` [n, 3, 3] in pixels and ``extrinsics`` [n, 3 or 4, 4], world to camera, in metres, OpenCV axes.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from ghgs_lit.config import register
-from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics, check_name, read_array, read_image
 from ghgs_lit.data.reader import Reader
@@ -67,18 +65,12 @@ class MyReader(Reader):
         return str(self.folder / name / f"{position}.png")
 
 
-@dataclass(frozen=True, kw_only=True)
+@register("data", "my_people")
 class MyPeople(DataSet):
-    """The settings. `name`, `root`, `limit` and `ring` are there already; CHANGE: add fields of your own."""
+    """The options. `root`, `limit`, `size` and so on are there already; CHANGE: add fields of your own."""
 
     static_cameras: ClassVar[bool] = True  # CHANGE: False if there are views between the cameras
+    ring: ClassVar[int] = 8  # CHANGE: number of cameras; inputs are evenly spaced among them
 
     def reader(self, phase: str, strict: bool = True) -> MyReader:
-        return MyReader(self.folder / phase, self.limit[phase], strict)
-
-
-@register("data", "my_people")
-class MyDataModule(PhotographsDataModule):
-    """Samples, batches and loaders are those of all data sets."""
-
-    dataset_type = MyPeople
+        return MyReader(self.folder / phase, self.limit.of(phase), strict)

@@ -121,7 +121,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     data = build_data(config)
     data.prepare_data([config["split"]])
     loader = data.evaluation_loader(split=config["split"])
-    number = config["subjects"] and math.ceil(config["subjects"] / data.options.batch_size)
+    number = config["subjects"] and math.ceil(config["subjects"] / data.dataset.batch_size)
     batches: list[Batch] = [batch.to(device) for batch in itertools.islice(loader, number)]
     if batches[0].targets is None:
         raise InputError(f"targets={config['targets']['name']}: expected target photographs; found none")

@@ -44,7 +44,7 @@ def peers(cfg: DictConfig, config: dict[str, Any], directory: Path, device: torc
         Journal(directory / "subjects.jsonl"),
         _identity(config),
     )
-    number, size = len({row["subject"] for row in rows}), " x ".join(map(str, data.options.size))
+    number, size = len({row["subject"] for row in rows}), " x ".join(map(str, data.dataset.size))
     known = {**data.facts, **data.dataset.split_facts(config["split"])}
     facts = ", ".join(f"{key} {value}" for key, value in known.items() if key != "name")
     about = f"{config['checkpoint']}; {number} subjects of {config['data']['name']}, {size} ({facts})"

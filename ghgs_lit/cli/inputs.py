@@ -79,7 +79,7 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
     Raises:
         InputError: their sides are not divisible by the model's patch.
     """
-    size, multiple = data.options.size, side_multiple(model.options, model.encoder.patch_size)
+    size, multiple = data.dataset.size, side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
 

@@ -8,7 +8,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config.paths import conf_dir
-from ghgs_lit.config.schema import check
+from ghgs_lit.config.registry import KINDS, check
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
@@ -47,11 +47,6 @@ def check_groups(verb: str, cfg: DictConfig) -> None:
             raise InputError(f"{name}: expected a key or group of ghgs {verb}; found none")
 
 
-def is_group(name: str) -> bool:
-    """Whether a key of a configuration is the node of a config group."""
-    return (conf_dir() / name).is_dir() or name == "rounds"
-
-
 def _has_node(group: str, option: str | None) -> bool:
     """Whether an option fills the node of its group; those of the whole configuration may set others only."""
     path = conf_dir() / group / f"{option}.yaml"
@@ -76,5 +71,5 @@ def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
     data = OmegaConf.to_container(cfg, resolve=True)
     check(data)
     if verb is not None:
-        VERBS[verb].read({name: value for name, value in data.items() if not is_group(name)}, "")
+        VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
     return data

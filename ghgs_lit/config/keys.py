@@ -16,7 +16,6 @@ WITHOUT_INFLUENCE = (
     "callbacks",
     "data.cache_dir",
     "data.cache_images_mb",
-    "data.pin_memory",
     "data.render_workers",
     "data.workers",
     "encoder.weights",  # repeats the origin of init_from's weights, which counts

@@ -6,18 +6,38 @@ shows the same fields.
 """
 
 import difflib
+import os
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from omegaconf import OmegaConf
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from ghgs_lit.config.describe import Words, expected, options_of
 from ghgs_lit.errors import InputError
 
 _T = TypeVar("_T", bound="Options")
 
+
+def _text(value: Any) -> Any:
+    """A path of :mod:`pathlib` as text; other values as they are."""
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def _pair(size: int | tuple[int, int]) -> tuple[int, int]:
+    return (size, size) if isinstance(size, int) else size
+
+
 Text = Annotated[str, Field(min_length=1)]
-Path = Annotated[str, Field(min_length=1), Words("a path")]
+Path = Annotated[str, Field(min_length=1), BeforeValidator(_text), Words("a path")]
 Count = Annotated[int, Field(ge=1)]
 Index = Annotated[int, Field(ge=0)]
 Amount = Annotated[float, Field(ge=0)]
@@ -28,7 +48,8 @@ Workers = Annotated[int, Field(ge=0, le=1024)]
 Width = Annotated[int, Field(ge=1, le=65536)]
 # A photograph of more pixels would need gigabytes before anything could refuse it.
 Side = Annotated[int, Field(ge=1, le=8192)]
-Size = Side | tuple[Side, Side]
+#: A side or [height, width] in pixels; read as (height, width).
+Size = Annotated[Side | tuple[Side, Side], AfterValidator(_pair)]
 
 
 def multiple_of_four(value: int) -> int:
@@ -94,6 +115,8 @@ class Options(BaseModel, metaclass=_Checked):
         """
         if isinstance(values, cls):
             return values
+        if OmegaConf.is_config(values):
+            values = OmegaConf.to_container(values, resolve=True)
         if not isinstance(values, Mapping):
             raise InputError(f"{key}: expected a mapping of its keys; found {values!r}")
         try:
@@ -129,20 +152,27 @@ def _plain(value: Any) -> Any:
 
 
 def _input_error(cls: type[Options], key: str, values: Mapping, error: ValidationError) -> InputError:
-    """The first of pydantic's errors, in the words of this package."""
-    first = error.errors(include_url=False)[0]
+    """The first of pydantic's errors, in the words of this package.
+
+    Unknown keys come first: a misspelt key may be why another one is missing.
+    """
+    errors = error.errors(include_url=False)
+    first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     own = first.get("ctx", {}).get("error")
-    path = [key] if key else []
+    path, field, nested = [key] if key else [], None, cls
     for name in first["loc"]:
-        field = cls.model_fields.get(name) if isinstance(name, str) else None
-        if field is None:
+        if nested is None or not isinstance(values, Mapping | list | tuple):
             break
-        path.append(name)
-        values = values[name] if isinstance(values, Mapping) and name in values else None
-        nested = options_of(field.annotation)
-        if nested is None or not isinstance(values, Mapping):
-            break
+        if isinstance(name, int):  # of a list of options
+            values = values[name]
+            continue
         cls = nested
+        if name not in cls.model_fields:
+            break
+        field = cls.model_fields[name]
+        path.append(name)
+        values = values.get(name)
+        nested = options_of(field.annotation)
     dotted = ".".join(path)
     if isinstance(own, InputError):  # of a validator over several fields
         return InputError(f"{dotted}.{own}" if dotted else str(own))

@@ -6,7 +6,6 @@ names one of the kinds below or one that the user's own code has registered; cod
 """
 
 import importlib
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -43,13 +42,15 @@ KINDS: dict[str, dict[str | None, str]] = {
     "evaluation": {None: "ghgs_lit.config.verbs.EvaluationOptions"},
     "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
-        "humman": "ghgs_lit.data.datamodules.HuMManDataModule",
-        "rendered": "ghgs_lit.data.datamodules.RenderedDataModule",
-        "scans": "ghgs_lit.synthesis.datamodules.ScansDataModule",
-        "synthetic": "ghgs_lit.synthesis.datamodules.SyntheticDataModule",
-        "thuman2": "ghgs_lit.synthesis.datamodules.THuman2DataModule",
-        "zju_mocap": "ghgs_lit.data.datamodules.ZJUMoCapDataModule",
+        "humman": "ghgs_lit.data.humman.dataset.HuMMan",
+        "scans": "ghgs_lit.synthesis.datasets.Scans",
+        "synthetic": "ghgs_lit.synthesis.datasets.Synthetic",
+        "thuman2": "ghgs_lit.synthesis.thuman2.THuman2",
+        "zju_mocap": "ghgs_lit.data.zju_mocap.dataset.ZJUMoCap",
     },
+    "views": {None: "ghgs_lit.data.sampling.ViewProtocol"},
+    "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},
+    "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
     "callbacks": {
         "attention": "ghgs_lit.training.validation_pictures.AttentionOptions",
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
@@ -139,8 +140,7 @@ def read_node(node: Any, key: str) -> Options:
         raise InputError(f"{key}: expected a mapping of its keys; found {node!r}")
     values = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else dict(node)
     kind = None if None in KINDS[group] else values.pop("kind", None)
-    cls = class_of(group, kind, key)
-    return cls.read(values, key) if issubclass(cls, Options) else _Arguments(cls, values, key)
+    return class_of(group, kind, key).read(values, key)
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
@@ -156,27 +156,22 @@ def build(node: Any, key: str, **extra: Any) -> Any:
     return read_node(node, key).build(**extra)
 
 
-class _Arguments:
-    """Options of a class that takes them one by one."""
+def check(config: Mapping[str, Any]) -> None:
+    """Refuse wrong values of all groups of a configuration.
 
-    def __init__(self, cls: type, values: Mapping[str, Any], key: str) -> None:
-        self._cls, self._values, self._key = cls, values, key
+    Args:
+        config: plain data, interpolations resolved. ``data`` without a kind changes keys of a checkpoint's.
 
-    def build(self, **extra: Any) -> Any:
-        known = inspect.signature(self._cls).parameters.values()
-        names = [parameter.name for parameter in known]
-        for name in self._values:
-            takes_all = any(parameter.kind == parameter.VAR_KEYWORD for parameter in known)
-            if name not in names and (name.startswith("_") or not takes_all):
-                raise InputError(f"{self._key} key: expected one of {', '.join(names)}; found {name!r}")
-        return self._cls(**{**self._values, **extra})
-
-
-def is_typed(key: str, node: Any) -> bool:
-    """Whether the value of a dotted key is a node of typed options, which are then checked."""
-    group, *names = key.split(".")
-    if group not in KINDS or len(names) != (group in NAMED) or not isinstance(node, Mapping):
-        return False
-    if None not in KINDS[group] and "kind" not in node:
-        return False
-    return isinstance(read_node(node, key), Options)
+    Raises:
+        InputError: names the key of the first wrong value, what was expected and what was found.
+    """
+    for group, node in config.items():
+        # Verbs whose data is that of a checkpoint have none of their own.
+        whose = group in ("data", "targets") and (node is None or (group == "data" and "kind" not in node))
+        if group not in KINDS or whose:
+            continue
+        if group in NAMED and isinstance(node, Mapping):
+            for name, part in node.items():
+                read_node(part, f"{group}.{name}")
+        else:
+            read_node(node, group)

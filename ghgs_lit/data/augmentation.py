@@ -6,17 +6,17 @@ A batch is a function of (seed, step, index) alone, as its samples are, so that 
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from pydantic import model_validator
 from torch import Tensor
 
-from ghgs_lit.config.settings import image_size, set_fields
+from ghgs_lit.config import options
+from ghgs_lit.config.options import Amount, Options, Positive, Share
 from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
 from ghgs_lit.data.matting import refined_matte
-from ghgs_lit.errors import require
 from ghgs_lit.types import Batch, Cameras
 
 # Streams of random numbers beside those of ghgs_lit.data.sampling.
@@ -25,54 +25,48 @@ _SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
 Size = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """What varies in training; None and 0: nothing. Pixels are those of the inputs at their drawn size.
+class Augmentation(Options):
+    """What varies in training; null and 0: nothing. Pixels are those of the inputs at their drawn size.
 
-    Attributes:
-        sizes: sides or (height, width) of the inputs; one is drawn for each step, the same in all processes.
-        target_scale: least and greatest size of the targets over that of the inputs, drawn likewise; never
-            larger than without it, as photographs that are enlarged teach blur.
-        chance: share of the steps whose inputs are imperfect, 0 to 1.
-        exposure, white_balance: in stops, as for :func:`color_gains`. Targets keep theirs.
-        mask_offset, mask_ragged, mask_hole, mask_hole_chance: as for :func:`imperfect_mask`. The inputs are
-            black outside their masks, as those of a capture.
-        background: share of the samples with such masks that were taken before :func:`backgrounds`, which a
-            mask that is too large shows; behind the others it is black.
-        refined: share of the samples before a background whose masks were refined
-            (:func:`ghgs_lit.data.matting.refined_matte`), as a capture's are with ``refine_masks``.
-        calibration: in pixels, as for :func:`miscalibrated`. Targets keep their true cameras, depth maps the
-            z-depths in the true cameras: the loss on depth asks for the distance of the surface, not for one
-            that makes up for the error of a camera.
+    Targets keep their colours and their true cameras, depth maps the z-depths in the true cameras: the loss
+    on depth asks for the distance of the surface, not for one that makes up for the error of a camera.
     """
 
-    sizes: tuple[Size, ...] | None = None
-    target_scale: tuple[float, float] | None = None
-    chance: float = 1.0
-    exposure: float = 0.0
-    white_balance: float = 0.0
-    mask_offset: float = 0.0
-    mask_ragged: float = 0.0
-    mask_hole: float = 0.0
-    mask_hole_chance: float = 0.0
-    background: float = 0.0
-    refined: float = 0.0
-    calibration: float = 0.0
+    group = "augmentation"
 
-    def __post_init__(self) -> None:
-        if self.sizes is not None:
-            require(len(self.sizes) > 0, "augmentation.sizes", "sizes or null", list(self.sizes))
-            set_fields(self, sizes=tuple(image_size("augmentation.sizes", size) for size in self.sizes))
-        if self.target_scale is not None:
-            limits = tuple(self.target_scale)
-            ordered = len(limits) == 2 and 0 < limits[0] <= limits[1]
-            require(ordered, "augmentation.target_scale", "[least, greatest] above 0", list(limits))
-            set_fields(self, target_scale=limits)
-        for name in ("chance", "background", "refined"):
-            require(getattr(self, name) <= 1, f"augmentation.{name}", "at most 1", getattr(self, name))
-        for field in dataclasses.fields(self)[2:]:
-            value = getattr(self, field.name)
-            require(value >= 0, f"augmentation.{field.name}", "at least 0", value)
+    sizes: tuple[options.Size, ...] | None = None
+    """Sides or [height, width] of the inputs; one is drawn for each step, the same in all processes."""
+    target_scale: tuple[Positive, Positive] | None = None
+    """[least, greatest] size of the targets over that of the inputs, drawn likewise; never larger than
+    data.target_size, as photographs that are enlarged teach blur."""
+    chance: Share = 1.0
+    """Share of the steps whose inputs are imperfect in the ways below."""
+    exposure: Amount = 0.0
+    """Stops: greatest deviation of single cameras."""
+    white_balance: Amount = 0.0
+    """Stops: greatest deviation of red and of blue of single cameras."""
+    mask_offset: Amount = 0.0
+    """Pixels that masks grow or shrink by at most; inputs are then black outside their masks."""
+    mask_ragged: Amount = 0.0
+    """Pixels: greatest height of bumps of the outlines of masks."""
+    mask_hole: Amount = 0.0
+    """Greatest diameter of a missing piece of a mask, as a share of the subject's height."""
+    mask_hole_chance: Amount = 0.0
+    """How often a piece of a mask is missing, 0 to 1."""
+    background: Share = 0.0
+    """Share of samples with wrong masks that were taken before a background, which a mask that is too large
+    shows; behind the others it is black."""
+    refined: Share = 0.0
+    """Share of the samples before a background whose masks were refined, as by refine_masks."""
+    calibration: Amount = 0.0
+    """Pixels: greatest error of the cameras of the inputs."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Augmentation":
+        self.require(self.sizes != (), "sizes", "sizes or null")
+        low, high = self.target_scale or (1, 1)
+        self.require(low <= high, "target_scale", "[least, greatest] above 0")
+        return self
 
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
         """Sizes of the inputs and of the targets of a step.
@@ -121,19 +115,21 @@ class Augmentation:
             gains = [color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
             images = (images * torch.from_numpy(np.stack(gains)).to(images)[..., None, None]).clamp(0, 1)
         if self.calibration:
-            found = [
+            wrong = [
                 miscalibrated(cameras[b], masks[b], self.calibration, s[1]) for b, s in enumerate(streams)
             ]
-            lenses, poses = (
-                torch.stack([getattr(one, name) for one in found]) for name in ("intrinsics", "extrinsics")
+            cameras = Cameras(
+                torch.stack([one.intrinsics for one in wrong]),
+                torch.stack([one.extrinsics for one in wrong]),
+                cameras.height,
+                cameras.width,
             )
-            cameras = Cameras(lenses, poses, cameras.height, cameras.width)
         if self.mask_offset or self.mask_ragged or self.mask_hole:
             known = masks.to(images) if alpha is None else alpha
-            found = [
+            segmented = [
                 self._segmented(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
             ]
-            images, masks, mattes = (torch.stack(parts) for parts in zip(*found, strict=True))
+            images, masks, mattes = (torch.stack(parts) for parts in zip(*segmented, strict=True))
             alpha = None if alpha is None else mattes
         return dataclasses.replace(batch, images=images, masks=masks, cameras=cameras, alpha=alpha)
 
@@ -162,13 +158,13 @@ class Augmentation:
             refined_matte(image, 255 * mask, pixels)
             for image, mask in zip(bytes_, wrong.byte().numpy(), strict=True)
         ]
-        subjects, found = (
+        subjects, refined = (
             torch.from_numpy(np.stack(each)).to(images) / 255 for each in zip(*pairs, strict=True)
         )
-        kept = (found > 0.5).flatten(1).any(1)[:, None, None]  # no mask is emptied
-        found = torch.where(kept, found, wrong.to(images))
+        kept = (refined > 0.5).flatten(1).any(1)[:, None, None]  # no mask is emptied
+        refined = torch.where(kept, refined, wrong.to(images))
         images = torch.where(kept[:, None], subjects.movedim(-1, 1), photographs * wrong[:, None])
-        return images, found > 0.5, found
+        return images, refined > 0.5, refined
 
     def _masks(self, masks: Tensor, rng: np.random.Generator) -> Tensor:
         limits = (self.mask_offset, self.mask_ragged, self.mask_hole, self.mask_hole_chance)

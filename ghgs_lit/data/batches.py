@@ -1,7 +1,7 @@
 """From sample specifications to batches. An item of the torch datasets here is a whole :class:`Batch`."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
@@ -9,73 +9,24 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, DistributedSampler
 
-from ghgs_lit.config.settings import image_size, set_fields
 from ghgs_lit.data.augmentation import Augmentation, Size
 from ghgs_lit.data.reader import Photographs
-from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name, subject_rng
-from ghgs_lit.data.view import RESAMPLINGS, View
-from ghgs_lit.errors import choice, require
+from ghgs_lit.data.sampling import Photo, SampleSpec, TrainingSampler, photo_name
+from ghgs_lit.data.view import View
 from ghgs_lit.types import Batch, Cameras, Targets
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatchOptions:
-    """How photographs become batches; the same keys for every data set.
-
-    Attributes:
-        size: side or (height, width) of the inputs in pixels.
-        target_size: the same of the targets (null: as ``size``).
-        resampling: how photographs get this size, as for :func:`ghgs_lit.data.view.resize_view`.
-        batch_size: samples of one step in each process.
-        steps_per_epoch: null passes once over the subjects.
-        body_vertices: number of vertices drawn from each body, always the same ones (null: all).
-        depths: whether depth maps of the inputs are read, where the data has any.
-        apply_mask: make everything outside the masks black. Rendered photographs do not need it: they lie
-            on black, and pixels at the silhouette carry their share of the subject, as those of splats do.
-        cache_images_mb: MiB of decoded photographs kept in memory by each process.
-        evaluation_positions: input positions by number of views, where they are not evenly spaced.
-        workers: loading processes (0: none).
-        pin_memory: copy batches to the GPU through pinned memory.
-    """
-
-    size: int | Sequence[int]
-    target_size: int | Sequence[int] | None = None
-    resampling: str = "area"
-    batch_size: int = 1
-    steps_per_epoch: int | None = None
-    body_vertices: int | None = None
-    depths: bool = True
-    apply_mask: bool = False
-    cache_images_mb: float = 512
-    evaluation_positions: Mapping[int, Sequence[int]] | None = field(default_factory=dict)
-    workers: int = 0
-    pin_memory: bool = False
-
-    def __post_init__(self) -> None:
-        require(self.batch_size >= 1, "data.batch_size", "at least 1", self.batch_size)
-        for key in ("steps_per_epoch", "body_vertices"):
-            value = getattr(self, key)
-            require(value is None or value >= 1, f"data.{key}", "at least 1 or null", value)
-        for key in ("workers", "cache_images_mb"):
-            require(getattr(self, key) >= 0, f"data.{key}", "at least 0", getattr(self, key))
-        choice("data.resampling", self.resampling, RESAMPLINGS)
-        size = image_size("data.size", self.size)
-        target = size if self.target_size is None else image_size("data.target_size", self.target_size)
-        positions = {int(k): list(v) for k, v in (self.evaluation_positions or {}).items()}
-        set_fields(self, size=size, target_size=target, evaluation_positions=positions)
 
 
 @dataclass(frozen=True)
 class BatchBuilder:
     """Reads the photographs of samples into a :class:`Batch`.
 
-    ``apply_mask``, ``body_vertices`` and ``depths`` are those of :class:`BatchOptions`.
+    Attributes:
+        inputs, targets: the photographs at the sizes of both.
+        depths: whether depth maps of the inputs are read, where the data has any.
     """
 
     inputs: Photographs
     targets: Photographs
-    apply_mask: bool = False
-    body_vertices: int | None = None
     depths: bool = True
 
     def batch(
@@ -91,13 +42,13 @@ class BatchBuilder:
         depths = [[view.depth for view in row] for row in inputs]
         bodies = [self._body(s.subject) for s in specs]
         return Batch(
-            images=self._images(inputs),
+            images=_images(inputs),
             masks=_stack([[view.mask for view in row] for row in inputs]),
             cameras=_cameras(inputs),
             targets=self._targets(specs, target_size) if specs[0].targets else None,
             body_vertices=None if any(body is None for body in bodies) else bodies,
             depths=_stack_known(depths),
-            alpha=self._alpha(inputs),
+            alpha=_stack_known([[view.alpha for view in row] for row in inputs]),
             subjects=tuple(s.subject for s in specs),
             views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
         )
@@ -105,39 +56,27 @@ class BatchBuilder:
     def _targets(self, specs: Sequence[SampleSpec], size: Size | None) -> Targets:
         views = [_views(self.targets, s.subject, s.targets, False, size) for s in specs]
         return Targets(
-            images=self._images(views),
+            images=_images(views),
             masks=_stack([[view.mask for view in row] for row in views]),
             cameras=_cameras(views),
             names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
             protocols=specs[0].protocols,
         )
 
-    def _images(self, views: list[list[View]]) -> Tensor:
-        images = _stack([[view.image for view in row] for row in views])
-        if self.apply_mask:
-            images = images * _stack([[view.mask for view in row] for row in views])[..., None]
-        return images.permute(0, 1, 4, 2, 3).float() / 255
-
-    def _alpha(self, views: list[list[View]]) -> Tensor | None:
-        alpha = _stack_known([[view.alpha for view in row] for row in views])
-        if alpha is None or not self.apply_mask:
-            return alpha
-        return alpha * _stack([[view.mask for view in row] for row in views])
-
     def _body(self, name: str) -> Tensor | None:
         vertices = self.inputs.body(name)
-        if vertices is None:
-            return None
-        if self.body_vertices is not None and len(vertices) > self.body_vertices:
-            chosen = subject_rng(0, name).choice(len(vertices), self.body_vertices, replace=False)
-            vertices = vertices[np.sort(chosen)]
-        return torch.from_numpy(vertices)
+        return None if vertices is None else torch.from_numpy(vertices)
 
 
 def _views(
     photographs: Photographs, subject: str, photos: Sequence[Photo], depth: bool, size: Size | None
 ) -> list[View]:
     return [photographs.view(subject, *photo, depth=depth, size=size) for photo in photos]
+
+
+def _images(views: list[list[View]]) -> Tensor:
+    images = _stack([[view.image for view in row] for row in views])
+    return images.permute(0, 1, 4, 2, 3).float() / 255
 
 
 def _stack(arrays: list[list[np.ndarray]]) -> Tensor:

@@ -119,7 +119,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
             Right cameras reach 0.98 to 1.
     """
     report = Report()
-    dataset, workers = data.dataset, data.options.workers
+    dataset, workers = data.dataset, data.dataset.workers
     # With static cameras only one protocol is possible; the configured one matters in training only.
     targets = CAMERAS if dataset.static_cameras else data.targets
     inspections = dataset.inspections()
@@ -142,7 +142,7 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
             report.problems.append(str(error))
             continue
         report.problems += reader.problems
-        cache_mb = min(data.options.cache_images_mb, _CACHE_MB)
+        cache_mb = min(data.dataset.cache_images_mb, _CACHE_MB)
         found = _inspect_phase(phase, Photographs(reader, None, cache_mb), targets, min_iou, workers)
         found.seen = agreeing(found.seen, reader, min_agreement)
         report.phases[phase] = found

@@ -3,17 +3,16 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
-from ghgs_lit.config.settings import from_config, from_flat
 from ghgs_lit.data.augmentation import Augmentation
-from ghgs_lit.data.batches import BatchBuilder, BatchOptions, EvaluationBatches, StepSampler, TrainingBatches
-from ghgs_lit.data.dataset import DataSet
+from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
+from ghgs_lit.data.dataset import DataOptions
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
@@ -48,52 +47,46 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
 
 def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
     several = targets if isinstance(targets, Sequence) and not isinstance(targets, str) else (targets,)
-    return [from_config(TargetProtocol, "targets", protocol) for protocol in several]
+    return [TargetProtocol.read(protocol, "targets") for protocol in several]
 
 
 class PhotographsDataModule(LightningDataModule):
-    """Batches of a data set. A subclass names its ``dataset_type``, and nothing else.
+    """Batches of a data set.
 
     Args:
+        dataset: which photographs, and how they become batches.
         views: :class:`ViewProtocol` or its mapping.
         targets: :class:`TargetProtocol` or its mapping.
         seed: seed of all samples.
         augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
-        options: the fields of ``dataset_type`` and of :class:`BatchOptions`, in one flat mapping.
 
     Raises:
         InputError: an unknown key or an impossible value; when data is read, files that are missing or bad.
     """
 
-    dataset_type: ClassVar[type[DataSet]]
-
     def __init__(
         self,
+        dataset: DataOptions,
         views: ViewProtocol | Mapping[str, Any],
         targets: Targets,
         seed: int = 0,
         augmentation: Augmentation | Mapping[str, Any] | None = None,
-        **options: Any,
     ) -> None:
         super().__init__()
-        self.dataset: DataSet
-        self.options: BatchOptions
-        self.dataset, self.options = from_flat(
-            "data", type(self).__name__, options, self.dataset_type, BatchOptions
-        )
-        self.views = from_config(ViewProtocol, "views", views)
-        self.targets = from_config(TargetProtocol, "targets", targets)
-        self.augmentation = from_config(Augmentation, "augmentation", augmentation or {})
-        self.dataset.check_targets(self.targets)
+        self.dataset = dataset
+        self.views = ViewProtocol.read(views, "views")
+        self.targets = TargetProtocol.read(targets, "targets")
+        self.augmentation = Augmentation.read(augmentation or {}, "augmentation")
+        dataset.check_targets(self.targets)
         self.seed = seed
         #: Whether training reads depth maps; evaluation reads them all the same, for its depth error.
-        self.trains_on_depths = self.options.depths
+        self.trains_on_depths = True
         self._builders: dict[str, BatchBuilder] = {}
 
     @property
     def facts(self) -> dict[str, str]:
         """What readers of results must know about how the data was read."""
-        return {**self.dataset.facts, "resampling": self.options.resampling}
+        return {**self.dataset.facts, "resampling": self.dataset.resampling}
 
     def prepare_data(self, splits: Sequence[str] = PHASES) -> None:
         """Make what ``splits`` need and is missing."""
@@ -105,11 +98,11 @@ class PhotographsDataModule(LightningDataModule):
         """Builds batches of a split; made on first use."""
         choice("split", phase, self.dataset.split_names)
         if phase not in self._builders:
-            o, reader = self.options, self.dataset.reader(phase)
-            inputs = targets = Photographs(reader, o.size, o.cache_images_mb, o.resampling)
-            if o.target_size != o.size:
-                targets = Photographs(reader, o.target_size, o.cache_images_mb, o.resampling)
-            self._builders[phase] = BatchBuilder(inputs, targets, o.apply_mask, o.body_vertices, o.depths)
+            data, reader = self.dataset, self.dataset.reader(phase)
+            inputs = targets = Photographs(reader, data.size, data.cache_images_mb, data.resampling)
+            if data.target_size not in (None, data.size):
+                targets = Photographs(reader, data.target_size, data.cache_images_mb, data.resampling)
+            self._builders[phase] = BatchBuilder(inputs, targets)
         return self._builders[phase]
 
     def subjects(self, phase: str) -> dict[str, tuple[int, ...]]:
@@ -120,7 +113,7 @@ class PhotographsDataModule(LightningDataModule):
         """What training sees at each step (``targets`` None: this module's)."""
         targets = self._possible(targets or self.targets)
         return TrainingSampler(
-            self.subjects("train"), self.views, targets, self.dataset.ring, self.options.batch_size, self.seed
+            self.subjects("train"), self.views, targets, self.dataset.ring, self.dataset.batch_size, self.seed
         )
 
     def training_batch(self, step: int) -> Batch:
@@ -138,8 +131,8 @@ class PhotographsDataModule(LightningDataModule):
         sampler = self.training_sampler()
         world = self.trainer.world_size if self.trainer else 1
         rank = self.trainer.global_rank if self.trainer else 0
-        once = math.ceil(len(sampler.subjects) / (self.options.batch_size * world))
-        length = self.options.steps_per_epoch or once
+        once = math.ceil(len(sampler.subjects) / (self.dataset.batch_size * world))
+        length = self.dataset.steps_per_epoch or once
         batches = self._training_batches(sampler, length, rank, world)
         return self._loader(
             batches, sampler=StepSampler(batches, lambda: trained_batches(self.trainer, length))
@@ -163,7 +156,7 @@ class PhotographsDataModule(LightningDataModule):
         """
         protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
-        batches = EvaluationBatches(self.builder(split), specs, batch_size or self.options.batch_size)
+        batches = EvaluationBatches(self.builder(split), specs, batch_size or self.dataset.batch_size)
         return self._loader(batches)
 
     def evaluation_batch(
@@ -193,7 +186,7 @@ class PhotographsDataModule(LightningDataModule):
             [self._possible(protocol) for protocol in protocols],
             self.dataset.ring,
             self.seed,
-            self.options.evaluation_positions,
+            self.dataset.evaluation_positions,
         )
 
     def val_dataloader(self) -> DataLoader:
@@ -212,8 +205,8 @@ class PhotographsDataModule(LightningDataModule):
         return DataLoader(
             batches,
             batch_size=None,
-            num_workers=self.options.workers,
-            persistent_workers=self.options.workers > 0,
-            pin_memory=self.options.pin_memory and torch.cuda.is_available(),
+            num_workers=self.dataset.workers,
+            persistent_workers=self.dataset.workers > 0,
+            pin_memory=torch.cuda.is_available(),
             **options,
         )

@@ -1,44 +1,86 @@
-"""A data set as it is configured: where it lies and how it is read."""
+"""Data sets as they are configured: where they lie, how they are read and how photographs become batches."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from ghgs_lit.config.settings import set_fields
+from pydantic import BeforeValidator
+
+from ghgs_lit.config import options
+from ghgs_lit.config.options import Amount, Count, Index, Options, Size, Text, Workers
+from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.reader import PHASES, Reader
-from ghgs_lit.data.sampling import TargetProtocol
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
+from ghgs_lit.errors import InputError
+
+if TYPE_CHECKING:  # it imports Lightning, which takes seconds
+    from ghgs_lit.data.datamodule import PhotographsDataModule
 
 
-@dataclass(frozen=True, kw_only=True)
-class DataSet(ABC):
-    """What all data sets have in common. A subclass adds one field for each configuration key of its own.
+def _number(key: Any) -> Any:
+    """A key of a mapping as a number: the command line and JSON make texts of them."""
+    return int(key) if isinstance(key, str) and key.isdecimal() else key
 
-    Attributes:
-        name: name of the data set in results and messages.
-        root: folder of the data.
-        limit: number of subjects used of each phase, the first ones: ``{train: n, val: n}`` (null: all).
-        ring: number of positions on a full ring of cameras.
+
+class Limit(Options):
+    """Numbers of subjects."""
+
+    train: Count | None = None
+    """Subjects of training that are used, the first ones; null: all."""
+    val: Count | None = None
+    """Subjects of validation that are used, the first ones; null: all."""
+
+    def of(self, phase: str) -> int | None:
+        """The number of a phase; None: all."""
+        return getattr(self, phase, None)
+
+
+class DataOptions(Options):
+    """Everything that data sets have in common; each has a subclass with the keys of its own.
+
+    Class attributes:
         published: number of people of each phase in the publication, where there is one.
         static_cameras: whether there are no views between the cameras (their view number is always 0).
+        ring: number of positions on a full ring of cameras; inputs are evenly spaced among them.
     """
 
+    group = "data"
     published: ClassVar[Mapping[str, int]] = {}
     static_cameras: ClassVar[bool] = False
+    ring: ClassVar[int] = 16
 
-    name: str
-    root: str | None = None
-    limit: Mapping[str, int | None] = field(default_factory=dict)
-    ring: int = 16
+    name: Text
+    """Name of the data set in results and messages."""
+    size: Size
+    """Side or [height, width] of the inputs in pixels."""
+    target_size: Size | None = None
+    """Side or [height, width] of the targets in pixels; null: as size."""
+    resampling: Literal["area", "release"] = "area"
+    """area: means over exact areas, everything stays at its place. release: as the authors' code reads
+    (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
+    batch_size: Count = 1
+    """Samples of one step in each process."""
+    steps_per_epoch: Count | None = None
+    """Training steps of an epoch; null: one pass over the subjects."""
+    cache_images_mb: Amount = 512
+    """MiB of decoded photographs kept in memory by each process."""
+    evaluation_positions: dict[Annotated[int, BeforeValidator(_number)], tuple[Index, ...]] | None = None
+    """Input positions by number of views, such as {3: [0, 6, 11]}; null, or another number: evenly spaced."""
+    workers: Workers = 0
+    """Loading processes; 0: none."""
 
-    def __post_init__(self) -> None:
-        require(self.ring >= 2, "data.ring", "at least 2", self.ring)
-        for phase, count in (self.limit or {}).items():
-            choice("data.limit key", phase, PHASES)
-            require(count is None or count >= 1, f"data.limit.{phase}", "at least 1 or null", count)
-        set_fields(self, limit=dict.fromkeys(PHASES) | dict(self.limit or {}))
+    def build(
+        self,
+        views: ViewProtocol | Mapping[str, Any],
+        targets: TargetProtocol | Mapping[str, Any],
+        seed: int = 0,
+        augmentation: Augmentation | Mapping[str, Any] | None = None,
+    ) -> "PhotographsDataModule":
+        """Batches of the data set; arguments as for :class:`PhotographsDataModule`."""
+        from ghgs_lit.data.datamodule import PhotographsDataModule
+
+        return PhotographsDataModule(self, views, targets, seed, augmentation)
 
     @abstractmethod
     def reader(self, phase: str, strict: bool = True) -> Reader:
@@ -69,6 +111,18 @@ class DataSet(ABC):
         return
 
     @property
+    def folder(self) -> Path:
+        """The folder of the data, which a subclass names as ``root``.
+
+        Raises:
+            InputError: ``data.root`` is null or no folder.
+        """
+        folder = required_folder("data.root", "the folder of the data set", self.root)
+        if not folder.is_dir():
+            raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
+        return folder
+
+    @property
     def facts(self) -> dict[str, str]:
         """What readers of results must know about how the files are read."""
         return {"name": self.name}
@@ -77,17 +131,14 @@ class DataSet(ABC):
         """What they must know about a split."""
         return {"split": split}
 
-    @property
-    def folder(self) -> Path:
-        """The folder ``root``.
 
-        Raises:
-            InputError: ``root`` is null or no folder.
-        """
-        folder = required_folder("data.root", "the folder of the data set", self.root)
-        if not folder.is_dir():
-            raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
-        return folder
+class DataSet(DataOptions):
+    """A data set in a folder of the user's."""
+
+    root: options.Path | None = None
+    """Folder of the data."""
+    limit: Limit = Limit()
+    """Subjects used of each phase."""
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:

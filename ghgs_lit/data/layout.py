@@ -14,13 +14,12 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ghgs_lit.data.completeness import Completeness
-from ghgs_lit.data.dataset import DataSet
+from ghgs_lit.data.dataset import DataOptions
 from ghgs_lit.data.decoding import (
     check_extrinsics,
     check_intrinsics,
@@ -30,33 +29,19 @@ from ghgs_lit.data.decoding import (
 )
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
 _POSITION = re.compile(r"(.+)_(\d{3,})")
-_PIXEL_CENTERS = ("half", "integer", "auto")
+#: Folders of bodies; the first that exists is read.
+_BODY_MODELS = ("smpl", "smplx")
 
 #: From the name of a subject to its body vertices [n, 3], None where it has none.
 BodyReader = Callable[[str], np.ndarray | None]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rendered(DataSet):
-    """Data in the rendered layout at ``root``.
-
-    Attributes:
-        body_models: folders of bodies; the first that exists is read.
-        pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
-            package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
-    """
-
-    name: str = "rendered"
-    body_models: Sequence[str] = ("smpl", "smplx")
-    pixel_centers: str = "half"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        choice("data.pixel_centers", self.pixel_centers, _PIXEL_CENTERS)
+class Rendered(DataOptions):
+    """Data in the rendered layout. A subclass says ``root``, ``limit`` and ``pixel_centers``."""
 
     @property
     def facts(self) -> dict[str, str]:
@@ -77,8 +62,8 @@ class Rendered(DataSet):
         return None
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
-        names, limit, further = self.subject_names(phase), self.limit.get(phase), self.further_bodies()
-        return Layout(self.folder, phase, names, limit, self.pixel_centers, self.body_models, further, strict)
+        names, limit, further = self.subject_names(phase), self.limit.of(phase), self.further_bodies()
+        return Layout(self.folder, phase, names, limit, self.pixel_centers, further, strict)
 
 
 class Layout(Reader):
@@ -90,8 +75,9 @@ class Layout(Reader):
         names: the subjects to read (None: all that there are). Those that the folder of the phase lacks are
             read from the other one: a split may differ from the one that the folders were made for.
         limit: number of subjects, the first ones (None: all).
-        pixel_centers, body_models: as for :class:`Rendered`.
-        further_bodies: reads bodies that are in none of ``body_models``.
+        pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
+            package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
+        further_bodies: reads bodies that are not among the renders.
         strict: as for :class:`Reader`.
 
     Raises:
@@ -105,13 +91,12 @@ class Layout(Reader):
         names: Sequence[str] | None = None,
         limit: int | None = None,
         pixel_centers: str = "half",
-        body_models: Sequence[str] = ("smpl", "smplx"),
         further_bodies: BodyReader | None = None,
         strict: bool = True,
     ) -> None:
         super().__init__(strict)
         self.further_bodies = further_bodies
-        self.root, self.body_models = Path(root).expanduser(), tuple(body_models)
+        self.root = Path(root).expanduser()
         self._complete = Completeness(self.root)
         integer = pixel_centers == "auto" and not self._complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
@@ -123,23 +108,23 @@ class Layout(Reader):
         if not self.root.is_dir():
             raise InputError(f"{self.root}: expected the root of a rendered data set; found no such folder")
         phases = [phase] if names is None else [phase, *(p for p in PHASES if p != phase)]
-        found = {p: _positions(self.root / p / "img") for p in phases}
+        stored = {p: _positions(self.root / p / "img") for p in phases}
         images = self.root / phase / "img"
-        if not any(found.values()) and not images.is_dir():
+        if not any(stored.values()) and not images.is_dir():
             raise InputError(
                 f"{images}: expected a folder <id>_<position> for every camera; found no such folder"
             )
         if names is None:
             other = _positions(self.root / next(p for p in PHASES if p != phase) / "img")
-            for name in sorted(found[phase].keys() & other.keys()):
+            for name in sorted(stored[phase].keys() & other.keys()):
                 self.problem(f"{self.root}: expected each subject in train or in val; found {name!r} in both")
         planned = self._complete.plan.get(phase, [])
-        wanted = (sorted({*found[phase], *planned}) if names is None else list(names))[:limit]
-        homes = {name: next((p for p in phases if name in found[p]), phase) for name in wanted}
+        wanted = (sorted({*stored[phase], *planned}) if names is None else list(names))[:limit]
+        homes = {name: next((p for p in phases if name in stored[p]), phase) for name in wanted}
         missing = [
             name
             for name, home in homes.items()
-            if name not in found[home] or self._complete.missing(home, [name])
+            if name not in stored[home] or self._complete.missing(home, [name])
         ]
         if missing and self.strict:
             raise InputError(
@@ -151,7 +136,7 @@ class Layout(Reader):
         if not wanted:
             self.problem(f"{images}: expected folders <id>_<position>; found none")
         for name in (n for n in wanted if n not in missing):
-            self.subjects[name] = tuple(sorted(found[homes[name]][name]))
+            self.subjects[name] = tuple(sorted(stored[homes[name]][name]))
             self._folders[name] = self.root / homes[name]
 
     def place(self, name: str, position: int, view: int) -> str:
@@ -162,7 +147,7 @@ class Layout(Reader):
         return sorted(int(p.stem) for p in files if p.suffix in _IMAGE_SUFFIXES and p.stem.isdecimal())
 
     def read_body(self, name: str) -> np.ndarray | None:
-        for model in self.body_models:
+        for model in _BODY_MODELS:
             path = self._folders[name] / model / name / "vertices.npy"
             if path.exists():
                 return read_array(path, [(None, 3)]).astype(np.float32)
@@ -221,8 +206,8 @@ def _read_camera(folder: Path, view: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _positions(images: Path) -> dict[str, list[int]]:
     """Ring positions of each subject that ``images`` has folders of."""
-    found: dict[str, list[int]] = {}
+    positions: dict[str, list[int]] = {}
     for entry in images.iterdir() if images.is_dir() else ():
         if match := _POSITION.fullmatch(entry.name):
-            found.setdefault(match[1], []).append(int(match[2]))
-    return found
+            positions.setdefault(match[1], []).append(int(match[2]))
+    return positions

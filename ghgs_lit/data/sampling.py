@@ -9,11 +9,13 @@ index in the batch) alone, so that a run resumes exactly where it stopped, whate
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
-from ghgs_lit.config.settings import set_fields
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.config.options import Count, Index, Options, Text
+from ghgs_lit.errors import InputError, require
 
 VIEW_NUMBERS = (0, 1, 2, 3, 4)
 RING_VIEW, MIDDLE_VIEW = 0, 3
@@ -22,6 +24,8 @@ _ORDER, _COUNT, _SAMPLE = 0, 1, 2
 
 #: (ring position, view number)
 Photo = tuple[int, int]
+ViewNumber = Literal[0, 1, 2, 3, 4]
+Several = Annotated[int, Field(ge=2)]
 
 
 def subject_rng(seed: int, name: str) -> np.random.Generator:
@@ -50,29 +54,20 @@ def ring_photos(positions: Sequence[int]) -> tuple[Photo, ...]:
     return tuple((position, RING_VIEW) for position in positions)
 
 
-@dataclass(frozen=True)
-class ViewProtocol:
-    """How input views are chosen.
+class ViewProtocol(Options):
+    """How input views are chosen."""
 
-    Attributes:
-        name: name of the protocol in results.
-        training_counts: numbers of views; one of them is drawn for each training step.
-        evaluation_count: number of views in evaluation.
-        training: ``any`` (ring cameras in random order), ``even`` (evenly spaced from a random start) or
-            ``uneven`` (evenly spaced, then each moved by up to one position, as captures are).
-    """
+    group = "views"
 
-    name: str
-    training_counts: tuple[int, ...]
-    evaluation_count: int
-    training: str = "any"
-
-    def __post_init__(self) -> None:
-        set_fields(self, training_counts=tuple(self.training_counts))
-        valid = len(self.training_counts) > 0 and min(self.training_counts) >= 2
-        require(valid, "views.training_counts", "counts of at least 2", list(self.training_counts))
-        require(self.evaluation_count >= 2, "views.evaluation_count", "at least 2", self.evaluation_count)
-        choice("views.training", self.training, ("any", "even", "uneven"))
+    name: Text
+    """Name of the protocol in results."""
+    training_counts: tuple[Several, ...] = Field((3, 4, 5), min_length=1)
+    """Numbers of input views; one of them is drawn for each training step."""
+    evaluation_count: Several = 4
+    """Number of input views in evaluation."""
+    training: Literal["any", "even", "uneven"] = "any"
+    """any: ring cameras in random order. even: evenly spaced from a random start. uneven: evenly spaced, then
+    each moved by up to one position, as captures are."""
 
     def draw(self, available: Sequence[int], count: int, ring: int, rng: np.random.Generator) -> list[int]:
         """Positions of the ``count`` inputs of a training sample."""
@@ -95,45 +90,41 @@ def middle(first: int, second: int, ring: int) -> Photo:
     return doubled // 2 % ring, MIDDLE_VIEW if doubled % 2 else RING_VIEW
 
 
-@dataclass(frozen=True)
-class TargetProtocol:
-    """How target views are chosen.
+class TargetProtocol(Options):
+    """How target views are chosen."""
 
-    Attributes:
-        name: name of the protocol in results.
-        kind: which targets evaluation measures (null: the value of ``name``): ``release``, view ``view`` at
-            an input's position (3: 11.25 degrees from the input); ``midway``, half-way between an input and
-            the next; ``random``, any of ``training_views`` at any position, fixed by the seed; ``cameras``,
-            view ``view`` at those of ``positions`` that are not inputs.
-        view: number of the view that ``release`` and ``cameras`` take.
-        positions: positions that ``cameras`` takes (null: all).
-        per_subject: number of targets in evaluation, the first ones; ``all``: one beside every input, or
-            every camera.
-        training_views: numbers of the views that training draws from, at any position.
-        per_step: number of targets that training draws for each sample.
-    """
+    group = "targets"
 
-    name: str
-    kind: str | None = None
-    view: int = MIDDLE_VIEW
-    positions: tuple[int, ...] | None = None
-    per_subject: int | str = 1
-    training_views: tuple[int, ...] = (0, 2, 3, 4)
-    per_step: int = 1
+    kind: Literal["release", "midway", "random", "cameras"]
+    """Targets of evaluation. release: view ``view`` at an input's position. midway: half-way between an input
+    and the next. random: any of training_views at any position, fixed by the seed. cameras: view ``view`` at
+    those of ``positions`` that are not inputs. Null: the value of ``name``."""
+    name: Text
+    """Name of the protocol in results."""
+    view: ViewNumber = MIDDLE_VIEW
+    """View that release and cameras take at a position: 0 the ring camera, 3 the middle to the next (release:
+    11.25 degrees from the input)."""
+    positions: tuple[Index, ...] | None = None
+    """Positions that cameras takes; null: all."""
+    per_subject: Count | Literal["all"] = 1
+    """Targets of each subject in evaluation, the first ones; all: one beside every input, or every camera."""
+    training_views: tuple[ViewNumber, ...] = Field((0, 2, 3, 4), min_length=1)
+    """Numbers of the views that training draws from, at any position."""
+    per_step: Count = 1
+    """Targets that training draws for each sample."""
 
-    def __post_init__(self) -> None:
-        set_fields(self, kind=self.kind or self.name, training_views=tuple(self.training_views))
-        choice("targets.kind", self.kind, ("release", "midway", "random", "cameras"))
-        if self.positions is not None:
-            set_fields(self, positions=tuple(self.positions))
-            cameras = self.kind == "cameras"
-            require(cameras, "targets.positions", "null unless targets.kind=cameras", self.positions)
-        choice("targets.view", self.view, VIEW_NUMBERS)
-        known = len(self.training_views) > 0 and set(self.training_views) <= set(VIEW_NUMBERS)
-        require(known, "targets.training_views", f"some of {list(VIEW_NUMBERS)}", list(self.training_views))
-        require(self.per_step >= 1, "targets.per_step", "at least 1", self.per_step)
-        many = self.per_subject == "all" or (isinstance(self.per_subject, int) and self.per_subject >= 1)
-        require(many, "targets.per_subject", "a number of at least 1 or all", self.per_subject)
+    @model_validator(mode="before")
+    @classmethod
+    def _kind_is_name(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("kind") is None:
+            return {**values, "kind": values.get("name")}
+        return values
+
+    @model_validator(mode="after")
+    def _check(self) -> "TargetProtocol":
+        possible = self.positions is None or self.kind == "cameras"
+        self.require(possible, "positions", "null unless targets.kind=cameras")
+        return self
 
     @property
     def view_numbers(self) -> set[int]:
@@ -188,7 +179,7 @@ class TargetProtocol:
 
 
 #: Every camera that is not an input: for rigs with static cameras.
-CAMERAS = TargetProtocol("cameras", view=RING_VIEW, per_subject="all", training_views=(RING_VIEW,))
+CAMERAS = TargetProtocol(name="cameras", view=RING_VIEW, per_subject="all", training_views=(RING_VIEW,))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ghgs_lit.data.reader import PHASES
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 
 _SPLIT_FILES = ("splits.json", "split_train.txt")
 
@@ -23,16 +23,16 @@ def split_names(
         source: folder of the scans.
         names: ids of the scans.
         split: as for :func:`read_split` (None: the split files in ``source``, if there are any).
-        val_fraction: fraction of ``names`` that is ``val`` where nothing else decides.
+        val_fraction: fraction of ``names`` that is ``val`` where nothing else decides, 0 to 1; above 0 at
+            least one of them.
         seed: of the division by fraction.
 
     Raises:
         InputError: the split is missing or malformed, names scans that do not exist, or overlaps.
     """
     if split is None and not any((source / name).exists() for name in _SPLIT_FILES):
-        require(0 <= val_fraction < 1, "data.val_fraction", "at least 0 and below 1", val_fraction)
         order = np.random.default_rng(seed).permutation(len(names))
-        count = round(val_fraction * len(names))
+        count = max(round(val_fraction * len(names)), val_fraction > 0)
         return {
             "train": [names[i] for i in sorted(order[count:])],
             "val": [names[i] for i in sorted(order[:count])],

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from ghgs_lit.config import build
-from ghgs_lit.config.settings import from_config
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.sampling import TargetProtocol
 from ghgs_lit.errors import choice, require
@@ -29,8 +28,7 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
     views = evaluation["views"]
     require(len(set(views)) == len(views), "evaluation.views", "different numbers from 2 on", views)
     protocols = {
-        name: from_config(TargetProtocol, "targets", values)
-        for name, values in target_protocols(config).items()
+        name: TargetProtocol.read(values, "targets") for name, values in target_protocols(config).items()
     }
     build(config["metrics"], "metrics")
     split = evaluation["split"]

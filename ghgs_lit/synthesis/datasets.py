@@ -5,82 +5,107 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
-from ghgs_lit.config.settings import from_config, set_fields
-from ghgs_lit.data.dataset import required_folder
+from pydantic import Field
+
+from ghgs_lit.config import options
+from ghgs_lit.config.options import Index, Options, Seed, Share, Size, Text, Workers
+from ghgs_lit.data.dataset import DataSet, Limit, required_folder
 from ghgs_lit.data.layout import Rendered
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
-from ghgs_lit.data.splits import Split, split_names
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.data.splits import read_split, split_names
+from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import bench, people
 from ghgs_lit.synthesis.jobs import (
     ACTIVE,
-    RenderSettings,
-    Source,
+    PersonSource,
+    RenderOptions,
     SyntheticSource,
+    everything,
     identity,
     render_people,
 )
-from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.synthesis.rig import Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
 
+# Of heights, yaws, lights and of the split by fraction of scans.
+_SEED = 0
 
-@dataclass(frozen=True, kw_only=True)
+
 class _Renderable(Rendered):
-    """A data set that this package can render; its ring of cameras is the rig's.
+    """A data set that this package can render; its ring of cameras is the rig's."""
 
-    Attributes:
-        rig, render: settings or their mappings.
-        render_workers: number of rendering processes (null: one for each core; 0: no further process).
-    """
+    ring: ClassVar[int] = Rig.positions
 
-    ring: int = field(init=False, default=16)
-    rig: Rig = field(default_factory=Rig)
-    render: RenderSettings = field(default_factory=RenderSettings)
-    render_workers: int | None = None
+    rig: RigOptions = RigOptions()
+    """The ring of cameras around each subject."""
+    render: RenderOptions = RenderOptions()
+    """What is rendered of each person."""
+    render_workers: Workers | None = None
+    """Rendering processes; null: one for each core; 0: no further process."""
 
-    def __post_init__(self) -> None:
-        rig = from_config(Rig, "data.rig", self.rig or {})
-        render = from_config(RenderSettings, "data.render", self.render or {})
-        set_fields(self, rig=rig, render=render, ring=rig.positions)
-        super().__post_init__()
+    def render_into(
+        self, root: Path, names: Mapping[str, Sequence[str]], source: PersonSource, seed: int
+    ) -> int:
+        """Render the people of each phase that ``root`` lacks; returns their number."""
+        return render_people(root, names, source, self.rig.build(), self.render, seed, self.render_workers)
 
 
-@dataclass(frozen=True, kw_only=True)
+#: Index of the first validation person: training people never reach it.
+FIRST_VAL = 1_000_000
+
+
+class People(Options):
+    """Numbers of people; larger ones extend the same cache."""
+
+    group = "data.people"
+
+    train: int = Field(64, ge=1, lt=FIRST_VAL)
+    """People of training."""
+    val: int = Field(8, ge=1, lt=FIRST_VAL)
+    """People of validation."""
+
+
+class ActivePeople(Options):
+    """Numbers of further people, in poses of sport and dance; larger ones extend the same cache."""
+
+    group = "data.active"
+
+    train: int = Field(0, ge=0, lt=FIRST_VAL)
+    """People of training."""
+    val: int = Field(0, ge=0, lt=FIRST_VAL)
+    """People of validation."""
+
+
 class Synthetic(_Renderable):
-    """Generated people, rendered on first use and kept in a cache folder named after all their settings.
+    """Generated people, rendered on first use and kept in a cache folder named after all their settings."""
 
-    Attributes:
-        people: number of people, ``{train: n, val: n}``; a larger number extends the same cache.
-        active: number of further people, in poses of sport and dance, likewise.
-        people_seed: seed of the people.
-        cache_dir: folder of the caches (null: ``$GHGS_CACHE`` or ``~/.cache/ghgs_lit``).
-    """
+    limit: ClassVar[Limit] = Limit()
+    pixel_centers: ClassVar[str] = "half"
 
-    # Index of the first validation person: training people never reach it.
-    FIRST_VAL: ClassVar[int] = 1_000_000
+    name: Text = "synthetic"
+    size: Size = (140, 140)
+    rig: RigOptions = RigOptions(height=None)
+    render: RenderOptions = RenderOptions(size=140)
+    people: People = People()
+    """Number of people."""
+    active: ActivePeople = ActivePeople()
+    """Number of further people, in poses of sport and dance."""
+    people_seed: Seed = 0
+    """Seed of the people."""
+    cache_dir: options.Path | None = None
+    """Folder of the caches; null: $GHGS_CACHE or ~/.cache/ghgs_lit."""
 
-    root: str = field(init=False, default="")
-    people: Mapping[str, int]
-    active: Mapping[str, int] = field(default_factory=dict)
-    people_seed: int = 0
-    cache_dir: str | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for phase in PHASES:
-            count = self.people.get(phase, 0)
-            require(0 < count < self.FIRST_VAL, f"data.people.{phase}", "at least 1", count)
-            count = self.active.get(phase, 0)
-            require(0 <= count < self.FIRST_VAL, f"data.active.{phase}", "at least 0", count)
-        settings = {**identity(self.rig, self.render, self.people_seed), "people": people_version()}
-        key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+    @property
+    def root(self) -> str:
+        """The cache's folder, which is named after everything that the photographs depend on."""
+        made_with = identity(self.rig.build(), self.render, self.people_seed) | {"people": people_version()}
+        key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
-        set_fields(self, root=str(Path(cache).expanduser() / f"synthetic-{key}"))
+        return str(Path(cache).expanduser() / f"synthetic-{key}")
 
     @property
     def split_names(self) -> tuple[str, ...]:
@@ -92,8 +117,8 @@ class Synthetic(_Renderable):
     def subject_names(self, phase: str) -> list[str]:
         if phase == bench.SPLIT:
             return bench.names()
-        first = 0 if phase == "train" else self.FIRST_VAL
-        numbers = (("p", self.people[phase]), (ACTIVE, self.active.get(phase, 0)))
+        first = 0 if phase == "train" else FIRST_VAL
+        numbers = (("p", getattr(self.people, phase)), (ACTIVE, getattr(self.active, phase)))
         return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
@@ -103,10 +128,10 @@ class Synthetic(_Renderable):
             InputError: the people of ``bench`` are not those of its definition (:mod:`.bench`).
         """
         if bench.SPLIT in splits:
-            bench.check_settings(asdict(self))
+            made_with = everything(self.rig.build(), self.render)
+            bench.check_settings({"people_seed": self.people_seed, **made_with})
         names = {phase: self.subject_names(phase) for phase in splits}
-        source, seed = SyntheticSource(self.people_seed), self.people_seed
-        render_people(Path(self.root), names, source, self.rig, self.render, seed, self.render_workers)
+        self.render_into(Path(self.root), names, SyntheticSource(self.people_seed), self.people_seed)
         if bench.SPLIT in splits:
             bench.check_photographs(self.reader(bench.SPLIT))
 
@@ -119,36 +144,49 @@ class Synthetic(_Renderable):
             )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scans(_Renderable):
-    """Scans in the rendered layout at ``root``; :meth:`render_missing` renders them from ``source``.
+class Scans(DataSet, _Renderable):
+    """Scans in the rendered layout at ``root``; :meth:`render_missing` renders them from ``source``."""
 
-    Attributes:
-        source: folder of textured meshes (:class:`ScanSource`); only for rendering.
-        split, val_fraction: which scans are train and val (:func:`split_names`).
-        render_seed: seed of heights, yaws, lights and of the split by fraction.
-    """
+    name: Text = "scans"
+    size: Size = (140, 140)
+    source: options.Path | None = None
+    """Folder of textured meshes, <id>/<id>.obj or .glb; only for rendering."""
+    split: options.Path | dict[str, tuple[Text | Index, ...] | None] | None = None
+    """Which subjects are train and val: a JSON file, a folder with split_train.txt and split_val.txt, or
+    {train: [0000-0425], val: [0426-0525]}. Null: the folders train and val of root; when rendering, the split
+    files in source, else a fraction."""
+    val_fraction: Share = 0.1
+    """Fraction of the scans that is val where no split decides, at least one of them."""
+    pixel_centers: Literal["half", "integer", "auto"] = "half"
+    """Pixel centres of the files. half: rendered by this package; integer: by the published scripts; auto:
+    whichever it was."""
 
-    source: str | None = None
-    split: Split | None = None
-    val_fraction: float = 0.1
-    render_seed: int = 0
+    def subject_names(self, phase: str) -> list[str] | None:
+        if self.split is None:
+            return None
+        images = [self.folder / p / "img" for p in PHASES]
+        there = {e.name.rpartition("_")[0] for folder in images if folder.is_dir() for e in folder.iterdir()}
+        return read_split(self.split, sorted(there))[phase]
 
     @property
     def source_folder(self) -> Path:
+        """The folder of the scans.
+
+        Raises:
+            InputError: ``source`` is null.
+        """
         return required_folder("data.source", "a folder of scans", self.source)
 
-    def scans(self) -> Source:
+    def scans(self) -> PersonSource:
         """Where the scans come from."""
         return ScanSource(self.source_folder)
 
     def render_missing(self) -> int:
         """Render the scans of the split (up to ``limit``) that ``root`` lacks; returns their number."""
-        source, seed = self.scans(), self.render_seed
-        root = required_folder("data.root", "a folder", self.root)
-        names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, seed)
-        names = {phase: listed[: self.limit[phase]] for phase, listed in names.items()}
-        return render_people(root, names, source, self.rig, self.render, seed, self.render_workers)
+        source, root = self.scans(), required_folder("data.root", "a folder", self.root)
+        names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)
+        names = {phase: listed[: self.limit.of(phase)] for phase, listed in names.items()}
+        return self.render_into(root, names, source, _SEED)
 
 
 @functools.cache

@@ -14,34 +14,37 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
+from pydantic import Field
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from ghgs_lit.config.settings import from_config, image_size, set_fields
+from ghgs_lit.config.options import Index, Options, Size
 from ghgs_lit.data.layout import position_name
-from ghgs_lit.data.sampling import VIEW_NUMBERS, subject_rng
+from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.progress import Progress
-from ghgs_lit.synthesis.rig import Rig, Variation
+from ghgs_lit.synthesis.rig import STILL, Rig
 from ghgs_lit.synthesis.writing import write_body, write_view
 
 _GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: increase it when photographs of the same settings would change.
 RENDER_VERSION = 2
+#: Of all people.
+LIGHTS = Lights()
 
 
-class Source(Protocol):
+class PersonSource(Protocol):
     """Where people come from; must survive pickling."""
 
     def load(self, name: str) -> Person: ...
@@ -67,57 +70,46 @@ class SyntheticSource:
         return 0.0
 
 
-@dataclass(frozen=True)
-class RenderSettings:
-    """What is rendered of each person.
+class RenderOptions(Options):
+    """What is rendered of each person."""
 
-    Attributes:
-        size: side or (height, width) in pixels.
-        samples: each pixel is the mean of ``samples`` x ``samples`` rays.
-        positions: positions of the ring that are rendered (null: all).
-        views: numbers of the views at each position (:mod:`ghgs_lit.synthesis.rig`); targets need 0, 2, 3 and
-            4, stereo methods need 1.
-        quality: of the JPEG files, 1 to 100.
-        lights: settings of the lights or their mapping.
-    """
+    group = "data.render"
 
-    size: int | tuple[int, int] = 512
-    samples: int = 3
-    positions: tuple[int, ...] | None = None
-    views: tuple[int, ...] = (0, 2, 3, 4)
-    quality: int = 98
-    lights: Lights = field(default_factory=Lights)
-
-    def __post_init__(self) -> None:
-        require(1 <= self.samples <= 16, "data.render.samples", "between 1 and 16", self.samples)
-        require(1 <= self.quality <= 100, "data.render.quality", "between 1 and 100", self.quality)
-        known = len(self.views) > 0 and set(self.views) <= set(VIEW_NUMBERS)
-        require(known, "data.render.views", f"some of {list(VIEW_NUMBERS)}", list(self.views))
-        set_fields(
-            self,
-            size=image_size("data.render.size", self.size),
-            lights=from_config(Lights, "data.render.lights", self.lights),
-            views=tuple(self.views),
-            positions=None if self.positions is None else tuple(self.positions),
-        )
+    size: Size = (512, 512)
+    """Side or [height, width] of the photographs in pixels."""
+    samples: int = Field(3, ge=1, le=16)
+    """Each pixel is the mean of samples x samples rays."""
+    positions: tuple[Index, ...] | None = None
+    """Ring positions to render; null: all."""
+    views: tuple[ViewNumber, ...] = Field((RING_VIEW, 2, 3, 4), min_length=1)
+    """Views at each position: 0 the ring camera, 1 the next, 3 the middle, 2 and 4 random between.
+    Targets need 0, 2, 3 and 4, stereo methods need 1."""
+    quality: int = Field(98, ge=1, le=100)
+    """Of the JPEG files."""
 
 
 @dataclass(frozen=True)
 class _Job:
-    source: Source
+    source: PersonSource
     rig: Rig
-    settings: RenderSettings
+    settings: RenderOptions
     seed: int
     phase: str
     name: str
     workspace: Path
 
 
-def identity(rig: Rig, settings: RenderSettings, seed: int) -> dict:
-    """Everything that photographs of a given person depend on, as plain data."""
-    render = asdict(settings)
+def everything(rig: Rig, settings: RenderOptions) -> dict:
+    """All that photographs of a given person depend on beside the seed, as plain data."""
+    cameras = {**asdict(rig), "variation": rig.variation.model_dump()}
+    return {"rig": cameras, "render": {**settings.model_dump(), "lights": asdict(LIGHTS)}}
+
+
+def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
+    """The same with the seed, as it names caches and is noted in data sets."""
+    cameras, render = everything(rig, settings).values()
     render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
-    cameras, still = asdict(rig), asdict(Variation())
+    still = STILL.model_dump()
     # The name of a cache does not depend on what does not vary.
     varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
     if varied:
@@ -129,7 +121,7 @@ def render_subject(job: _Job) -> _Job:
     """Render one subject into its workspace."""
     rng = subject_rng(job.seed, job.name)
     person = job.rig.place(job.source.load(job.name), rng)
-    yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), job.settings.lights.draw(rng)
+    yaws, lights = job.rig.yaws(rng) + job.source.facing(job.name), LIGHTS.draw(rng)
     height, width = job.settings.size
     # Random numbers of their own: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
@@ -159,9 +151,9 @@ def render_subject(job: _Job) -> _Job:
 def render_people(
     root: Path,
     names: Mapping[str, Sequence[str]],
-    source: Source,
+    source: PersonSource,
     rig: Rig,
-    settings: RenderSettings,
+    settings: RenderOptions,
     seed: int,
     workers: int | None = None,
 ) -> int:
@@ -185,7 +177,6 @@ def render_people(
         InputError: ``root`` holds something else, a person is bad, or the script has no main guard.
     """
     _check_main_guard()
-    require(workers is None or workers >= 0, "data.render_workers", "at least 0 or null", workers)
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)

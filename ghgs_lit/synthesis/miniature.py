@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ghgs_lit.data.dataset import DataSet, required_folder
 from ghgs_lit.data.humman.dataset import HuMMan
+from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_text_atomically
@@ -90,8 +91,8 @@ def _check_own(folder: Path) -> None:
 
 def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     chosen = []
-    for phase, splits in dataset.splits.items():
-        chosen += [s for split in splits for s in split.sequences][: people[phase]]
+    for phase in PHASES:
+        chosen += [s for some in dataset.split.of(phase) for s in some.sequences][: people[phase]]
     root = _root(dataset)
     with _writing(root):
         return zju_mocap.make(root, chosen, size, seed)
@@ -100,7 +101,7 @@ def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: in
 def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     root = _root(dataset)
     with _writing(root, humman.body_models(root)):
-        return humman.make(root, dataset.split["val"], people, size, seed)
+        return humman.make(root, dataset.split.val, people, size, seed)
 
 
 def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:

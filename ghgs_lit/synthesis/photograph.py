@@ -54,13 +54,6 @@ class Lights:
     elevation: float = 30.0
     jitter: float = 0.25
 
-    def __post_init__(self) -> None:
-        require(self.count >= 1, "lights.count", "at least 1", self.count)
-        require(0 <= self.ambient <= 1, "lights.ambient", "between 0 and 1", self.ambient)
-        require(0 <= self.softness <= 1, "lights.softness", "between 0 and 1", self.softness)
-        require(self.exposure > 0, "lights.exposure", "more than 0", self.exposure)
-        require(0 <= self.jitter < 1, "lights.jitter", "at least 0 and below 1", self.jitter)
-
     def draw(self, rng: np.random.Generator) -> "LightRig":
         """Draw the lights of one person: evenly spaced in azimuth, with random elevations and strengths."""
         azimuth = 2 * np.pi * (np.arange(self.count) + rng.uniform()) / self.count
@@ -246,9 +239,9 @@ class Studio:
         for _ in range(_MAX_LAYERS):
             rays = directions[active]
             hits = self._scene.run(origin + start[:, None] * rays, rays, output=True)
-            found = np.flatnonzero(hits["primID"] >= 0)
-            active, reached = active[found], start[found] + hits["tfar"][found]
-            u, v, triangle = hits["u"][found], hits["v"][found], hits["primID"][found]
+            hit = np.flatnonzero(hits["primID"] >= 0)
+            active, reached = active[hit], start[hit] + hits["tfar"][hit]
+            u, v, triangle = hits["u"][hit], hits["v"][hit], hits["primID"][hit]
             corners = np.stack((1 - u - v, u, v), -1)
             solid = self._solid(triangle, corners)
             done = active[solid]

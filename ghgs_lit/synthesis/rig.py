@@ -7,12 +7,14 @@ A :class:`Variation` gives each subject a ring of its own and moves single camer
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field, model_validator
 
-from ghgs_lit.config.settings import from_config, set_fields
+from ghgs_lit.config.options import Amount, Options, Positive
 from ghgs_lit.errors import require
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.types import Cameras
@@ -20,44 +22,57 @@ from ghgs_lit.types import Cameras
 # Share of the image's sides that a varied rig leaves free around a subject.
 _MARGIN = 0.01
 
+Pitch = Annotated[float, Field(gt=-89, lt=89)]
+Tilt = Annotated[float, Field(ge=0, lt=45)]
+Fill = Annotated[float, Field(gt=0, lt=1)]
 
-@dataclass(frozen=True)
-class Variation:
-    """How rigs differ between subjects and single cameras from their ring; None and 0: not at all.
 
-    Attributes:
-        radius: least and greatest radius of a subject's ring, metres.
-        pitch: least and greatest pitch of a subject's ring, degrees. The cameras look at ``look_at``: a ring
-            that looks down stands higher.
-        fill: least and greatest share of the image's height that a subject takes up in the camera that sees
-            it tallest; it decides the focal length. A subject that would not fit into every image of the ring
-            takes up less.
-        camera_pitch, camera_roll: greatest deviation of single cameras, degrees.
-        camera_look_at: greatest shift of single cameras, with the point that they look at, along each axis,
-            metres.
-        between_pitch: greatest deviation of the views between ring cameras (2, 3 and 4), which only targets
-            take, degrees: subjects are also seen from higher and from lower than by any input.
-    """
+class Variation(Options):
+    """How rigs differ between subjects and single cameras from their ring; null and 0: not at all."""
 
-    radius: tuple[float, float] | None = None
-    pitch: tuple[float, float] | None = None
-    fill: tuple[float, float] | None = None
-    camera_pitch: float = 0.0
-    camera_roll: float = 0.0
-    camera_look_at: float = 0.0
-    between_pitch: float = 0.0
+    group = "data.rig.variation"
 
-    def __post_init__(self) -> None:
-        for name, low, high in (("radius", 0, np.inf), ("pitch", -89, 89), ("fill", 0, 1)):
-            limits = getattr(self, name)
-            if limits is not None:
-                ordered = len(limits) == 2 and low < limits[0] <= limits[1] < high
-                expected = f"[least, greatest] between {low} and {high}"
-                require(ordered, f"data.rig.variation.{name}", expected, list(limits))
-                set_fields(self, **{name: tuple(limits)})
-        for name in ("camera_pitch", "camera_roll", "camera_look_at", "between_pitch"):
-            value = getattr(self, name)
-            require(value >= 0, f"data.rig.variation.{name}", "at least 0", value)
+    radius: tuple[Positive, Positive] | None = None
+    """[least, greatest] radius of a subject's ring, metres."""
+    pitch: tuple[Pitch, Pitch] | None = None
+    """[least, greatest] pitch of a subject's ring, degrees; a ring that looks down stands higher."""
+    fill: tuple[Fill, Fill] | None = None
+    """[least, greatest] share of the image's height that a subject takes up in the camera that sees it
+    tallest: decides the focal length. Less where it would not fit into every image of the ring."""
+    camera_pitch: Tilt = 0.0
+    """Degrees: greatest deviation of single cameras."""
+    camera_roll: float = Field(0.0, ge=0, le=180)
+    """Degrees: greatest roll of single cameras."""
+    camera_look_at: Amount = 0.0
+    """Metres: greatest shift of single cameras and of what they look at, along each axis."""
+    between_pitch: Tilt = 0.0
+    """Degrees: greatest deviation of the views between ring cameras (2, 3 and 4), which only targets take:
+    subjects are also seen from higher and from lower than by any input."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Variation":
+        for name in ("radius", "pitch", "fill"):
+            low, high = getattr(self, name) or (0, 0)
+            self.require(low <= high, name, "[least, greatest]")
+        return self
+
+
+#: A rig that is the same for all.
+STILL = Variation()
+
+
+class RigOptions(Options):
+    """What can be changed of the ring of cameras that THuman2.0 is rendered with by the published scripts."""
+
+    group = "data.rig"
+
+    height: Positive | None = 1.80
+    """Metres that subjects are scaled to, give or take 0.05; null: they keep their own height."""
+    variation: Variation = Variation()
+    """Of the rig, between subjects and between single cameras."""
+
+    def build(self) -> "Rig":
+        return Rig(height=self.height, variation=self.variation)
 
 
 @dataclass(frozen=True)
@@ -79,7 +94,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Rig:
-    """A ring of cameras.
+    """A ring of cameras; the numbers are those of the published scripts.
 
     Attributes:
         positions: number of cameras.
@@ -91,7 +106,7 @@ class Rig:
         yaw_jitter: the ring of each subject is turned by up to this angle, degrees.
         height: height that subjects are scaled to, metres (null: they keep their own).
         height_jitter: greatest deviation from ``height``, metres.
-        variation: :class:`Variation` or its mapping; :meth:`drawn` applies it.
+        variation: :meth:`drawn` applies it.
     """
 
     positions: int = 16
@@ -103,17 +118,7 @@ class Rig:
     yaw_jitter: float = 11.0
     height: float | None = 1.80
     height_jitter: float = 0.05
-    variation: Variation = field(default_factory=Variation)
-
-    def __post_init__(self) -> None:
-        require(self.positions >= 2, "rig.positions", "at least 2", self.positions)
-        require(self.radius > 0, "rig.radius", "more than 0", self.radius)
-        require(len(self.look_at) == 3, "rig.look_at", "three coordinates", self.look_at)
-        require(-89 < self.pitch < 89, "rig.pitch", "between -89 and 89 degrees", self.pitch)
-        require(self.focal > 0, "rig.focal", "more than 0", self.focal)
-        require(self.height is None or self.height > 0, "rig.height", "more than 0 or null", self.height)
-        variation = from_config(Variation, "data.rig.variation", self.variation)
-        set_fields(self, look_at=tuple(self.look_at), variation=variation)
+    variation: Variation = STILL
 
     def yaws(self, rng: np.random.Generator) -> np.ndarray:
         """Yaws [positions, 5] in degrees of all views of one subject."""
@@ -175,7 +180,7 @@ class Rig:
         pitch = v.camera_pitch * pitch + v.between_pitch * higher
         poses = Poses(pitch, v.camera_roll * roll, v.camera_look_at * shift)
         radius, ring_pitch = _within(v.radius, share[0], self.radius), _within(v.pitch, share[1], self.pitch)
-        rig = replace(self, radius=radius, pitch=ring_pitch, variation=Variation())
+        rig = replace(self, radius=radius, pitch=ring_pitch, variation=STILL)
         if v.fill is None:
             return rig, poses
         low, high = rig._extents(person, yaws, poses)

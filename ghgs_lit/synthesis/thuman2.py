@@ -5,48 +5,40 @@ release render is read as it is. GHG keeps its bodies beside the scans (``<sourc
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
+from ghgs_lit.config import options
+from ghgs_lit.config.options import Share, Size, Text, Workers
 from ghgs_lit.data.layout import BodyReader
-from ghgs_lit.data.reader import PHASES
-from ghgs_lit.data.splits import read_split
 from ghgs_lit.synthesis.datasets import Scans
+from ghgs_lit.synthesis.jobs import RenderOptions
 from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body
 
 
-@dataclass(frozen=True, kw_only=True)
 class THuman2(Scans):
-    """THuman2.0, raw and rendered.
-
-    ``split`` (:func:`read_split`) also selects among the renders at ``root``; null: its folders ``train`` and
-    ``val``.
-
-    Attributes:
-        fits: folder of the SMPL-X fits (null: found by its usual names in or beside ``source``).
-        body_model: folder of the licensed SMPL-X model (null: the fits' own meshes are read).
-    """
+    """THuman2.0, raw and rendered."""
 
     published: ClassVar[Mapping[str, int]] = {"train": 426, "val": 100}
 
-    fits: str | None = None
-    body_model: str | None = None
+    name: Text = "thuman2"
+    size: Size = (512, 512)
+    workers: Workers = 8
+    render: RenderOptions = RenderOptions(size=1024, samples=2, views=(0, 1, 2, 3, 4), quality=95)
+    val_fraction: Share = 0.19
+    pixel_centers: Literal["half", "integer", "auto"] = "auto"
+    fits: options.Path | None = None
+    """Folder with <id>/smplx_param.pkl, mesh_smplx.obj; null: by its usual names in or beside source."""
+    body_model: options.Path | None = None
+    """Folder of the licensed SMPL-X model; null: the fits' mesh_smplx.obj."""
 
     def scans(self) -> THuman2Source:
         folder = self.source_folder
         model = Path(self.body_model).expanduser() if self.body_model else None
         return THuman2Source(folder, find_fits(folder, self.fits), model)
-
-    def subject_names(self, phase: str) -> list[str] | None:
-        if self.split is None:
-            return None
-        images = [self.folder / p / "img" for p in PHASES]
-        there = {e.name.rpartition("_")[0] for folder in images if folder.is_dir() for e in folder.iterdir()}
-        return read_split(self.split, sorted(there))[phase]
 
     def further_bodies(self) -> BodyReader | None:
         return None if self.source is None else partial(_body_beside_scan, self.scans())

@@ -31,7 +31,7 @@ def test_data_without_training_people_can_be_made_and_evaluated(monkeypatch, cap
     assert [phase["subjects"] for phase in content["phases"].values()] == [2]
     assert content["notes"][0].startswith("train: expected subjects to train on; found none")
     cfg = compose("prepare", keys)
-    data = build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=0)
+    data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
     assert next(iter(data.evaluation_loader())).subjects == ("s0",)
 
 

@@ -66,11 +66,9 @@ def test_every_object_outside_the_model_is_built(group, name, tmp_path):
     if node is None:
         return
     extra = {
-        "data": {"views": cfg.views, "targets": cfg.get("targets"), "seed": 0, "root": str(tmp_path)},
+        "data": {"views": cfg.views, "targets": cfg.get("targets"), "seed": 0},
         "logger": {"save_dir": str(tmp_path)},
     }.get(group, {})
-    if name == "synthetic":
-        extra.pop("root")
     for key, part in nodes_with_kind(node, group):
         if group == "trainer":  # one for a GPU refuses to be made where there is none
             part = {**part, "accelerator": "cpu"}

@@ -1,22 +1,20 @@
 """YAML and options say the same: no key without a field, no field that no shipped file sets."""
 
+import math
+from typing import get_origin
+
 import pytest
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli.main import VERBS
-from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.describe import meanings, options_of
 from ghgs_lit.config.keys import flatten
-from ghgs_lit.config.options import Options
-from ghgs_lit.config.registry import KINDS, NAMED, class_of
+from ghgs_lit.config.registry import KINDS, NAMED, check, class_of
+from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed, verb_with
 
-TYPED = [
-    (group, kind)
-    for group, kinds in KINDS.items()
-    for kind in kinds
-    if issubclass(class_of(group, kind, group), Options)
-]
+TYPED = [(group, kind) for group, kinds in KINDS.items() for kind in kinds]
 
 
 def shipped(group):
@@ -34,7 +32,8 @@ def shipped(group):
 
 def fields(cls, prefix=""):
     for name, field in cls.model_fields.items():
-        nested = options_of(field.annotation)
+        # Of lists of options files have whole values.
+        nested = None if get_origin(field.annotation) is tuple else options_of(field.annotation)
         yield f"{prefix}{name}"
         if nested is not None:
             yield from fields(nested, f"{prefix}{name}.")
@@ -61,3 +60,88 @@ def test_every_field_has_a_meaning(group, kind):
                 check(nested)
 
     check(class_of(group, kind, group))
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """A configuration of every group."""
+    cfg = composed("train", "model=recurrent", "logger=wandb")
+    return OmegaConf.to_container(cfg, resolve=True)
+
+
+def with_value(config, key, value):
+    """``config`` with another value of a dotted key; the nodes on the way are copied."""
+    name, _, rest = key.partition(".")
+    return {**config, name: with_value(config[name], rest, value) if rest else value}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("optimizer.lr", "abc", "a number > 0"),
+        ("optimizer.lr", 0.0, "a number > 0"),
+        ("optimizer.lr", math.nan, "a number > 0"),
+        ("optimizer.lr", math.inf, "a number > 0"),
+        ("optimizer.lr", True, "a number > 0"),
+        ("optimizer.lr", {"high": 1}, "a number > 0"),
+        ("optimizer.betas", [0.9], "a list of 2 values"),
+        ("optimizer.betas", [0.9, 1.0], "each a number >= 0 and < 1"),
+        ("trainer.max_steps", 1.5, "an integer >= -1"),
+        ("trainer.max_steps", "abc", "an integer >= -1"),
+        ("trainer.val_check_interval", 0, "an integer >= 1 or a number > 0 and <= 1"),
+        ("trainer.max_time", 10, "days:hours:minutes:seconds such as 00:00:10:00 or null"),
+        ("trainer.devices", True, "an integer >= 1"),
+        ("data.batch_size", 1.5, "an integer >= 1"),
+        ("data.size", 100000, "<= 8192"),
+        ("data.size", [140], "a list of 2 values"),
+        ("data.root", 7, "a path or null"),
+        ("data.workers", -1, "an integer >= 0"),
+        ("targets.per_subject", "some", "an integer >= 1 or all"),
+        ("augmentation", "none", "a mapping of its keys"),
+        ("data.rig", None, "a mapping of its keys"),
+    ],
+)
+def test_a_wrong_value_is_named_with_what_was_expected_and_found(whole, key, value, expected):
+    """Wrong types and ranges ended in tracebacks, comparisons of texts with numbers, or ran for ever."""
+    with pytest.raises(InputError) as caught:
+        check(with_value(whole, key, value))
+    message = str(caught.value)
+    assert message.startswith(f"{key}: expected ")
+    assert expected in message
+    assert message.endswith(f"; found {value!r}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("optimizer.lr", 1),
+        ("trainer.max_time", {"hours": 2}),
+        ("trainer.max_time", None),
+        ("trainer.val_check_interval", 0.5),
+        ("trainer.devices", [0, 1]),
+        ("targets.per_subject", "all"),
+        ("data.evaluation_positions", {3: [0, 6, 11]}),
+        ("optimizer.freeze_until", {"depth_head.dpt": 0.5}),
+        ("callbacks", {}),
+        ("data.size", [360, 640]),
+    ],
+)
+def test_what_the_documentation_allows_passes(whole, key, value):
+    """Options must not forbid values that work."""
+    check(with_value(whole, key, value))
+
+
+@pytest.mark.parametrize("group", sorted(KINDS))
+def test_an_unknown_key_is_refused_in_every_group(whole, group):
+    """A misspelt key that is ignored would be a setting that does nothing."""
+    verb = verb_with(group)
+    config = whole if verb == "train" else OmegaConf.to_container(composed(verb), resolve=True)
+    key = f"{group}.{next(iter(config[group]))}" if group in NAMED else group
+    with pytest.raises(InputError, match=rf"{key} key: expected one of .*; found 'nonsense'"):
+        check(with_value(config, f"{key}.nonsense", 1))
+
+
+def test_resolve_checks():
+    """Verbs, sweeps and saved configurations all go through ``resolve``."""
+    with pytest.raises(InputError, match=r"data\.batch_size: expected an integer >= 1; found 1\.5"):
+        resolve(compose("train", ["data.batch_size=1.5"]))

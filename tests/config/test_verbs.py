@@ -4,8 +4,8 @@ import pytest
 
 from ghgs_lit.cli.main import VERBS as DESCRIBED
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.config.compose import is_group
 from ghgs_lit.config.describe import meanings, options_of
+from ghgs_lit.config.registry import KINDS
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
@@ -29,7 +29,7 @@ def test_yaml_and_options_of_a_verb_agree(verb):
     """A default in two places that differ would be wrong in one of them."""
     data = resolve(compose(verb, GIVEN.get(verb, [])), verb)
     options = VERBS[verb]
-    own = {name: value for name, value in data.items() if not is_group(name)}
+    own = {name: value for name, value in data.items() if name not in KINDS}
     assert set(own) == set(options.model_fields)
     read = options.read(own, "")
     for name, field in options.model_fields.items():

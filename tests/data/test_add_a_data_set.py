@@ -63,7 +63,7 @@ def clean(monkeypatch):
 
 def node(project: Path, **changes) -> dict:
     about = {"kind": "my_people", "name": "m", "root": str(project / "photographs")}
-    return {**about, "size": 56, "ring": CAMERAS, **KEYS, **changes}
+    return {**about, "size": 56, **changes}
 
 
 def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, capsys):
@@ -106,7 +106,7 @@ def test_the_template_passes_the_check(project, monkeypatch):
     """task=check asks for the static cameras alone, whatever the protocol's views, and counts the bodies."""
     monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
     release = {"name": "release", "training_views": [2, 3, 4]}
-    report = inspect(build(node(project, targets=release), "data"))
+    report = inspect(build(node(project), "data", **KEYS | {"targets": release}))
     assert report.problems == report.notes == []
     assert [phase.bodies for phase in report.phases.values()] == [2, 1]
 
@@ -114,7 +114,7 @@ def test_the_template_passes_the_check(project, monkeypatch):
 def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
     """Cameras, masks and bodies of the template reach the batch; what it cannot give is refused."""
     monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
-    data = build(node(project), "data")
+    data = build(node(project), "data", **KEYS)
     (batch,) = list(data.evaluation_loader())
     assert batch.images.shape == (1, 3, 3, 56, 56)
     assert len(batch.body_vertices[0]) == 50
@@ -126,15 +126,15 @@ def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
     assert str(project) in sys.path
     between = {"name": "cameras", "view": 3}
     with pytest.raises(InputError, match="found cameras, which asks for views between cameras"):
-        list(build(node(project, targets=between), "data").evaluation_loader())
+        list(build(node(project), "data", **KEYS | {"targets": between}).evaluation_loader())
     (project / "photographs" / "val" / "c" / "cameras.npz").unlink()
     with pytest.raises(InputError, match=r"c/cameras\.npz"):
-        list(build(node(project), "data").evaluation_loader())
+        list(build(node(project), "data", **KEYS).evaluation_loader())
 
 
 def test_nothing_is_admitted_by_a_configuration(project):
     """A checkpoint of somebody else cannot have foreign code imported."""
-    for kind in ("my_people", "my_people.MyDataModule", "os.system"):
+    for kind in ("my_people", "my_people.MyPeople", "os.system"):
         with pytest.raises(InputError, match=r"data\.kind: expected one of"):
             build(node(project, kind=kind), "data")
     assert "my_people" not in sys.modules
@@ -153,7 +153,8 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
         with pytest.raises(InputError, match="my_people"):
             build(node(project), "data")
         admit()
-        assert build(node(project), "data").dataset.name == "m"
+        plugins._installed.cache_clear()
+        assert build(node(project), "data", **KEYS).dataset.name == "m"
         monkeypatch.delenv(plugins.VARIABLE, raising=False)
         registry._REGISTERED.clear()
         sys.modules.pop("my_people")

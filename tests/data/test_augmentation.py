@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from ghgs_lit.config import compose
+from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
-from ghgs_lit.data.datamodules import RenderedDataModule
 from ghgs_lit.errors import InputError
 from ghgs_lit.types import Batch
-from tests.helpers.people import RELEASE, V4, equal, render_boxes
+from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
 
 RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "uneven"}
 IMPERFECT = {
@@ -26,15 +26,15 @@ def root(tmp_path_factory):
     return folder / "out"
 
 
-def module(root, **changes) -> RenderedDataModule:
+def module(root, **changes):
     arguments = {"views": RANDOM, "targets": RELEASE, "size": 28, "batch_size": 2, "steps_per_epoch": 6}
-    return RenderedDataModule(root=str(root), **(arguments | changes))
+    return rendered(root, **(arguments | changes))
 
 
 def test_nothing_varies_by_default(root):
     """augmentation=none and no augmentation give the photographs as they are read, to the bit."""
     none = compose("train").augmentation
-    assert Augmentation(**none) == Augmentation()
+    assert Augmentation.read(none, "augmentation") == Augmentation()
     data = module(root, augmentation=none)
     for step in range(3):
         batch = data.builder("train").batch(data.training_sampler().batch(step))
@@ -204,7 +204,7 @@ def test_validation_does_not_vary(root):
 
 def test_shipped_variation_is_built():
     """The option composes; its sizes fit the encoder's patch."""
-    augmentation = Augmentation(**compose("train", ["augmentation=captures"]).augmentation)
+    augmentation = read_node(compose("train", ["augmentation=captures"]).augmentation, "augmentation")
     assert all(side % 14 == 0 for size in augmentation.sizes for side in size)
     assert all(getattr(augmentation, name) > 0 for name in IMPERFECT)
 
@@ -213,11 +213,11 @@ def test_shipped_variation_is_built():
     ("values", "message"),
     [
         ({"sizes": []}, "augmentation.sizes: expected sizes or null; found"),
-        ({"sizes": [[3, 4, 5]]}, "augmentation.sizes: expected a side or"),
+        ({"sizes": [[3, 4, 5]]}, r"augmentation.sizes: expected a list \(each an integer"),
         ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
-        ({"chance": 1.5}, "augmentation.chance: expected at most 1; found 1.5"),
-        ({"background": 2}, "augmentation.background: expected at most 1; found 2"),
-        ({"calibration": -1}, "augmentation.calibration: expected at least 0; found -1"),
+        ({"chance": 1.5}, "augmentation.chance: expected a number >= 0 and <= 1; found 1.5"),
+        ({"background": 2}, "augmentation.background: expected a number >= 0 and <= 1; found 2"),
+        ({"calibration": -1}, "augmentation.calibration: expected a number >= 0; found -1"),
         ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole"),
     ],
 )

@@ -1,16 +1,14 @@
 """What task=check finds without a body's help: masks, cameras, units, leakage."""
 
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from ghgs_lit.data.check import inspect
-from ghgs_lit.data.datamodules import RenderedDataModule
 from ghgs_lit.errors import InputError
-from tests.helpers.people import TINY, V4, render_boxes
+from tests.helpers.people import TINY, render_boxes, rendered
 
 PLACE = "train/mask/s0_008/0.png"
 
@@ -19,7 +17,7 @@ PLACE = "train/mask/s0_008/0.png"
 def sound(tmp_path_factory):
     """Boxes, whose bodies of eight vertices check no camera."""
     folder = tmp_path_factory.mktemp("boxes")
-    settings = replace(TINY, samples=1, positions=(0, 4, 8, 12), views=(0, 3))
+    settings = TINY.replace(samples=1, positions=(0, 4, 8, 12), views=(0, 3))
     render_boxes(folder / "root", folder / "scans", train=2, val=1, settings=settings)
     return folder / "root"
 
@@ -32,9 +30,7 @@ def root(sound, tmp_path):
 
 def report(root, **changes):
     targets = {"name": "release", "training_views": [3]}
-    return inspect(
-        RenderedDataModule(**({"root": str(root), "views": V4, "targets": targets, "size": 42} | changes))
-    )
+    return inspect(rendered(root, **{"targets": targets, "size": 42, **changes}))
 
 
 def change(root, kind: str, function, names: str = "s0_*") -> None:
@@ -139,7 +135,7 @@ def test_the_same_person_in_both_phases_is_a_problem(root):
     (root / "rendering/done/val/s1").touch()
     (line,) = report(root).problems
     assert line == f"{root}: expected each subject in train or in val; found 's1' in both"
-    data = RenderedDataModule(root=str(root), views=V4, targets={"name": "cameras", "view": 0}, size=42)
+    data = rendered(root, targets={"name": "cameras", "view": 0}, size=42)
     with pytest.raises(InputError, match="found 's1' in both"):
         data.subjects("val")
 

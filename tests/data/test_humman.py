@@ -56,7 +56,7 @@ def test_named_sequences_are_for_testing_and_the_rest_for_training(root, tmp_pat
     shutil.copytree(root, tmp_path / "recon")
     (tmp_path / "recon" / "notes").mkdir()
     data = build_data("humman", tmp_path / "recon", "data.body=none").dataset
-    assert len(data.split["val"]) == len(set(data.split["val"])) == 22
+    assert len(data.split.val) == len(set(data.split.val)) == 22
     assert data.sequences("train") == ["p100001_a000048"]
     assert data.reader("val").sequences == {TEST}
     assert data.published == {"train": 317, "val": 22}

@@ -259,7 +259,8 @@ def test_a_broken_model_gets_its_line(case, tmp_path, monkeypatch):
         (["data.body=smplx"], "data.body: expected one of smpl, depth, none; found 'smplx'"),
         (["data.masks=mask"], "data.masks: expected one of kinect_mask, kinect_mask_manual; found 'mask'"),
         (["data.frames=[0,0,6]"], r"data.frames: expected \[start, stop, step\] with start < stop; found"),
-        (["data.split.val=null"], "data.split.val: expected names of sequences; found None"),
+        (["data.split.val=[]"], r"data.split.val: expected names of sequences; found \[\]"),
+        (["data.split.val=null"], r"data.split.val: expected a list \(each a text\); found None"),
     ],
 )
 def test_impossible_settings_are_refused(whole, overrides, line):

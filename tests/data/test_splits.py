@@ -46,3 +46,18 @@ def test_ranges_of_ids():
         read_split({"train": ["0000-0025"], "val": ["0025"]}, names)
     with pytest.raises(InputError, match=r"data\.split: expected a list 'val'"):
         read_split({"train": ["0000"]}, names)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4])
+def test_few_scans_leave_somebody_to_validate(tmp_path, count):
+    """A tenth of four scans is none: training and evaluation failed on a folder that was never written."""
+    names = [f"s{i}" for i in range(count)]
+    drawn = split_names(tmp_path, names, None, 0.1, 0)
+    assert len(drawn["val"]) == 1
+    assert sorted(drawn["train"] + drawn["val"]) == names
+    assert split_names(tmp_path, names, None, 0.0, 0) == {"train": names, "val": []}
+
+
+def test_all_scans_can_be_measured(tmp_path):
+    """data.val_fraction=1: nobody is trained on."""
+    assert split_names(tmp_path, ["a", "b"], None, 1, 0) == {"train": [], "val": ["a", "b"]}

@@ -216,18 +216,18 @@ def test_problems_are_collected_where_that_is_asked_for(whole, tmp_path):
         ("data.root=null", "data.root: expected the folder of the data set; found null"),
         ("data.root=/nowhere", "/nowhere: expected the folder of the data set; found no such folder"),
         (
-            "data.splits.train=[{sequences: [386], frames: [5, 5, 1]}]",
-            r"data.splits.frames: expected \[start, stop",
+            "data.split.train=[{sequences: [386], frames: [5, 5, 1]}]",
+            r"data.split.train.frames: expected \[start, stop",
         ),
-        ("data.splits.train=[{sequences: [], frames: [0, 5, 1]}]", "data.splits.sequences: expected ids"),
-        ("data.splits.train=[]", "data.splits.train: expected sequences and frames"),
+        ("data.split.train=[{sequences: [], frames: [0, 5, 1]}]", "data.split.train.sequences: expected ids"),
+        ("data.split.train=[]", "data.split.train: expected sequences and frames"),
         (
-            "data.splits.train=[{sequence: [386], frames: [0, 5, 1]}]",
-            "data.splits.train key: expected one of",
+            "data.split.train=[{sequence: [386], frames: [0, 5, 1]}]",
+            "data.split.train key: expected one of frames, sequences; found 'sequence'",
         ),
-        ("data.cameras=1", "data.cameras: expected at least 2 or null; found 1"),
+        ("data.cameras=1", "data.cameras: expected an integer >= 2 or null; found 1"),
         ("data.cameras=24", "annots.npy: expected 24 cameras; found 23"),
-        ("data.masks=[]", "data.masks: expected folders of masks"),
+        ("data.masks=[]", r"data.masks: expected a list \(each a text\); found \[\]"),
     ],
 )
 def test_impossible_settings_are_refused(whole, override, line):

@@ -24,8 +24,8 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import config_hash
-from ghgs_lit.synthesis.datamodules import ScansDataModule
 from tests.helpers.models import make_model
+from tests.helpers.people import rendered
 from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer
 from tests.helpers.verbs import ghgs
@@ -233,12 +233,8 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
 
 def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes, tmp_path):
     """A subject is predicted once for each number of views; rows and pictures are those of each protocol."""
-    data = ScansDataModule(
-        {"name": "v3", "training_counts": [3], "evaluation_count": 3},
-        {"name": "release"},
-        root=str(boxes),
-        size=42,
-    )
+    views = {"name": "v3", "training_counts": [3], "evaluation_count": 3}
+    data = rendered(boxes, views, {"name": "release"}, size=42)
     protocols = {name: {"name": name} for name in ("midway", "release")}
     protocols["midway"]["per_subject"] = 2
     predictions = []

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
@@ -35,7 +36,8 @@ def build_data(name: str, root: Path, *overrides: str):
     """The data module that the command line makes of ``data=<name> data.root=<root>``."""
     cfg = _config(f"data={name}", *overrides)
     place = {} if any(o.startswith("data.root=") for o in overrides) else {"root": str(root)}
-    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0, **place)
+    node = OmegaConf.to_container(cfg.data, resolve=True) | place
+    return build(node, "data", views=cfg.views, targets=cfg.targets, seed=0)
 
 
 def stored(data, phase: str, size: tuple[int, int] | None = None) -> Photographs:

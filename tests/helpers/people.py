@@ -8,7 +8,9 @@ import torch
 import trimesh
 from PIL import Image
 
-from ghgs_lit.synthesis.jobs import RenderSettings, render_people
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.synthesis.datasets import Scans
+from ghgs_lit.synthesis.jobs import RenderOptions, render_people
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
@@ -16,7 +18,14 @@ from ghgs_lit.synthesis.scans import ScanSource
 V4 = {"name": "v4", "training_counts": [4], "evaluation_count": 4}
 RELEASE = {"name": "release", "training_views": [2, 3, 4]}
 RIG = Rig()
-TINY = RenderSettings(size=42, samples=2)
+TINY = RenderOptions(size=42, samples=2)
+
+
+def rendered(
+    root: Path, views=V4, targets=RELEASE, seed=0, augmentation=None, **options
+) -> PhotographsDataModule:
+    """Batches of what :func:`render_boxes` has written."""
+    return Scans(root=root, **{"size": 28, **options}).build(views, targets, seed, augmentation)
 
 
 def box_person(name: str = "box", color=(200, 90, 30), extents=(0.5, 1.7, 0.3)) -> Person:

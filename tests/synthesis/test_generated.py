@@ -10,14 +10,14 @@ from ghgs_lit.data.sampling import (
 )
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.datamodules import ScansDataModule, SyntheticDataModule
-from ghgs_lit.synthesis.jobs import RenderSettings
+from ghgs_lit.synthesis.datasets import Scans, Synthetic
+from ghgs_lit.synthesis.jobs import RenderOptions
 from tests.helpers.people import RELEASE, RIG, V4, box_person, equal
 
 
-def built(*overrides, **extra):
+def built(*overrides):
     cfg = compose("prepare", overrides)
-    return build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed, **extra)
+    return build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
 
 
 @pytest.mark.parametrize("views", ["v3", "v4", "v5", "random"])
@@ -31,39 +31,37 @@ def test_configuration_groups_build(views, targets, tmp_path):
         views, int(views[-1]) if views[-1].isdigit() else 0
     )
     # Evaluating another protocol by its name gives what its file says.
-    by_name = TargetProtocol(targets)
+    by_name = TargetProtocol(name=targets)
     assert (data.targets.kind, data.targets.view, data.targets.per_subject) == (
         by_name.kind,
         by_name.view,
         by_name.per_subject,
     )
-    synthetic = built(f"views={views}", f"targets={targets}", cache_dir=str(tmp_path))
-    assert isinstance(synthetic, SyntheticDataModule)
+    synthetic = built(f"views={views}", f"targets={targets}", f"data.cache_dir={tmp_path}")
+    assert isinstance(synthetic.dataset, Synthetic)
 
 
 def test_configuration_of_the_rig_is_the_rigs_default():
     """YAML and code agree about the rig; a misspelt nested key is named."""
     data = built("data=scans")
-    assert isinstance(data, ScansDataModule)
-    assert data.dataset.rig == RIG
-    assert data.dataset.render == RenderSettings()
-    with pytest.raises(InputError, match=r"data\.rig key: expected one of .*; found 'raduis'"):
-        built("data=scans", "+data.rig.raduis=3")
-    with pytest.raises(InputError, match=r"data\.render\.lights key"):
-        built("data=scans", "+data.render.lights.colour=3")
+    assert isinstance(data.dataset, Scans)
+    assert data.dataset.rig.build() == RIG
+    assert data.dataset.render == RenderOptions()
+    with pytest.raises(InputError, match=r"data\.rig key: expected one of .*; found 'hieght'"):
+        built("data=scans", "+data.rig.hieght=3")
+    with pytest.raises(InputError, match=r"data\.rig\.variation key"):
+        built("data=scans", "+data.rig.variation.colour=3")
 
 
-def synthetic(tmp_path, **changes) -> SyntheticDataModule:
+def synthetic(tmp_path, seed=0, **changes):
     arguments = {
         "people": {"train": 2, "val": 1},
-        "views": V4,
-        "targets": RELEASE,
         "size": 28,
         "render": {"size": 28, "samples": 1},
         "cache_dir": str(tmp_path),
         "render_workers": 0,
     }
-    return SyntheticDataModule(**(arguments | changes))
+    return Synthetic(**(arguments | changes)).build(V4, RELEASE, seed)
 
 
 @pytest.fixture
@@ -118,9 +116,8 @@ def test_the_cache_is_named_after_every_setting(tmp_path):
             {"people_seed": 1},
             {"render": {"size": 42, "samples": 1}},
             {"render": {"size": 28, "samples": 2}},
-            {"render": {"size": 28, "samples": 1, "lights": {"ambient": 0.4}}},
-            {"rig": {"height": None}},
-            {"rig": {"pitch": -9.0}},
+            {"rig": {"height": 1.8}},
+            {"rig": {"height": None, "variation": {"pitch": [-9.0, -9.0]}}},
         )
     ]
     assert len(set(roots)) == len(roots)
@@ -133,9 +130,9 @@ def test_generated_people_must_have_the_views_that_are_asked_for(tmp_path):
         InputError, match=r"data\.render\.views: expected \[0, 2, 3, 4\] for targets=release; found \[0\]"
     ):
         synthetic(tmp_path, render={"size": 28, "views": [0]})
-    with pytest.raises(InputError, match=r"data\.people\.val: expected at least 1; found 0"):
-        synthetic(tmp_path, people={"train": 2})
-    with pytest.raises(InputError, match=r"data\.active\.train: expected at least 0; found -1"):
+    with pytest.raises(InputError, match=r"data\.people\.val: expected an integer >= 1 and .*; found 0"):
+        synthetic(tmp_path, people={"train": 2, "val": 0})
+    with pytest.raises(InputError, match=r"data\.active\.train: expected an integer >= 0 and .*; found -1"):
         synthetic(tmp_path, active={"train": -1})
 
 

@@ -29,7 +29,7 @@ def case(request, tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, function, write)
     cfg = compose("prepare", [f"data={request.param.split()[0]}", f"data.{key}={folder}"])
-    data = build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=0)
+    data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
     return (
         lambda: miniature.make_miniature(data.dataset, {"train": 1, "val": 1}, 64, 0),
         folder,
@@ -72,7 +72,7 @@ def test_what_lies_beside_is_not_overwritten(tmp_path):
         path.parent.mkdir(parents=True)
         path.write_text("licensed")
         cfg = compose("prepare", [f"data={name}", f"data.{key}={tmp_path / name / 'data'}"])
-        data = build(cfg.data, _key="data", views=cfg.views, targets=cfg.targets, seed=0)
+        data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
         refused(
             "expected an empty folder",
             lambda data=data: miniature.make_miniature(data.dataset, {"train": 1, "val": 0}, 64, 0),

@@ -12,11 +12,13 @@ from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import project
-from ghgs_lit.synthesis.jobs import RenderSettings, identity
-from ghgs_lit.synthesis.rig import Rig, Variation
+from ghgs_lit.synthesis.jobs import RenderOptions, identity
+from ghgs_lit.synthesis.rig import Rig, RigOptions, Variation
 from tests.helpers.people import RIG, box_person, render_boxes
 
-VARIATION = Variation((1.6, 3.4), (-25, 8), (0.55, 0.95), camera_pitch=6, camera_roll=8, camera_look_at=0.08)
+VARIATION = Variation(
+    radius=(1.6, 3.4), pitch=(-25, 8), fill=(0.55, 0.95), camera_pitch=6, camera_roll=8, camera_look_at=0.08
+)
 VARIED = Rig(height=None, variation=VARIATION)
 
 
@@ -79,7 +81,7 @@ def test_single_cameras_deviate_within_their_limits():
 def test_only_views_between_ring_cameras_stand_higher_or_lower():
     """Targets are seen from heights that no input has; nothing else of the rig changes."""
     person = VARIED.place(box_person(), subject_rng(0, "box"))
-    higher = replace(VARIED, variation=replace(VARIATION, between_pitch=20))
+    higher = replace(VARIED, variation=VARIATION.replace(between_pitch=20))
     pitches = []
     for rig in (VARIED, higher):
         _, cameras, _ = drawn(rig, person)
@@ -100,11 +102,14 @@ def test_without_variation_nothing_changes():
     assert torch.equal(cameras.intrinsics, even.intrinsics)
 
     def key(rig):
-        settings = json.dumps(identity(rig, RenderSettings(), 0), sort_keys=True)
+        settings = json.dumps(identity(rig, RenderOptions(), 0), sort_keys=True)
         return hashlib.sha256(settings.encode()).hexdigest()[:16]
 
     assert key(Rig()) == "3206455a5c8584ca"
-    variations = [Rig(variation={name: value}) for name, value in (("radius", [2, 2]), ("camera_roll", 1.0))]
+    variations = [
+        Rig(variation=Variation(**{name: value}))
+        for name, value in (("radius", [2, 2]), ("camera_roll", 1.0))
+    ]
     assert len({key(rig) for rig in [Rig(), *variations]}) == 3
 
 
@@ -127,17 +132,20 @@ def test_what_varies_changes_nothing_else(tmp_path):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"radius": [3, 2]}, r"radius: expected \[least, greatest\] between 0 and inf; found \[3, 2\]"),
-        ({"fill": [0.5, 1.2]}, r"fill: expected \[least, greatest\] between 0 and 1"),
-        ({"pitch": [-95, 0]}, r"pitch: expected \[least, greatest\] between -89 and 89"),
-        ({"camera_roll": -1}, r"camera_roll: expected at least 0; found -1"),
+        ({"radius": [3, 2]}, r"radius: expected \[least, greatest\]; found \[3\.0, 2\.0\]"),
+        (
+            {"fill": [0.5, 1.2]},
+            r"fill: expected a list of 2 values \(each a number > 0 and < 1\) or null; found \[0\.5, 1\.2\]",
+        ),
+        ({"pitch": [-95, 0]}, r"pitch: expected a list of 2 values \(each a number > -89 and < 89\)"),
+        ({"camera_roll": -1}, r"camera_roll: expected a number >= 0 and <= 180; found -1"),
         ({"camera_rol": 1}, r"key: .*did you mean camera_roll"),
     ],
 )
 def test_impossible_variations_are_refused(values, message):
     """The message names the key."""
     with pytest.raises(InputError, match=rf"^data\.rig\.variation\W{message}"):
-        Rig(variation=values)
+        RigOptions(variation=values)
 
 
 def test_a_ring_inside_the_subject_is_refused():

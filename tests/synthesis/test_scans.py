@@ -13,7 +13,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.synthesis.scans import ScanSource
 from ghgs_lit.types import Cameras
-from tests.helpers.people import render_boxes, write_obj_scan
+from tests.helpers.people import TINY, render_boxes, rendered, write_obj_scan
 
 
 def test_obj_scans_are_loaded_as_they_are(tmp_path):
@@ -89,3 +89,15 @@ def test_rendered_scans_share_one_transform(tmp_path):
             points = unproject_maps(torch.from_numpy(view.depth), cameras).numpy()[view.mask]
             assert (points > body.min(0) - 0.05).all()
             assert (points < body.max(0) + 0.05).all()
+
+
+def test_a_split_chooses_among_rendered_scans(tmp_path):
+    """Another file measured the same subjects, and a missing one was not noticed."""
+    render_boxes(tmp_path / "out", tmp_path / "scans", train=2, val=1, settings=TINY.replace(positions=(0,)))
+    assert list(rendered(tmp_path / "out").subjects("val")) == ["s2"]
+    mine = tmp_path / "mine.json"
+    mine.write_text('{"train": ["s2"], "val": ["s0", "s1"]}')
+    data = rendered(tmp_path / "out", split=mine)
+    assert [list(data.subjects(phase)) for phase in ("train", "val")] == [["s2"], ["s0", "s1"]]
+    with pytest.raises(InputError, match=r"none\.json: expected a JSON file or a folder"):
+        rendered(tmp_path / "out", split=tmp_path / "none.json").subjects("val")

@@ -15,11 +15,11 @@ from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.datamodules import THuman2DataModule
 from ghgs_lit.synthesis.miniatures import thuman2 as miniature
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
+from ghgs_lit.synthesis.thuman2 import THuman2
 from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
 from ghgs_lit.types import Cameras
 from tests.helpers.captures import stored
@@ -41,9 +41,8 @@ def raw(tmp_path_factory):
     return miniature.make_raw(tmp_path_factory.mktemp("raw") / "THuman2.0_Release", COUNT, 64, 0)
 
 
-def module(root=None, **changes) -> THuman2DataModule:
-    arguments = {"root": root, "views": V4, "targets": RELEASE, "size": SIZE, "name": "thuman2"}
-    return THuman2DataModule(**(arguments | {"pixel_centers": "auto"} | changes))
+def module(root=None, **changes):
+    return THuman2(**{"root": root, "size": SIZE, "workers": 0, **changes}).build(V4, RELEASE)
 
 
 def seen_by(view, scan=None) -> np.ndarray:
@@ -289,14 +288,13 @@ def composed(name, root, *overrides):
 )
 def test_named_protocols(rendered, experiment, size, inputs, targets):
     """Each experiment= has its publication's size, inputs and targets."""
-    data, cfg = composed(experiment, rendered, "data.depths=false")
-    assert data.options.size == (size, size)
+    data, cfg = composed(experiment, rendered)
+    assert data.dataset.size == (size, size)
     assert list(cfg.evaluation.targets) == [data.targets.name]
     batch = next(iter(data.evaluation_loader(targets=data.targets)))
     assert list(batch.views[0]) == inputs
     assert list(batch.targets.names[0]) == targets
     assert batch.images.shape[-2:] == (size, size)
-    assert batch.depths is None
     training = data.training_batch(0)
     assert {name[-1] for name in training.targets.names[0]} <= {"2", "3", "4"}
     assert len(training.targets.names[0]) == (3 if experiment == "thuman2_ghg" else 1)

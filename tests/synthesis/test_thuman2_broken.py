@@ -5,6 +5,7 @@ import os
 import pickle
 import re
 import shutil
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from PIL import Image
 
 from ghgs_lit.data.check import inspect, show, split_line, write
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.datamodules import THuman2DataModule
 from ghgs_lit.synthesis.miniatures import thuman2 as miniature
+from ghgs_lit.synthesis.thuman2 import THuman2
 from tests.data.test_pickles import Call
 from tests.helpers.people import V4
 
@@ -37,17 +38,19 @@ def folder(sound, tmp_path):
     return tmp_path / "data"
 
 
-def module(folder, **changes) -> THuman2DataModule:
+class Small(THuman2):
+    """The miniature has four cameras."""
+
+    ring: ClassVar[int] = 4
+
+
+def module(folder, **changes):
     arguments = {
         "root": str(folder / "root"),
-        "views": V4,
-        "targets": {"name": "release", "training_views": [3]},
         "size": SIZE,
-        "name": "thuman2",
-        "rig": {"positions": 4},
-        "pixel_centers": "auto",
+        "workers": 0,
     }
-    return THuman2DataModule(**(arguments | changes))
+    return Small(**{**arguments, **changes}).build(V4, {"name": "release", "training_views": [3]})
 
 
 def camera(folder, change):

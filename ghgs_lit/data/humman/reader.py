@@ -24,8 +24,6 @@ from ghgs_lit.errors import InputError
 
 log = logging.getLogger(__name__)
 
-BODIES = ("smpl", "depth", "none")
-
 
 @dataclass(frozen=True)
 class _Frame:

@@ -1,49 +1,59 @@
 """ZJU-MoCap as it is configured."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
-from ghgs_lit.config.settings import from_config, set_fields
+from pydantic import Field, model_validator
+
+from ghgs_lit.config.options import Options, Size, Text, Workers
 from ghgs_lit.data.dataset import DataSet
-from ghgs_lit.data.reader import PHASES
-from ghgs_lit.data.zju_mocap.reader import Split, ZJUMoCapReader
-from ghgs_lit.errors import choice, require
+from ghgs_lit.data.zju_mocap.reader import Frames, ZJUMoCapReader
+
+# Cameras of a sequence where all are used and nothing else is known; some have 23.
+_ALL = 21
 
 
-@dataclass(frozen=True, kw_only=True)
+class FramesByPhase(Options):
+    """Which frames are train and val."""
+
+    train: tuple[Frames, ...]
+    """Sequences and their frames."""
+    val: tuple[Frames, ...]
+    """Sequences and their frames."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "FramesByPhase":
+        for phase in ("train", "val"):
+            self.require(self.of(phase) != (), phase, "sequences and frames")
+        return self
+
+    def of(self, phase: str) -> tuple[Frames, ...]:
+        """The frames of a phase."""
+        return getattr(self, phase)
+
+
 class ZJUMoCap(DataSet):
-    """Downloaded ZJU-MoCap sequences below ``root``; a sample is one frame of one sequence.
-
-    Attributes:
-        splits: for ``train`` and ``val`` a list of :class:`Split` or their mappings.
-        cameras, undistorted, masks, bodies: as for :class:`ZJUMoCapReader`.
-    """
+    """Downloaded ZJU-MoCap sequences below ``root``; a sample is one frame of one sequence."""
 
     published: ClassVar[Mapping[str, int]] = {"train": 6, "val": 3}
     static_cameras: ClassVar[bool] = True
 
-    splits: Mapping[str, Sequence[Split | Mapping[str, Any]]]
-    cameras: int | None = 20
+    name: Text = "zju_mocap"
+    size: Size = (512, 512)
+    workers: Workers = 8
+    split: FramesByPhase
+    """Sequences of each phase, and which of their frames."""
+    cameras: Annotated[int, Field(ge=2)] | None = 20
+    """Cameras used of each sequence, the first ones, which make up the ring; null: all, a ring of 21."""
     undistorted: bool = True
-    masks: Sequence[str] = ("mask_cihp",)
-    bodies: Sequence[str] = ("new_vertices", "vertices")
+    """Remove the lens distortion of photographs and masks (SHERF does not, most others do)."""
+    masks: tuple[Text, ...] = Field(("mask_cihp",), min_length=1)
+    """Folders of label maps; those that a sequence has are united."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        splits = {}
-        for phase in self.splits:
-            choice("data.splits key", phase, PHASES)
-        for phase in PHASES:
-            key, listed = f"data.splits.{phase}", self.splits.get(phase)
-            require(bool(listed), key, "sequences and frames", listed)
-            splits[phase] = [from_config(Split, key, split) for split in listed]
-        require(self.cameras is None or self.cameras >= 2, "data.cameras", "at least 2 or null", self.cameras)
-        require(len(self.masks) > 0, "data.masks", "folders of masks", list(self.masks))
-        set_fields(self, splits=splits)
+    @property
+    def ring(self) -> int:
+        return self.cameras or _ALL
 
     def reader(self, phase: str, strict: bool = True) -> ZJUMoCapReader:
-        splits, limit = self.splits[phase], self.limit[phase]
-        return ZJUMoCapReader(
-            self.folder, splits, self.cameras, self.undistorted, self.masks, self.bodies, limit, strict
-        )
+        frames, limit = self.split.of(phase), self.limit.of(phase)
+        return ZJUMoCapReader(self.folder, frames, self.cameras, self.undistorted, self.masks, limit, strict)

@@ -10,41 +10,40 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Annotated
 
 import numpy as np
+from pydantic import AfterValidator, model_validator
 
-from ghgs_lit.config.settings import set_fields
+from ghgs_lit.config.options import Count, Index, Options, Text
 from ghgs_lit.data.decoding import check_center, check_name, read_array, read_map, read_photograph
 from ghgs_lit.data.reader import FrameReader
 from ghgs_lit.data.view import View, half_centers, opencv_view
 from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 
 log = logging.getLogger(__name__)
 
 BODY_VERTICES = 6890
+#: Folders of vertices; the first that a sequence has is read.
+_BODIES = ("new_vertices", "vertices")
 
 
-@dataclass(frozen=True)
-class Split:
-    """Some frames of some sequences.
+class Frames(Options):
+    """Some frames of some sequences."""
 
-    Attributes:
-        sequences: ids, such as 377.
-        frames: [start, stop, step] of the indices in ``annots.npy``, from 0. A shorter sequence gives the
-            frames that it has, as in the published loaders.
-    """
+    sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...]
+    """Ids, such as 377."""
+    frames: tuple[Index, Index, Count]
+    """[start, stop, step] of the indices in annots.npy, from 0. A shorter sequence gives the
+    frames that it has, as in the published loaders."""
 
-    sequences: tuple[str, ...]
-    frames: tuple[int, int, int]
-
-    def __post_init__(self) -> None:
-        set_fields(self, sequences=tuple(map(str, self.sequences)), frames=tuple(self.frames))
-        require(len(self.sequences) > 0, "data.splits.sequences", "ids such as 377", list(self.sequences))
-        start, stop, step = self.frames if len(self.frames) == 3 else (-1, 0, 0)
-        valid = 0 <= start < stop and step >= 1
-        require(valid, "data.splits.frames", "[start, stop, step] with start < stop", list(self.frames))
+    @model_validator(mode="after")
+    def _check(self) -> "Frames":
+        self.require(self.sequences != (), "sequences", "ids such as 377")
+        self.require(self.frames[0] < self.frames[1], "frames", "[start, stop, step] with start < stop")
+        return self
 
 
 @dataclass(frozen=True)
@@ -59,17 +58,16 @@ class _Frame:
 
 
 class ZJUMoCapReader(FrameReader):
-    """Frames of ``splits``, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
+    """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
 
     Missing sequences are left out (``ghgs prepare task=check`` counts them).
 
     Args:
         folder: root of the data set.
-        splits: which sequences and frames.
+        chosen: which sequences and frames.
         cameras: number of cameras used of each sequence, the first ones (None: all 21 or 23).
         undistorted: remove the lens distortion of photographs and masks.
         masks: folders of label maps; those that a sequence has are united.
-        bodies: folders of vertices; the first that a sequence has is read.
         limit: number of frames in all, the first ones (None: all).
         strict: as for :class:`Reader`.
 
@@ -80,17 +78,16 @@ class ZJUMoCapReader(FrameReader):
     def __init__(
         self,
         folder: Path,
-        splits: Sequence[Split],
+        chosen: Sequence[Frames],
         cameras: int | None = 20,
         undistorted: bool = True,
         masks: Sequence[str] = ("mask_cihp",),
-        bodies: Sequence[str] = ("new_vertices", "vertices"),
         limit: int | None = None,
         strict: bool = True,
     ) -> None:
         super().__init__(strict)
-        self.undistorted, self.masks, self.bodies = undistorted, tuple(masks), tuple(bodies)
-        wanted = [(f"CoreView_{s}", split.frames) for split in splits for s in split.sequences]
+        self.undistorted, self.masks = undistorted, tuple(masks)
+        wanted = [(f"CoreView_{s}", some.frames) for some in chosen for s in some.sequences]
         there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
         for name, frames in wanted:
             if name in there:
@@ -111,8 +108,8 @@ class ZJUMoCapReader(FrameReader):
                 f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
                 f"found {len(annotations.frames)} frames"
             )
-        found = [_Frame(path, annotations, index) for index in chosen]
-        named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in found}
+        named = [_Frame(path, annotations, index) for index in chosen]
+        named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in named}
         if len(chosen) < len(wanted):
             log.info("%s: %d of %d frames (the sequence is shorter)", path, len(chosen), len(wanted))
         self.frames |= named
@@ -135,7 +132,7 @@ class ZJUMoCapReader(FrameReader):
 
     def read_body(self, name: str) -> np.ndarray | None:
         frame = self.frames[name]
-        folder = next((f for b in self.bodies if (f := frame.folder / b).is_dir()), None)
+        folder = next((f for b in _BODIES if (f := frame.folder / b).is_dir()), None)
         if folder is None:
             return None
         return read_array(folder / f"{frame.number}.npy", [(BODY_VERTICES, 3)]).astype(np.float32)

@@ -29,7 +29,7 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, Targets
 
 #: Stages of a training step after the prediction.
 LOSS, BACKWARD = "loss", "backward"
-#: Vertices of a body where ``data.body_vertices`` draws none: those of SMPL-X.
+#: Vertices of a body: those of SMPL-X.
 _VERTICES = 10475
 
 

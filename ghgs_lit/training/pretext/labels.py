@@ -24,7 +24,7 @@ def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
     Raises:
         InputError: the batch has no depths or no bodies, or other bodies.
     """
-    require(batch.depths is not None, "data.depths", "true depths, which the labels are made from", "none")
+    require(batch.depths is not None, "data", "true depths, which the labels are made from", "none")
     require(batch.body_vertices is not None, "data", "people with bodies, as data=synthetic", "none")
     b, v, height, width = batch.depths.shape
     valid, points = batch.masks & (batch.depths > 0), unproject_maps(batch.depths, batch.cameras)

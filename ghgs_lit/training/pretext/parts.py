@@ -59,7 +59,7 @@ def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]
     Raises:
         InputError: not the vertices of a built-in body.
     """
-    expected = f"{BODY_VERTICES}, all of a built-in person (data=synthetic with data.body_vertices=null)"
+    expected = f"{BODY_VERTICES}, all of a built-in person (data=synthetic)"
     require(len(vertices) == BODY_VERTICES, "vertices of the body", expected, len(vertices))
     # Made for one batch: a tree that is quick to build, not the quickest to ask.
     tree = cKDTree(vertices.double().cpu().numpy(), balanced_tree=False, compact_nodes=False)

@@ -74,7 +74,7 @@ def test_shares_are_those_of_a_patchs_pixels():
 
 
 @pytest.mark.parametrize(
-    ("missing", "message"), [("depths", "data.depths: expected"), ("body_vertices", "data: ")]
+    ("missing", "message"), [("depths", "data: expected true depths"), ("body_vertices", "data: ")]
 )
 def test_photographs_without_labels_are_refused(missing, message):
     """Photographs of real people say nothing about parts."""

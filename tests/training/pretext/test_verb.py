@@ -101,7 +101,6 @@ def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_pat
             "encoder.semantic: expected the options of a branch to train; found None",
         ),
         ([BRANCH, "data.size=50"], "data.size: expected sides divisible by the patch size 14"),
-        ([BRANCH, "data.body_vertices=100"], "vertices of the body: expected 13380"),
         ([BRANCH.replace("parts: 16", "parts: 3")], "encoder.semantic.parts: expected 16; found 3"),
     ],
 )
