@@ -23,6 +23,7 @@ from ghgs_lit.recalibration import RecalibrationOptions
 from ghgs_lit.surroundings import ModelOptions
 from ghgs_lit.types import Batch, Cameras, Tokens
 from ghgs_lit.weights.names import RELEASE, to_ours
+from tests.helpers.configs import composed
 from tests.helpers.models import ATTRIBUTES, close, config, make_model
 from tests.helpers.scenes import CASES, fixture, hard_subjects, make_batch, stack
 
@@ -272,7 +273,8 @@ def test_named_models_choose_their_parts_and_the_command_line_wins():
     assert config("model=paper")["bounds"]["kind"] == "box"
     assert config("model=paper", "bounds=hull")["bounds"]["kind"] == "hull"
     assert config("model=paper", "depth_head=hull")["depth_head"]["parameterization"] == "linear"
-    assert config("model=hull", "recalibration=paper")["recalibration"]["k"] == 64
+    assert composed("train", "model=hull", "recalibration=paper").recalibration.k == 64
+    assert composed("train", "model=hull").recalibration.k == 16
 
 
 @pytest.mark.parametrize("ablation", ["full", "neither"])

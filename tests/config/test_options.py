@@ -94,7 +94,7 @@ def with_value(config, key, value):
         ("data.batch_size", 1.5, "an integer >= 1"),
         ("data.size", 100000, "<= 8192"),
         ("data.size", [140], "a list of 2 values"),
-        ("data.root", 7, "a path or null"),
+        ("data.cache_dir", 7, "a path or null"),
         ("data.workers", -1, "an integer >= 0"),
         ("targets.per_subject", "some", "an integer >= 1 or all"),
         ("augmentation", "none", "a mapping of its keys"),
