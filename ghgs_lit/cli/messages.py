@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.keys import is_below
+from ghgs_lit.config.registry import option_keys
 from ghgs_lit.config.schema import KINDS
 from ghgs_lit.errors import InputError
 
@@ -70,10 +71,10 @@ def _composition(error: HydraException) -> str:
         return f"{' '.join(sys.argv[1:])}: expected overrides that fit; found {error} {error.__cause__ or ''}"
     key = named[1]
     # A key without its group counts as close, too: lr for optimizer.lr.
-    keys = [known for known in KINDS if "*" not in known]
+    keys = [*(known for known in KINDS if "*" not in known), *option_keys()]
     whole = {known.rpartition(".")[2]: known for known in keys}.get(key)
     hint = f" (did you mean {whole}?)" if whole else did_you_mean(key, (*keys, *_groups()))
-    hint = "" if key in KINDS else hint  # a key of another verb
+    hint = "" if key in keys else hint  # a key of another verb
     return f"{key}: expected a key or group of this verb; found none of that name{hint}; +{key}=... adds it"
 
 

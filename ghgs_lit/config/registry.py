@@ -7,11 +7,12 @@ names one of the kinds below or one that the user's own code has registered; cod
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 
+from ghgs_lit.config.describe import options_of
 from ghgs_lit.config.options import Options, did_you_mean
 from ghgs_lit.config.plugins import VARIABLE, load_plugins
 from ghgs_lit.errors import InputError
@@ -148,6 +149,25 @@ def build(node: Any, key: str, **extra: Any) -> Any:
         InputError: as :func:`read_node`; other errors keep their type.
     """
     return read_node(node, key).build(**extra)
+
+
+def option_keys() -> list[str]:
+    """The dotted keys of all options of this package, but for those of groups whose nodes have names."""
+    kinds = [(group, class_of(group, kind, group)) for group in KINDS for kind in KINDS[group]]
+    return [
+        key
+        for group, cls in kinds
+        if group not in NAMED and issubclass(cls, Options)
+        for key in _keys_below(cls, group)
+    ]
+
+
+def _keys_below(cls: type[Options], parent: str) -> Iterator[str]:
+    for name, field in cls.model_fields.items():
+        yield f"{parent}.{name}"
+        nested = options_of(field.annotation)
+        if nested is not None:
+            yield from _keys_below(nested, f"{parent}.{name}")
 
 
 class _Arguments:
