@@ -75,7 +75,7 @@ def measure_and_write(
             "views": evaluation["views"],
             "targets": list(targets),
             "target_protocols": targets,
-            "reported": list(metrics.metrics),
+            "reported": metrics.names,
             "left_out": metrics.left_out,
             "definitions": metrics.definitions,
             "split": SPLITS.get(evaluation["split"], "unseen in training"),

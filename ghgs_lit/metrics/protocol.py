@@ -74,6 +74,15 @@ class ImageMetrics:
         return self
 
     @property
+    def names(self) -> list[str]:
+        """The names of the values, in their order."""
+        values = []
+        for region in self.options.regions:
+            metrics = ("psnr", "ssim") if region == "subject" else ("psnr", "ssim", "flip")
+            values += [name if region == "image" else f"{name}_{region}" for name in metrics]
+        return values + ["lpips"] * (self.lpips is not None)
+
+    @property
     def definitions(self) -> dict[str, str]:
         """How each metric and region is defined, to be stored beside the numbers."""
         options = self.options

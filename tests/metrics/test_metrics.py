@@ -213,7 +213,9 @@ def test_a_protocol_reports_its_metrics_by_name():
     image, target = _images(2)
     mask = torch.zeros(2, 30, 41, dtype=torch.bool)
     mask[:, 8:20, 10:30] = True
-    values = MetricsOptions(lpips="off").build()(image * 1.5, target, mask)
+    metrics = MetricsOptions(lpips="off").build()
+    values = metrics(image * 1.5, target, mask)
+    assert list(values) == metrics.names
     assert set(values) == {
         "psnr", "ssim", "flip", "psnr_box", "ssim_box", "flip_box", "psnr_subject", "ssim_subject",
     }  # fmt: skip
