@@ -117,11 +117,13 @@ def flags_first(arguments: Sequence[str]) -> list[str]:
             overrides.append(argument)
         elif name not in _FLAGS:
             raise BadUsage(f"{name}: expected a flag of --hydra-help; found none of that name")
-        elif _FLAGS[name] and not value:
-            following = next(rest, None)
-            if following is None:
+        elif _FLAGS[name]:
+            value = value or next(rest, "")
+            if not value:
                 raise BadUsage(f"{name}: expected a value after it, as --hydra-help says; found none")
-            flags += [name, following]
+            if name in ("-c", "--cfg") and value not in ("job", "hydra", "all"):
+                raise BadUsage(f"{name}: expected one of job, hydra, all; found {value!r}")
+            flags += [name, value]
         else:
             flags.append(argument)
     return flags + overrides

@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli import main as cli
+from ghgs_lit.cli.messages import flags_first
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import compose, conf_dir
 from tests.helpers.processes import run_python
@@ -154,3 +155,11 @@ def test_a_verb_prints_the_path_of_its_configuration_and_on_request_all_of_it(mo
     assert OmegaConf.load(tmp_path / "config.yaml") == config
     write_config({**config, "print_config": True}, tmp_path)
     assert "lr: 0.25" in capsys.readouterr().out
+
+
+def test_flags_may_stand_anywhere():
+    """Hydra takes none between overrides."""
+    assert flags_first(["seed=1", "-m", "--config-dir", "x", "seed=2"]) == [
+        "-m", "--config-dir", "x", "seed=1", "seed=2",
+    ]  # fmt: skip
+    assert flags_first(["--cfg=job", "seed=1"]) == ["--cfg", "job", "seed=1"]
