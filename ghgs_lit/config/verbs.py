@@ -331,10 +331,19 @@ class Import(Verb):
     """Of random weights."""
 
 
+class Phases(Options):
+    """Numbers of people."""
+
+    train: Index = 4
+    """To train on."""
+    val: Index = 2
+    """To measure on."""
+
+
 class Miniature(Options):
     """A small data set of built-in people in the published layout of data=..."""
 
-    people: dict[str, Index] = Field({"train": 4, "val": 2})
+    people: Phases = Phases()
     """Number of people of each phase."""
     size: Side = 256
     """Longer side of the photographs, pixels."""

@@ -12,6 +12,7 @@ from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ghgs_lit.config import resolve
+from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.checks import check_config
@@ -90,10 +91,10 @@ def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictCon
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))
-        directory = Path(str(cfg.hydra.sweep.dir))
+        directory, verb = Path(str(cfg.hydra.sweep.dir)), cfg.hydra.job.name
         with open_dict(cfg):
             del cfg["hydra"]
-        config = resolve(cfg)
+        config = resolve(cfg, verb if verb in VERBS else None)
         name = config_hash(config)
         shown = tuple(filter_overrides(overrides))
         run = RunDirectory(directory / name)

@@ -90,8 +90,7 @@ def ambiguous(gaussians: Gaussians, views: Cameras, settings: RasterSettings, **
     """
     images = []
     for sign in (-1, 1):
-        moved = dataclasses.replace(
-            settings,
+        moved = settings.replace(
             alpha_min=settings.alpha_min * (1 + sign * 1e-5),
             stop=settings.stop * (1 + sign * 1e-3),
             extent=settings.extent * (1 + sign * 1e-6),

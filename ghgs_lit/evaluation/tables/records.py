@@ -29,7 +29,7 @@ TRAINING = ("steps", "seconds", "peak_gb")
 _OF_EVALUATION = ("checkpoint", "refine", "refine_cameras")
 _ROW = ["method", "views", "targets", "subject"]
 # Keys that identify an encoder of conf/encoder; models change its other keys.
-_ENCODER_KEYS = ("patch_size", "width", "heads", "depth", "layers", "vit")
+_ENCODER_KEYS = ("width", "heads", "depth", "layers", "vit")
 
 
 @dataclass(frozen=True)
