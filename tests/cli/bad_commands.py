@@ -207,7 +207,11 @@ NUMBERS = [
     ("train callbacks.attention.token=[1]", 1, "callbacks.attention.token: expected a list of 3 values"),
     ("train callbacks.best.mode=best", 1, "callbacks.best.mode: expected one of max, min; found 'best'"),
     ("train metrics.box_margin=-1", 1, "metrics.box_margin: expected a number >= 0; found -1"),
-    ("predict checkpoint=x turntable.frames=-1", 1, "turntable.frames: expected an integer >= 0 and <= 2000; found -1"),
+    (
+        "predict checkpoint=x turntable.frames=-1",
+        1,
+        "turntable.frames: expected an integer >= 0 and <= 2000; found -1",
+    ),
     ("predict checkpoint=x subject=1.5", 1, "subject: expected a text or an integer", "found 1.5"),
     ("predict checkpoint=5", 1, "checkpoint: expected a path or null; found 5"),
     ("import out=x dtype=float8", 1, "dtype: expected one of float32, bfloat16, float16; found 'float8'"),

@@ -1,5 +1,6 @@
 """YAML and options say the same: no key without a field, no field that no shipped file sets."""
 
+import functools
 import math
 from typing import get_origin
 
@@ -17,17 +18,20 @@ from tests.helpers.configs import composed, verb_with
 TYPED = [(group, kind) for group, kinds in KINDS.items() for kind in kinds]
 
 
+@functools.cache
 def shipped(group):
     """The nodes of a group in everything that ships, as plain data."""
     files = sorted((conf_dir() / group).glob("*.yaml"))
     configurations = [composed(verb_with(group), f"{group}={path.stem}") for path in files]
     configurations += [composed("train", f"model={name}") for name in ("paper", "hull", "recurrent")]
     configurations += [composed("train", *over) for over in (["compat=release"], ["experiment=shipped"])]
-    configurations += [compose(verb) for verb in VERBS]
+    configurations += [composed(verb) for verb in VERBS]
+    nodes = []
     for cfg in configurations:
-        node = OmegaConf.to_container(cfg, resolve=False).get(group)
-        if node:
-            yield from node.values() if group in NAMED else [node]
+        if (node := cfg.get(group)) is not None:
+            node = OmegaConf.to_container(node, resolve=False)
+            nodes += node.values() if group in NAMED else [node]
+    return nodes
 
 
 def fields(cls, prefix=""):
