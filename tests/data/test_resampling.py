@@ -123,4 +123,4 @@ def test_the_release_protocol_loads_as_the_release(tmp_path):
         assert builder.inputs.resampling == builder.targets.resampling == resampling
         assert data.dataset.reader("val")._shift == 0
     with pytest.raises(InputError, match=r"data\.resampling: expected one of area, release; found 'cubic'"):
-        build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0, resampling="cubic")
+        build({**cfg.data, "resampling": "cubic"}, "data", views=cfg.views, targets=cfg.targets, seed=0)
