@@ -160,15 +160,18 @@ def check(config: Mapping[str, Any]) -> None:
     """Refuse wrong values of all groups of a configuration.
 
     Args:
-        config: plain data, interpolations resolved. ``data`` without a kind changes keys of a checkpoint's.
+        config: plain data, interpolations resolved. Nodes that lack their kind are refused where they are built.
 
     Raises:
         InputError: names the key of the first wrong value, what was expected and what was found.
     """
     for group, node in config.items():
-        # Verbs whose data is that of a checkpoint have none of their own.
-        whose = group in ("data", "targets") and (node is None or (group == "data" and "kind" not in node))
-        if group not in KINDS or whose:
+        # Verbs whose data is that of a checkpoint have none of their own, or change keys of it; a model may
+        # change keys of an optimizer that a verb lacks.
+        partial = isinstance(node, Mapping) and "kind" not in node and None not in KINDS.get(group, ())
+        if group not in KINDS or (group in ("data", "targets") and node is None):
+            continue
+        if partial and group not in NAMED:
             continue
         if group in NAMED and isinstance(node, Mapping):
             for name, part in node.items():
