@@ -84,7 +84,7 @@ def keys() -> frozenset[str]:
         shipped = [
             [f"{group}={option}" for option in sorted(options - OPTIONS.get(group, set()))]
             for group, options in groups().items()
-            if "/" not in group and group not in ("experiment", "sweep")
+            if "/" not in group and group not in ("experiment", "sweep", "calibration")
         ]
         # One option of each group at a time: composing takes a third of a second.
         runs = [(verb, []) for verb in VERBS]

@@ -160,7 +160,7 @@ def check(config: Mapping[str, Any]) -> None:
     """Refuse wrong values of all groups of a configuration.
 
     Args:
-        config: plain data, interpolations resolved. Nodes that lack their kind are refused where they are built.
+        config: plain data, interpolations resolved. A node that lacks its kind is refused where it is built.
 
     Raises:
         InputError: names the key of the first wrong value, what was expected and what was found.
