@@ -21,6 +21,8 @@ PIXEL_CENTERS = ("half", "integer")
 
 #: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
+_CODED, _SHOWN = 1088, 1080
 # Sides of a photograph and of its calibration have one ratio up to the rounding of a resize, in pixels.
 _ROUNDING = 1.5
 
@@ -69,7 +71,8 @@ class StoredCamera:
         distortion: of OpenCV's model, 0 to 14 numbers: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
             ``fisheye`` k1 to k4 of Kannala and Brandt's.
         fisheye: which of these models.
-        mask: the photograph's mask, where the file names it.
+        masks: those of its photographs that the file names, by folder and name without suffix.
+        unread: keys of the file that say nothing to its reader.
     """
 
     name: str
@@ -79,7 +82,18 @@ class StoredCamera:
     size: tuple[int, int] | None = None
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     fisheye: bool = False
-    mask: Path | None = None
+    masks: dict[str, Path] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
+
+    def is_same(self, other: "StoredCamera") -> bool:
+        """Whether all numbers are equal."""
+        numbers = [(c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other)]
+        return all(np.array_equal(*pair) for pair in zip(*numbers, strict=True))
+
+    def mask_of(self, photograph: Path) -> Path | None:
+        """The mask that the file names for a photograph: with its folder and name, else the only one."""
+        only = next(iter(self.masks.values())) if len(self.masks) == 1 else None
+        return self.masks.get(f"{photograph.parent.name}/{photograph.stem}", only)
 
     def __post_init__(self) -> None:
         object.__setattr__(
@@ -121,6 +135,9 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
         InputError: the ratio of the sides differs.
     """
     size = camera.size or photograph
+    if not same_ratio(size, photograph):
+        shown = tuple(_SHOWN if side == _CODED else side for side in size)
+        size = shown if same_ratio(shown, photograph) else size
     intrinsics = camera.intrinsics.copy()
     height, width = size
     if convention.intrinsics != "pixels":

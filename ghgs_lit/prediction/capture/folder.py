@@ -24,6 +24,7 @@ from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
     Pixels,
+    composed,
     find_instants,
     fits_stored,
     image_named,
@@ -90,7 +91,9 @@ class CaptureFolder:
     def paths(self) -> dict[str, dict[str, Path]]:
         """``{instant: {camera: path}}``."""
         folder = Path(self.images).expanduser()
-        return find_instants(folder, self.file.cameras, dict(self._said("names", {})))
+        # Numbers, too, are names of cameras.
+        names = {composed(str(key)): composed(str(name)) for key, name in self._said("names", {}).items()}
+        return find_instants(folder, self.file.cameras, names)
 
     @property
     def instants(self) -> list[str]:
@@ -159,7 +162,7 @@ class CaptureFolder:
         if self.segment is not None:
             return _segmenter(self.segment)(pixels)
         beside = mask_path(path, images, images)
-        named = beside if beside is not None else camera.mask
+        named = beside if beside is not None else camera.mask_of(path)
         if named is not None:
             return matte_of_file(named, pixels)
         if pixels.alpha is not None:

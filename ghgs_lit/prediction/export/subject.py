@@ -1,6 +1,7 @@
 """One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -113,7 +114,7 @@ class ExportedSubject:
     @property
     def file_names(self) -> list[str]:
         """The names of the views as parts of the names of files."""
-        return [file_name(view) for view in self.views]
+        return file_names(self.views)
 
     @cached_property
     def stored(self) -> Gaussians:
@@ -201,6 +202,19 @@ def exported_subject(
     )
 
 
-def file_name(view: str) -> str:
-    """The name of a photograph as a part of a file's name."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+def file_names(views: Sequence[str]) -> list[str]:
+    """The names of photographs as parts of the names of files, all different also without case.
+
+    A name that is fit for a file stays; of others that become one, the second ends with ``_2``.
+    """
+    fit = ["".join(c if c.isalnum() or c in "-_." else "_" for c in view) for view in views]
+    names: dict[int, str] = {}
+    taken: set[str] = set()
+    for i in sorted(range(len(views)), key=lambda i: fit[i] != views[i]):
+        names[i] = next(
+            name
+            for name in (fit[i], *(f"{fit[i]}_{n}" for n in range(2, len(views) + 2)))
+            if name.casefold() not in taken
+        )
+        taken.add(names[i].casefold())
+    return [names[i] for i in range(len(views))]

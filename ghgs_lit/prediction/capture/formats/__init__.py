@@ -1,5 +1,6 @@
 """Files of cameras: one module a format, each a function from a path to a :class:`CameraFile`."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from ghgs_lit.prediction.capture.formats.colmap import model_folder, read_colmap
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json, read_json_file, read_toml
 from ghgs_lit.prediction.capture.formats.nerfstudio import read_nerfstudio
 from ghgs_lit.prediction.capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv
+from ghgs_lit.prediction.capture.formats.qualisys import read_qualisys
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 
@@ -20,11 +22,12 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "opencv": read_opencv,
     "easymocap": read_easymocap,
     "toml": read_toml,
+    "qualisys": read_qualisys,
 }
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
-    """Read a file or a folder of cameras.
+    """Read a file or a folder of cameras; a warning names what is in it and not read.
 
     Args:
         path: of the file; COLMAP's models, OpenCV's files for each camera and EasyMocap's are folders.
@@ -37,7 +40,10 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
     choice("calibration.format", format, ("auto", *FORMATS))
     if not path.exists():
         raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
-    return FORMATS[_format_of(path) if format == "auto" else format](path)
+    file = FORMATS[_format_of(path) if format == "auto" else format](path)
+    if file.unread:
+        warnings.warn(f"{path}: entries that are not read: {', '.join(file.unread)}", stacklevel=2)
+    return file
 
 
 def _format_of(path: Path) -> str:
@@ -55,9 +61,12 @@ def _format_of(path: Path) -> str:
         return "toml"
     elif suffix == ".json":
         return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
+    elif path.name.endswith(".qca.txt"):
+        return "qualisys"
     elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
         return "colmap"
     raise InputError(
-        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, or TOML; "
+        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, TOML, or"
+        f" Qualisys' .qca.txt; "
         f"found {'a folder without any' if path.is_dir() else repr(path.suffix)}"
     )

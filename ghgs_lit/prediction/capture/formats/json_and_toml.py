@@ -1,8 +1,8 @@
-"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim and Anipose."""
+"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim, Anipose and Caliscope."""
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,32 +37,45 @@ def read_json(path: Path) -> CameraFile:
         InputError: a camera is missing or wrong.
     """
     content = read_json_file(path)
-    named = content.get("cameras", content)
+    named, others = _cameras_of(content)
     require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
     if not with_extrinsics:
-        return _read_matrices(path, named, "opencv")
+        return _read_matrices(path, named, others, "opencv")
     cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
-    return CameraFile.of(cameras, Convention(), "ghgs")
+    return CameraFile.of(cameras, Convention(), "ghgs", {*others, *set(named) - set(with_extrinsics)})
+
+
+def _cameras_of(content: Mapping[str, Any]) -> tuple[Any, list[str]]:
+    """What stands for the cameras, of a list by their names, and the keys beside it."""
+    if "cameras" not in content:
+        return content, []
+    named = content["cameras"]
+    if isinstance(named, list) and all(isinstance(camera, Mapping) for camera in named):
+        named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
+    return named, [key for key in content if key not in ("cameras", "metadata")]
 
 
 def read_toml(path: Path) -> CameraFile:
-    """Pose2Sim's and Anipose's TOML: a table for each camera, named by its key ``name``.
+    """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
 
     Raises:
         InputError: a camera is missing or wrong.
     """
-    tables = read_mapping(path, tomllib.loads, "TOML", "TOML")
+    tables, others = _cameras_of(read_mapping(path, tomllib.loads, "TOML", "TOML"))
     named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
-    return _read_matrices(path, named, "toml")
+    return _read_matrices(path, named, others, "toml")
 
 
-def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
-    """OpenCV's matrices by the names of cameras."""
+def _read_matrices(
+    path: Path, named: Mapping[str, Any], others: Sequence[str], name_of_format: str
+) -> CameraFile:
+    """OpenCV's matrices by the names of cameras; ``others`` are keys beside them."""
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if has_intrinsics(camera)}
     cameras = cameras_from_fields(path, with_intrinsics, expected, sorted(named))
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
+    rest = {*others, *set(named) - set(with_intrinsics) - {"metadata"}}
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format, rest)
 
 
 def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:

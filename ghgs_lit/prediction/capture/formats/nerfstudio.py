@@ -10,7 +10,15 @@ import numpy as np
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
+from ghgs_lit.prediction.capture.formats.camera_file import (
+    CameraFile,
+    coefficients,
+    end_of,
+    is_fisheye,
+    pinhole,
+    plain,
+    unread,
+)
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
 _KEYS = [
@@ -29,7 +37,15 @@ _KEYS = [
     "p1",
     "p2",
 ]
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+# Read, or of no matter for a camera.
+_KNOWN = {
+    *map(plain, _KEYS),
+    *("frames", "filepath", "transformmatrix", "maskpath", "cameramodel", "isfisheye", "aabbscale", "scale"),
+    *("offset", "appliedtransform", "appliedscale", "orientationoverride", "plyfilepath", "depthfilepath"),
+    *("colmapimid", "sharpness", "rotation", "trainfilenames", "valfilenames", "testfilenames", "time", "up"),
+}
 
 
 def read_nerfstudio(path: Path) -> CameraFile:
@@ -51,16 +67,21 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     for key in ("file_path", "transform_matrix"):
         require(key in frame, origin, key, sorted(frame))
     fields = {**shared, **frame}
-    model = fields.get("camera_model", "OPENCV")
-    choice(f"{origin}: camera_model", model, _MODELS)
-    fisheye = model == "OPENCV_FISHEYE"
+    model, flag = fields.get("camera_model"), fields.get("is_fisheye")
+    choice(f"{origin}: camera_model", model, (None, *_MODELS))
+    fisheye = is_fisheye(origin, flag, model)
     numbers = {key: _number(origin, key, fields[key]) for key in _KEYS if key in fields}
     size = (int(numbers["h"]), int(numbers["w"])) if {"h", "w"} <= set(numbers) else None
     intrinsics = _intrinsics(origin, numbers, size)
-    distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3")
+    names = "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3"
+    beyond = [key for key in _LENS if numbers.get(key) and key not in names.split()]
+    require(not beyond, origin, f"distortion {names}", beyond)
+    distortion = coefficients(numbers, names)
     pose = check_array(f"{origin}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
-    mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-    return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
+    name, mask = str(frame["file_path"]), frame.get("mask_path")
+    masks = {end_of(name): path.parent / str(mask)} if mask else {}
+    keys = unread(origin, fields, _KNOWN)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye, masks, keys)
 
 
 def _number(origin: str, key: str, value: Any) -> float:

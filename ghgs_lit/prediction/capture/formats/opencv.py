@@ -17,27 +17,55 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
+from ghgs_lit.prediction.capture.formats.camera_file import (
+    CameraFile,
+    coefficients,
+    is_fisheye,
+    plain,
+    read_mapping,
+    unread,
+)
 
 #: The files of EasyMocap: intrinsics and poses.
 EASYMOCAP = ("intri.yml", "extri.yml")
-# Its keys carry the camera's name: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01.
-_WITH_NAME = re.compile(r"(K|dist|D|R|Rot|T|H|W)_(.+)")
-# Spelled without case and underscores; a rotation matrix is preferred to a vector where there are both.
+# Spelled as `plain` does; a rotation matrix is preferred to a vector where there are both.
 _NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
-    "distortion": ("d", "dist", "distortioncoefficients", "distcoeffs", "distortions", "distortion"),
+    "distortion": (
+        *("d", "kc", "dist", "dists", "distortion", "distortions", "lensdistortion"),
+        *(
+            f"{one}{other}"
+            for one in ("dist", "distortion", "lensdistortion")
+            for other in ("coefficients", "coefficient", "coeffs", "coeff", "coefs", "coef", "params", "vector")
+        ),
+    ),
     "rotation": ("rot", "rotationmatrix", "r", "rvec", "rotation", "rotationvector"),
     "translation": ("t", "tvec", "translation", "translationvector"),
-    "size": ("size", "imagesize", "imgsize"),
+    "size": ("size", "imagesize", "imgsize", "resolution"),
     "width": ("width", "imagewidth", "w"),
     "height": ("height", "imageheight", "h"),
-    "fisheye": ("fisheye",),
+    "fisheye": ("fisheye", "isfisheye", "usefisheye"),
+    "model": ("cameramodel", "distortionmodel", "lensmodel", "model"),
+}
+# Coefficients that have an entry each.
+_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+# Read, or of no matter for a camera.
+_KNOWN = {
+    *(name for names in _NAMES.values() for name in names),
+    *_SINGLE,
+    *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
+    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata"),
 }
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with OpenCV's tag for matrices."""
+    """YAML with OpenCV's tag for matrices, and keys that stay text: 01 is the name of a camera."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and not key.tag.endswith(":merge"):
+                key.tag = self.DEFAULT_SCALAR_TAG
+        return super().construct_mapping(node, deep)
 
 
 def _matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
@@ -59,15 +87,18 @@ def read_opencv(path: Path) -> CameraFile:
     """
     files = sorted([*path.glob("*.yml"), *path.glob("*.yaml")]) if path.is_dir() else [path]
     cameras: list[StoredCamera] = []
+    others: list[str] = []
     for file in files:
         fields = _read_yaml(file)
         if has_intrinsics(fields):
             cameras.append(camera_from_fields(file.stem, str(file), fields))
         else:
             named = {name: value for name, value in fields.items() if has_intrinsics(value)}
+            named, rest = (named, set(fields) - set(named)) if named else _by_name(fields)
             expected = "a camera matrix (camera_matrix, K or K_<name>)"
-            cameras += cameras_from_fields(file, named or _by_name(fields), expected, sorted(fields))
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
+            cameras += cameras_from_fields(file, named, expected, sorted(fields))
+            others += unread(str(file), {key: fields[key] for key in rest}, _KNOWN)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv", others)
 
 
 def read_easymocap(path: Path) -> CameraFile:
@@ -81,10 +112,11 @@ def read_easymocap(path: Path) -> CameraFile:
     for file in (folder / name for name in EASYMOCAP):
         require(file.exists(), str(file), "EasyMocap's file beside the other", "no such file")
         fields |= _read_yaml(file)
-    named = _by_name(fields)
+    named, rest = _by_name(fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
     cameras = [camera_from_fields(name, f"{folder}: {name}", camera) for name, camera in named.items()]
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
+    others = unread(str(folder), {key: fields[key] for key in rest}, _KNOWN)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap", others)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -100,13 +132,18 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
 
 
-def _by_name(fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Cameras whose keys carry their names."""
-    cameras: dict[str, dict[str, Any]] = {}
+def _by_name(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], set[str]]:
+    """Cameras whose keys carry their names (K_01, dist_01, R_01, Rot_01, T_01), and the other keys."""
+    cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
+    rest = set(fields)
     for key, value in fields.items():
-        if match := _WITH_NAME.fullmatch(key):
-            cameras.setdefault(match[2], {})[match[1]] = value
-    return {name: camera for name, camera in cameras.items() if has_intrinsics(camera)}
+        # The longest name: K_1 beside K_cam_1.
+        ends = [name for name in cameras if key.endswith(f"_{name}")]
+        if ends:
+            name = max(ends, key=len)
+            cameras[name][key.removesuffix(f"_{name}")] = value
+            rest.discard(key)
+    return cameras, rest
 
 
 def cameras_from_fields(
@@ -123,7 +160,7 @@ def cameras_from_fields(
 
 def find(fields: Mapping[str, Any], what: str) -> Any:
     """The value of an entry of ``_NAMES``; None where no spelling of it is there."""
-    spelled = {key.lower().replace("_", ""): value for key, value in fields.items()}
+    spelled = {plain(key): value for key, value in fields.items()}
     return next((spelled[name] for name in _NAMES[what] if name in spelled), None)
 
 
@@ -144,6 +181,10 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
         InputError: a matrix is missing, or is none.
     """
 
+    spelled = [plain(key) for key in fields]
+    twice = [key for key in fields if spelled.count(plain(key)) > 1]
+    require(not twice, origin, "each entry once, without case and underscores", twice)
+
     def array(what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
         value, names = find(fields, what), " or ".join(_NAMES[what])
         require(value is not None, origin, f"{what} ({names})", sorted(fields))
@@ -155,10 +196,16 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = array("translation", (3,), (3, 1), (1, 3)).ravel()
-    no_distortion = find(fields, "distortion") is None
-    distortion = np.zeros(0) if no_distortion else array("distortion", (None,), (None, 1), (1, None)).ravel()
-    intrinsics, fisheye = array("intrinsics", (3, 3)), bool(find(fields, "fisheye"))
-    return StoredCamera(name, origin, intrinsics, pose, size_from_fields(origin, fields), distortion, fisheye)
+    intrinsics, size = array("intrinsics", (3, 3)), size_from_fields(origin, fields)
+    fisheye = is_fisheye(origin, find(fields, "fisheye"), find(fields, "model"))
+    single = {plain(key): value for key, value in fields.items() if plain(key) in _SINGLE}
+    if find(fields, "distortion") is not None:
+        distortion = array("distortion", (None,), (None, 1), (1, None)).ravel()
+    else:
+        numbers = {key: float(check_array(f"{origin}: {key}", value, [()])) for key, value in single.items()}
+        distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
+    keys = unread(origin, fields, _KNOWN)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye, unread=keys)
 
 
 def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:
