@@ -1,5 +1,6 @@
 """Scans: textured meshes, either as THuman2.0 stores them (``.obj``) or ``.glb`` files with several parts."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,10 +9,12 @@ import trimesh
 from PIL import Image
 
 from ghgs_lit.data.decoding import read_array, read_image
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
+# Of glTF, which trimesh does not unpack.
+_COMPRESSIONS = {"EXT_meshopt_compression"}
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
@@ -59,6 +62,8 @@ def _mesh_file(folder: Path) -> Path | None:
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     """All textured meshes of a file, in its world frame."""
+    compressed = _COMPRESSIONS & set(_extensions(path))
+    require(not compressed, str(path), "a mesh without compression", ", ".join(sorted(compressed)))
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
@@ -72,6 +77,19 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     if not parts:
         raise InputError(f"{path}: expected triangles; found none")
     return tuple(parts)
+
+
+def _extensions(path: Path) -> list[str]:
+    """The extensions without which a file of glTF cannot be read; none of other files."""
+    if path.suffix not in (".glb", ".gltf"):
+        return []
+    try:
+        content = path.read_bytes()
+        if path.suffix == ".glb":
+            content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+        return json.loads(content).get("extensionsRequired", [])
+    except (OSError, ValueError, AttributeError):
+        return []  # trimesh says what is wrong with it
 
 
 def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -> TexturedMesh:

@@ -36,7 +36,7 @@ _NAMES = {
         *(
             f"{one}{other}"
             for one in ("dist", "distortion", "lensdistortion")
-            for other in ("coefficients", "coefficient", "coeffs", "coeff", "coefs", "coef", "params", "vector")
+            for other in ("coefficients", "coefficient", "coeffs", "coeff", "coefs", "coef", "params")
         ),
     ),
     "rotation": ("rot", "rotationmatrix", "r", "rvec", "rotation", "rotationvector"),
