@@ -60,11 +60,11 @@ def _unread_override(error: OverrideParseException) -> str:
     key, equals, value = str(error.override).partition("=")
     if not equals or value[:1] in tuple("[{\"'"):
         return f"{error.override}: expected key=value or group=option; found {error}"
-    value = value.replace("\\", "\\\\").replace('"', '\\"')
-    quoted = shlex.quote(f'{key}="{value}"')
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+    quoted = shlex.quote(f'{key}="{escaped}"')
     return (
-        f"{error.override}: expected key=value or group=option, and quotes around a value with other"
-        f" characters than letters of English, digits and /-_.:%+@ ({quoted}); found {error}"
+        f"{key}: expected quotes around a value with other characters than English letters, digits and"
+        f" /-_.:%+@, two kinds because of the shell: {quoted}; found {value}"
     )
 
 

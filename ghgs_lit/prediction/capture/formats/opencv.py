@@ -28,16 +28,16 @@ from ghgs_lit.prediction.capture.formats.camera_file import (
 
 #: The files of EasyMocap: intrinsics and poses.
 EASYMOCAP = ("intri.yml", "extri.yml")
+_COEFFICIENTS = (
+    *("coefficients", "coefficient", "coeffs", "coeff", "coefs", "coef"),
+    *("parameters", "params"),
+)
 # Spelled as `plain` does; a rotation matrix is preferred to a vector where there are both.
 _NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
     "distortion": (
         *("d", "kc", "dist", "dists", "distortion", "distortions", "lensdistortion"),
-        *(
-            f"{one}{other}"
-            for one in ("dist", "distortion", "lensdistortion")
-            for other in ("coefficients", "coefficient", "coeffs", "coeff", "coefs", "coef", "params")
-        ),
+        *(f"{one}{other}" for one in ("dist", "distortion", "lensdistortion") for other in _COEFFICIENTS),
     ),
     "rotation": ("rot", "rotationmatrix", "r", "rvec", "rotation", "rotationvector"),
     "translation": ("t", "tvec", "translation", "translationvector"),
