@@ -33,10 +33,12 @@ def one_camera(tmp_path, **entries):
 
 @pytest.mark.parametrize(
     "spelling",
-    """D d dist Dist dists kc distortion distortions distCoeff distCoeffs dist_coeff dist_coeffs dist-coeffs
-    distCoef dist_coefs distortion_coefficients distortionCoefficients distortion_coefficient distortion_coeffs
-    distortion_coef distortion_params distortion_parameters dist_params lens_distortion
-    lensDistortionCoefficients""".split(),
+    [
+        *("D", "d", "dist", "Dist", "dists", "kc", "distortion", "distortions", "lens_distortion"),
+        *("distCoeff", "distCoeffs", "dist_coeff", "dist-coeffs", "distCoef", "dist_coefs", "dist_params"),
+        *("distortion_coefficients", "distortionCoefficients", "distortion_coefficient", "distortion_coeffs"),
+        *("distortion_coef", "distortion_params", "distortion_parameters", "lensDistortionCoefficients"),
+    ],
 )
 def test_a_lens_counts_under_every_name(tmp_path, spelling):
     for value in (LENS, [LENS]):  # a list, or a row of a matrix as NumPy has it
@@ -95,11 +97,12 @@ def test_a_fisheye_lens_is_told_by_model_or_flag(tmp_path):
         np.testing.assert_array_equal(camera.distortion, list(lens.values()))
     for said, line in (
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "fisheye: expected the lens of OPENCV; found True"),
-        ({}, r"expected distortion k1 k2 p1 p2 k3; found \['k4'\]"),
+        ({"k4": 0.1}, r"expected distortion k1 k2 p1 p2 k3; found \['k4'\]"),
+        ({"is_fisheye": True, "p1": 0.1}, r"expected distortion k1 k2 k3 k4; found \['p1'\]"),
         ({"ftheta_p0": 1.0}, r"found \['ftheta_p0'\]"),
     ):
         with pytest.raises(InputError, match=line):
-            read_cameras(transforms(tmp_path, frame("a.png"), **lens, **said))
+            read_cameras(transforms(tmp_path, frame("a.png"), **said))
 
 
 def test_nerfstudios_simple_radial(tmp_path):
@@ -200,9 +203,8 @@ def test_qualisys(tmp_path):
         lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera["D"], strict=True))
         k = 64 * camera["K"]
         text = QUALISYS.format(
-            **{"name": name, "right": SIZE[1] - 1, "bottom": SIZE[0] - 1, "turn": " ".join(
-                f'r{i + 1}{j + 1}="{turn[i, j]}"' for i in range(3) for j in range(3)
-            )},
+            name=name, right=SIZE[1] - 1, bottom=SIZE[0] - 1,
+            turn=" ".join(f'r{i + 1}{j + 1}="{turn[i, j]}"' for i in range(3) for j in range(3)),
             **dict(zip("xyz", eye, strict=True)), **lens,
             fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2],
         )  # fmt: skip
@@ -259,6 +261,13 @@ def rename(capture, folder, change):
         os.rename(path, path.with_name(change(path.name)))
 
 
+def renamed(capture, change):
+    """Rename the cameras of the calibration."""
+    content = json.loads((capture / "cameras.json").read_text())
+    cameras = {change(name): camera for name, camera in content["cameras"].items()}
+    write(capture / "cameras.json", {"cameras": cameras})
+
+
 @pytest.mark.parametrize("change", [lambda n: n.replace(".png", ".PNG"), lambda n: n.replace(".", ".png.")])
 def test_names_of_masks(capture, change):
     """``cam0.PNG`` of Windows, and COLMAP's ``cam0.png.png``."""
@@ -267,8 +276,7 @@ def test_names_of_masks(capture, change):
 
 
 def test_numbered_cameras_have_photographs_of_other_names(capture):
-    content = (capture / "cameras.json").read_text()
-    write(capture / "cameras.json", content.replace('"cam', '"'))
+    renamed(capture, lambda name: name.removeprefix("cam"))
     for folder in ("images", "masks"):
         rename(capture, folder, lambda name: name.replace("cam", "view"))
     names = {f"view{n}": n for n in range(4)}
@@ -277,9 +285,7 @@ def test_numbered_cameras_have_photographs_of_other_names(capture):
 
 def test_letters_of_macos(capture):
     """An umlaut of two characters in names of files, of one in the calibration."""
-    write(
-        capture / "cameras.json", json.loads((capture / "cameras.json").read_text().replace("cam", "Käthe"))
-    )
+    renamed(capture, lambda name: name.replace("cam", "K\u00e4the"))
     for folder, form in (("images", "NFD"), ("masks", "NFC")):
         rename(capture, folder, lambda n, form=form: unicodedata.normalize(form, n.replace("cam", "Käthe")))
     assert len(read(capture).photographs) == 4
