@@ -10,11 +10,7 @@ from typing import Any
 
 import lightning.pytorch as L
 from hydra.core.hydra_config import HydraConfig
-from lightning.fabric.plugins.environments import (
-    ClusterEnvironment,
-    LightningEnvironment,
-    TorchElasticEnvironment,
-)
+from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
@@ -109,10 +105,10 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
     )
 
 
-def _environment() -> list[ClusterEnvironment]:
+def _environment() -> list[LightningEnvironment]:
     """The plugin of a job of SLURM that no ``srun`` started: its tasks are no processes."""
-    by_srun = "SLURM_STEP_ID" in os.environ or "SRUN_DEBUG" in os.environ
-    is_alone = "SLURM_NTASKS" in os.environ and not by_srun and not TorchElasticEnvironment.detect()
+    starters = ("SLURM_STEP_ID", "SRUN_DEBUG", "TORCHELASTIC_RUN_ID")
+    is_alone = "SLURM_NTASKS" in os.environ and not any(name in os.environ for name in starters)
     return [LightningEnvironment()] if is_alone else []
 
 

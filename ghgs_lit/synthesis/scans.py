@@ -1,6 +1,5 @@
 """Scans: textured meshes, either as THuman2.0 stores them (``.obj``) or ``.glb`` files with several parts."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
 # Of glTF, which trimesh does not unpack.
-_COMPRESSIONS = {"EXT_meshopt_compression"}
+_COMPRESSION = b"EXT_meshopt_compression"
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
@@ -62,8 +61,8 @@ def _mesh_file(folder: Path) -> Path | None:
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     """All textured meshes of a file, in its world frame."""
-    compressed = _COMPRESSIONS & set(_extensions(path))
-    require(not compressed, str(path), "a mesh without compression", ", ".join(sorted(compressed)))
+    is_compressed = path.suffix != ".obj" and _COMPRESSION in path.read_bytes()
+    require(not is_compressed, str(path), "a mesh without compression", _COMPRESSION.decode())
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise
@@ -77,19 +76,6 @@ def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     if not parts:
         raise InputError(f"{path}: expected triangles; found none")
     return tuple(parts)
-
-
-def _extensions(path: Path) -> list[str]:
-    """The extensions without which a file of glTF cannot be read; none of other files."""
-    if path.suffix not in (".glb", ".gltf"):
-        return []
-    try:
-        content = path.read_bytes()
-        if path.suffix == ".glb":
-            content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
-        return json.loads(content).get("extensionsRequired", [])
-    except (OSError, ValueError, AttributeError):
-        return []  # trimesh says what is wrong with it
 
 
 def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -> TexturedMesh:

@@ -71,8 +71,7 @@ class StoredCamera:
         distortion: of OpenCV's model, 0 to 14 numbers: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tx ty; with
             ``fisheye`` k1 to k4 of Kannala and Brandt's.
         fisheye: which of these models.
-        masks: those of its photographs that the file names, by folder and name without suffix.
-        unread: keys of the file that say nothing to its reader.
+        mask: the photograph's mask, where the file names it.
     """
 
     name: str
@@ -82,18 +81,12 @@ class StoredCamera:
     size: tuple[int, int] | None = None
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     fisheye: bool = False
-    masks: dict[str, Path] = field(default_factory=dict)
-    unread: tuple[str, ...] = ()
+    mask: Path | None = None
 
-    def is_same(self, other: "StoredCamera") -> bool:
-        """Whether all numbers are equal."""
-        numbers = [(c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other)]
-        return all(np.array_equal(*pair) for pair in zip(*numbers, strict=True))
-
-    def mask_of(self, photograph: Path) -> Path | None:
-        """The mask that the file names for a photograph: with its folder and name, else the only one."""
-        only = next(iter(self.masks.values())) if len(self.masks) == 1 else None
-        return self.masks.get(f"{photograph.parent.name}/{photograph.stem}", only)
+    def has_numbers_of(self, other: "StoredCamera") -> bool:
+        """Whether both mean the same camera."""
+        both = [(c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other)]
+        return all(np.array_equal(*pair) for pair in zip(*both, strict=True))
 
     def __post_init__(self) -> None:
         object.__setattr__(

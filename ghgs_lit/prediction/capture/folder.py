@@ -162,7 +162,7 @@ class CaptureFolder:
         if self.segment is not None:
             return _segmenter(self.segment)(pixels)
         beside = mask_path(path, images, images)
-        named = beside if beside is not None else camera.mask_of(path)
+        named = beside if beside is not None else camera.mask
         if named is not None:
             return matte_of_file(named, pixels)
         if pixels.alpha is not None:

@@ -108,11 +108,7 @@ def images_in(folder: Path) -> dict[str, Path]:
 
 def image_named(folder: Path, *names: str) -> Path | None:
     """The image of a folder with one of these names (without suffix), None where there is none."""
-    places = (folder / f"{name}{suffix}" for name in names for suffix in SUFFIXES)
-    exact = next((path for path in places if path.exists()), None)
-    if exact is not None or not folder.is_dir():
-        return exact
-    paths = _listed(folder, folder.stat().st_mtime_ns)
+    paths = _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
     keys = ((composed(name), suffix) for name in names for suffix in SUFFIXES)
     return next((paths[key] for key in keys if key in paths), None)
 

@@ -203,18 +203,11 @@ def exported_subject(
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """The names of photographs as parts of the names of files, all different also without case.
-
-    A name that is fit for a file stays; of others that become one, the second ends with ``_2``.
-    """
-    fit = ["".join(c if c.isalnum() or c in "-_." else "_" for c in view) for view in views]
-    names: dict[int, str] = {}
-    taken: set[str] = set()
-    for i in sorted(range(len(views)), key=lambda i: fit[i] != views[i]):
-        names[i] = next(
-            name
-            for name in (fit[i], *(f"{fit[i]}_{n}" for n in range(2, len(views) + 2)))
-            if name.casefold() not in taken
-        )
-        taken.add(names[i].casefold())
-    return [names[i] for i in range(len(views))]
+    """The names of photographs as parts of the names of files, all different also without case."""
+    names: dict[str, str] = {}
+    for view in views:
+        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+        while name.casefold() in names:
+            name += "_"
+        names[name.casefold()] = name
+    return list(names.values())

@@ -1,6 +1,5 @@
 """Files of cameras: one module a format, each a function from a path to a :class:`CameraFile`."""
 
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,10 +39,7 @@ def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
     choice("calibration.format", format, ("auto", *FORMATS))
     if not path.exists():
         raise InputError(f"{path}: expected a file or folder of cameras; found no such path")
-    file = FORMATS[_format_of(path) if format == "auto" else format](path)
-    if file.unread:
-        warnings.warn(f"{path}: entries that are not read: {', '.join(file.unread)}", stacklevel=2)
-    return file
+    return FORMATS[_format_of(path) if format == "auto" else format](path)
 
 
 def _format_of(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 import re
 import unicodedata
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,58 +14,45 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 
 _SUFFIXES = ("jpg", "jpeg", "png", "tif", "tiff", "bmp", "webp")
-# Entries of a lens, as :func:`plain` spells them: leaving one out would bend the picture.
+# Entries about a lens, as :func:`plain` spells them, and models of lenses by a part of their names.
 _LENS = re.compile(
     r"(?<!un)dist(?!ance)|lens|radial|tangent|fisheye|omni|ftheta|latlong|equirect|^[kps]\d$|^xi$"
 )
-# Models of lenses, by a part of their names: Kannala and Brandt's, OpenCV's, and those that are not read.
 _FISHEYE = re.compile("fisheye|equidistant|kannala")
-_PERSPECTIVE = re.compile("opencv|pinhole|radial|perspective|plumbbob|radtan|rational|brown")
-_OTHER = re.compile("omni|spher|equirect|theta|division|panoram|latlong|orthogr|unified|prism|fov")
+_OTHER = re.compile("omni|spher|equirect|theta|division|panoram|latlong|orthogr|prism|fov")
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The cameras of a file.
-
-    Attributes:
-        cameras: by name.
-        convention: the meaning of their numbers by the format.
-        format: its name.
-        unread: entries of the file that say nothing to its reader.
-    """
+    """The cameras of a file by name, the meaning of their numbers by its format, and the format's name."""
 
     cameras: dict[str, StoredCamera]
     convention: Convention
     format: str
-    unread: tuple[str, ...] = ()
 
     @classmethod
-    def of(
-        cls,
-        cameras: Sequence[StoredCamera],
-        convention: Convention,
-        format: str,
-        unread: Collection[str] = (),
-    ) -> "CameraFile":
+    def of(cls, cameras: Sequence[StoredCamera], convention: Convention, format: str) -> "CameraFile":
         """Cameras in their order, named by their photographs without folder and suffix.
 
-        Where photographs of one camera have different names, those of several instants, the camera is named
-        by their folder.
+        Where several cameras share these names, those of instants, they are named by folders, or as the file
+        has it. A camera that is listed for several photographs is one, without their masks.
 
         Raises:
             InputError: two cameras have one name.
         """
-        unread = sorted({*unread, *(key for camera in cameras for key in camera.unread)})
-        for part in (-1, -2):
-            named = _merged(cameras, [_parts(camera.name)[part:][0] for camera in cameras])
-            if named is not None:
-                return cls(named, convention, format, tuple(unread))
-        whole = {unicodedata.normalize("NFC", camera.name): camera for camera in cameras}
-        names = [camera.name for camera in cameras]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        require(len(whole) == len(names), cameras[0].origin, "cameras of different names", f"twice {twice}")
-        return cls(whole, convention, format, tuple(unread))
+        for part in (-1, -2, 0):
+            named: dict[str, StoredCamera] = {}
+            for camera in cameras:
+                name = _parts(camera.name)[part:][0] if part else unicodedata.normalize("NFC", camera.name)
+                if name not in named:
+                    named[name] = camera
+                elif named[name].has_numbers_of(camera):
+                    named[name] = replace(camera, mask=None)
+                else:
+                    break
+            else:
+                return cls(named, convention, format)
+        raise InputError(f"{camera.origin}: expected cameras of different names; found {name} twice")
 
 
 def _parts(name: str) -> list[str]:
@@ -74,46 +62,28 @@ def _parts(name: str) -> list[str]:
     return [*folders, stem if dot and suffix.lower() in _SUFFIXES else last]
 
 
-def end_of(photograph: str) -> str:
-    """Folder and name of a photograph without its suffix, by which :meth:`StoredCamera.mask_of` finds it."""
-    return "/".join(_parts(photograph)[-2:])
-
-
-def _merged(cameras: Sequence[StoredCamera], names: Sequence[str]) -> dict[str, StoredCamera] | None:
-    """Cameras by name with the masks of all their photographs; None where one name has two cameras."""
-    merged: dict[str, StoredCamera] = {}
-    for name, camera in zip(names, cameras, strict=True):
-        first = merged.get(name)
-        if first is None:
-            merged[name] = camera
-        elif camera.name == first.name or not camera.is_same(first):
-            return None
-        else:
-            merged[name] = replace(first, masks={**first.masks, **camera.masks})
-    return merged
-
-
 def plain(key: str) -> str:
-    """A key without case, underscores and other signs, by which files differ."""
-    return "".join(filter(str.isalnum, str(key).lower()))
+    """A key without case, signs and the word coefficients or parameters, by which files differ."""
+    return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, key.lower())))
 
 
-def unread(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> tuple[str, ...]:
-    """The keys that a reader does not know.
+def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> None:
+    """Name in a warning what a reader does not know.
 
     Args:
         origin: file and key, for messages.
-        fields: of a camera.
-        known: what is read or says nothing about the picture, as :func:`plain` spells it.
+        fields: of a camera, or of the file.
+        known: what is read or of no matter, as :func:`plain` spells it.
 
     Raises:
-        InputError: one of them is about the lens, and not empty or 0.
+        InputError: it is about the lens, and not empty or 0: without it the picture would be bent.
     """
-    keys = [key for key in fields if plain(key) not in known]
-    lens = [key for key in keys if _LENS.search(plain(key)) and _bends(fields[key])]
+    unread = {key: value for key, value in fields.items() if plain(key) not in known}
+    lens = [key for key, value in unread.items() if _LENS.search(plain(key)) and _bends(value)]
     expected = "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4"
     require(not lens, origin, expected, lens)
-    return tuple(keys)
+    if unread:  # the same text for each camera, which Python shows once
+        warnings.warn(f"cameras: entries that are not read: {', '.join(sorted(unread))}", stacklevel=2)
 
 
 def _bends(value: Any) -> bool:
@@ -129,14 +99,14 @@ def is_fisheye(origin: str, flag: Any, model: Any) -> bool:
     Raises:
         InputError: the flag is none, they contradict each other, or it is a model of another kind.
     """
-    kind = plain(model or "")
+    name = plain(str(model or ""))
+    by_name = bool(_FISHEYE.search(name))
     expected = "a camera model of OpenCV (perspective or fisheye)"
-    named = True if _FISHEYE.search(kind) else False if _PERSPECTIVE.search(kind) else None
-    require(bool(named) or not _OTHER.search(kind), f"{origin}: camera model", expected, model)
+    require(by_name or not _OTHER.search(name), f"{origin}: camera model", expected, model)
     if flag is None:
-        return bool(named)
+        return by_name
     require(flag in (0, 1), f"{origin}: fisheye", "true or false", flag)
-    require(named in (None, bool(flag)), f"{origin}: fisheye", f"the lens of {model}", flag)
+    require(not name or by_name == flag, f"{origin}: fisheye", f"the lens of {model}", flag)
     return bool(flag)
 
 

@@ -58,29 +58,15 @@ def read_colmap(path: Path) -> CameraFile:
 
 
 def _names(folder: Path) -> dict[int, str]:
-    """The photographs of ``images.txt``, whose names COLMAP's own reader cuts at a space.
-
-    Raises:
-        InputError: one has a camera that ``cameras.txt`` lacks, or a line is none of a photograph.
-    """
-    names: dict[int, str] = {}
-    path, other = folder / "images.txt", folder / "cameras.txt"
-    if (folder / "images.bin").exists() or not path.exists() or not other.exists():
-        return names
-    lines = other.read_text(encoding="utf-8", errors="replace").splitlines()
-    known = {line.split()[0] for line in lines if line.strip() and not line.startswith("#")}
-    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
-    for line in lines:
-        if not line.strip() or line.startswith("#"):
-            continue
-        fields = line.split(maxsplit=9)
-        is_image = len(fields) == 10 and fields[0].isdecimal()
-        require(is_image, str(path), "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line)
-        expected = f"a camera of cameras.txt ({', '.join(sorted(known))}) for {fields[9]}"
-        require(fields[8] in known, str(path), expected, fields[8])
-        names[int(fields[0])] = fields[9].rstrip()
-        next(lines, None)  # its points
-    return names
+    """The photographs of ``images.txt``, whose names COLMAP's own reader cuts at a space."""
+    path = folder / "images.txt"
+    if (folder / "images.bin").exists() or not path.exists():
+        return {}
+    lines = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    lines = [line for line in lines if not line.startswith("#")]
+    # Every second line has points.
+    images = [fields for line in lines[::2] if len(fields := line.split(maxsplit=9)) == 10]
+    return {int(fields[0]): fields[9].rstrip() for fields in images if fields[0].isdecimal()}
 
 
 def _camera(folder: Path, name: str, image, camera) -> StoredCamera:

@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,13 @@ from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
-from ghgs_lit.prediction.capture.formats.opencv import cameras_from_fields, has_intrinsics, size_from_fields
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_unread, read_mapping
+from ghgs_lit.prediction.capture.formats.opencv import (
+    KNOWN,
+    cameras_from_fields,
+    has_intrinsics,
+    size_from_fields,
+)
 from ghgs_lit.prediction.export.maps import camera_entry, cameras_json
 
 _KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
@@ -37,23 +42,24 @@ def read_json(path: Path) -> CameraFile:
         InputError: a camera is missing or wrong.
     """
     content = read_json_file(path)
-    named, others = _cameras_of(content)
-    require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
+    named = _cameras_of(path, content)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
     if not with_extrinsics:
-        return _read_matrices(path, named, others, "opencv")
+        return _read_matrices(path, named, "opencv")
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, KNOWN)
     cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
-    return CameraFile.of(cameras, Convention(), "ghgs", {*others, *set(named) - set(with_extrinsics)})
+    return CameraFile.of(cameras, Convention(), "ghgs")
 
 
-def _cameras_of(content: Mapping[str, Any]) -> tuple[Any, list[str]]:
-    """What stands for the cameras, of a list by their names, and the keys beside it."""
-    if "cameras" not in content:
-        return content, []
-    named = content["cameras"]
+def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Cameras by name, where they have an entry of their own beside others, in which they may be a list."""
+    named = content.get("cameras", content)
     if isinstance(named, list) and all(isinstance(camera, Mapping) for camera in named):
         named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
-    return named, [key for key in content if key not in ("cameras", "metadata")]
+    require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
+    if "cameras" in content:
+        check_unread(str(path), content, KNOWN)
+    return named
 
 
 def read_toml(path: Path) -> CameraFile:
@@ -62,20 +68,18 @@ def read_toml(path: Path) -> CameraFile:
     Raises:
         InputError: a camera is missing or wrong.
     """
-    tables, others = _cameras_of(read_mapping(path, tomllib.loads, "TOML", "TOML"))
+    tables = _cameras_of(path, read_mapping(path, tomllib.loads, "TOML", "TOML"))
     named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
-    return _read_matrices(path, named, others, "toml")
+    return _read_matrices(path, named, "toml")
 
 
-def _read_matrices(
-    path: Path, named: Mapping[str, Any], others: Sequence[str], name_of_format: str
-) -> CameraFile:
-    """OpenCV's matrices by the names of cameras; ``others`` are keys beside them."""
+def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
+    """OpenCV's matrices by the names of cameras."""
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if has_intrinsics(camera)}
     cameras = cameras_from_fields(path, with_intrinsics, expected, sorted(named))
-    rest = {*others, *set(named) - set(with_intrinsics) - {"metadata"}}
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format, rest)
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, KNOWN)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
 
 
 def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:

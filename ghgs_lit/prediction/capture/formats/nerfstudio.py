@@ -12,12 +12,11 @@ from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import (
     CameraFile,
+    check_unread,
     coefficients,
-    end_of,
     is_fisheye,
     pinhole,
     plain,
-    unread,
 )
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
@@ -78,10 +77,9 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     require(not beyond, origin, f"distortion {names}", beyond)
     distortion = coefficients(numbers, names)
     pose = check_array(f"{origin}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
-    name, mask = str(frame["file_path"]), frame.get("mask_path")
-    masks = {end_of(name): path.parent / str(mask)} if mask else {}
-    keys = unread(origin, fields, _KNOWN)
-    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye, masks, keys)
+    mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
+    check_unread(origin, fields, _KNOWN)
+    return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
 
 
 def _number(origin: str, key: str, value: Any) -> float:

@@ -19,42 +19,35 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import (
     CameraFile,
+    check_unread,
     coefficients,
     is_fisheye,
     plain,
     read_mapping,
-    unread,
 )
 
 #: The files of EasyMocap: intrinsics and poses.
 EASYMOCAP = ("intri.yml", "extri.yml")
-_COEFFICIENTS = (
-    *("coefficients", "coefficient", "coeffs", "coeff", "coefs", "coef"),
-    *("parameters", "params"),
-)
 # Spelled as `plain` does; a rotation matrix is preferred to a vector where there are both.
 _NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
-    "distortion": (
-        *("d", "kc", "dist", "dists", "distortion", "distortions", "lensdistortion"),
-        *(f"{one}{other}" for one in ("dist", "distortion", "lensdistortion") for other in _COEFFICIENTS),
-    ),
+    "distortion": ("d", "dist", "distortion", "dists", "distortions", "lensdistortion", "kc"),
     "rotation": ("rot", "rotationmatrix", "r", "rvec", "rotation", "rotationvector"),
     "translation": ("t", "tvec", "translation", "translationvector"),
     "size": ("size", "imagesize", "imgsize", "resolution"),
     "width": ("width", "imagewidth", "w"),
     "height": ("height", "imageheight", "h"),
     "fisheye": ("fisheye", "isfisheye", "usefisheye"),
-    "model": ("cameramodel", "distortionmodel", "lensmodel", "model"),
+    "model": ("cameramodel", "distortionmodel", "lensmodel"),
 }
-# Coefficients that have an entry each.
+# Coefficients with an entry each.
 _SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-# Read, or of no matter for a camera.
-_KNOWN = {
+#: Entries that are read, or of no matter for a camera.
+KNOWN = {
     *(name for names in _NAMES.values() for name in names),
     *_SINGLE,
     *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
-    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata"),
+    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras", "sizes"),
 }
 
 
@@ -87,18 +80,16 @@ def read_opencv(path: Path) -> CameraFile:
     """
     files = sorted([*path.glob("*.yml"), *path.glob("*.yaml")]) if path.is_dir() else [path]
     cameras: list[StoredCamera] = []
-    others: list[str] = []
     for file in files:
         fields = _read_yaml(file)
         if has_intrinsics(fields):
             cameras.append(camera_from_fields(file.stem, str(file), fields))
         else:
             named = {name: value for name, value in fields.items() if has_intrinsics(value)}
-            named, rest = (named, set(fields) - set(named)) if named else _by_name(fields)
+            named = named or _by_name(str(file), fields)
             expected = "a camera matrix (camera_matrix, K or K_<name>)"
             cameras += cameras_from_fields(file, named, expected, sorted(fields))
-            others += unread(str(file), {key: fields[key] for key in rest}, _KNOWN)
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv", others)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
 
 
 def read_easymocap(path: Path) -> CameraFile:
@@ -112,11 +103,10 @@ def read_easymocap(path: Path) -> CameraFile:
     for file in (folder / name for name in EASYMOCAP):
         require(file.exists(), str(file), "EasyMocap's file beside the other", "no such file")
         fields |= _read_yaml(file)
-    named, rest = _by_name(fields)
+    named = _by_name(str(folder), fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
     cameras = [camera_from_fields(name, f"{folder}: {name}", camera) for name, camera in named.items()]
-    others = unread(str(folder), {key: fields[key] for key in rest}, _KNOWN)
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap", others)
+    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -132,18 +122,16 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
 
 
-def _by_name(fields: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], set[str]]:
-    """Cameras whose keys carry their names (K_01, dist_01, R_01, Rot_01, T_01), and the other keys."""
+def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01."""
     cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
-    rest = set(fields)
+    others: dict[str, Any] = {}
     for key, value in fields.items():
         # The longest name: K_1 beside K_cam_1.
-        ends = [name for name in cameras if key.endswith(f"_{name}")]
-        if ends:
-            name = max(ends, key=len)
-            cameras[name][key.removesuffix(f"_{name}")] = value
-            rest.discard(key)
-    return cameras, rest
+        name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
+        cameras.get(name, others)[key.removesuffix(f"_{name}")] = value
+    check_unread(origin, others, KNOWN)
+    return cameras
 
 
 def cameras_from_fields(
@@ -204,8 +192,8 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     else:
         numbers = {key: float(check_array(f"{origin}: {key}", value, [()])) for key, value in single.items()}
         distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
-    keys = unread(origin, fields, _KNOWN)
-    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye, unread=keys)
+    check_unread(origin, fields, KNOWN)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye)
 
 
 def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:

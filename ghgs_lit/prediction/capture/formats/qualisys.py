@@ -10,10 +10,8 @@ from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
 
 _SUBPIXELS = 64
-_COEFFICIENTS = {
-    **{f"k{i}": f"radialDistortion{i}" for i in (1, 2, 3)},
-    **{f"p{i}": f"tangentalDistortion{i}" for i in (1, 2)},
-}
+_ORDER = "k1 k2 p1 p2 k3"
+_DISTORTION = {"k": "radialDistortion", "p": "tangentalDistortion"}
 
 
 def read_qualisys(path: Path) -> CameraFile:
@@ -23,36 +21,29 @@ def read_qualisys(path: Path) -> CameraFile:
         InputError: it is no such file, or an entry is missing or no number.
     """
     try:
-        # Python's XML reader itself limits entities that grow.
-        cameras = list(ElementTree.parse(path).getroot().iter("camera"))
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: expected Qualisys' XML; found {error}") from error
+        cameras = [_camera(path, camera) for camera in ElementTree.parse(path).getroot().iter("camera")]
+    except (OSError, ElementTree.ParseError, AttributeError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: expected cameras of Qualisys; found {error!r}") from error
     require(bool(cameras), str(path), "cameras of Qualisys", "none")
     convention = Convention(axes="opengl", pixel_centers="integer", unit=0.001)
-    return CameraFile.of([_camera(path, camera) for camera in cameras], convention, "qualisys")
+    return CameraFile.of(cameras, convention, "qualisys")
 
 
 def _camera(path: Path, camera: ElementTree.Element) -> StoredCamera:
-    name = camera.get("serial", "")
-    origin = f"{path}: {name}"
-
-    def numbers(element: str, *keys: str) -> list[float]:
-        node = camera.find(element)
-        require(node is not None, origin, element, [child.tag for child in camera])
-        try:
-            return [float(node.get(key, "missing")) for key in keys]
-        except ValueError:
-            expected = f"numbers {', '.join(keys)}"
-            raise InputError(f"{origin}: {element}: expected {expected}; found {node.attrib}") from None
-
-    left, top, right, bottom = numbers("fov_video", "left", "top", "right", "bottom")
-    keys = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-    fx, fy, cx, cy = (value / _SUBPIXELS for value in numbers("intrinsic", *keys))
-    values = numbers("intrinsic", *_COEFFICIENTS.values())
-    distortion = coefficients(dict(zip(_COEFFICIENTS, values, strict=True)), "k1 k2 p1 p2 k3")
+    name = camera.attrib["serial"]
+    numbers = {
+        key: float(value)
+        for part in ("fov_video", "transform", "intrinsic")
+        for key, value in camera.find(part).attrib.items()
+    }
+    fx, fy, cx, cy = (
+        numbers[f"{key}{axis}"] / _SUBPIXELS for key in ("focalLength", "centerPoint") for axis in "UV"
+    )
+    intrinsics = pinhole(fx, fy, cx - numbers["left"], cy - numbers["top"])
+    lens = {name: numbers.get(f"{_DISTORTION[name[0]]}{name[1]}", 0.0) for name in _ORDER.split()}
     pose = np.eye(4)
-    turn = [f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]
-    pose[:3, :3] = np.reshape(numbers("transform", *turn), (3, 3))
-    pose[:3, 3] = -pose[:3, :3] @ numbers("transform", "x", "y", "z")
-    size = int(bottom - top) + 1, int(right - left) + 1
-    return StoredCamera(name, origin, pinhole(fx, fy, cx - left, cy - top), pose, size, distortion)
+    pose[:3, :3] = [[numbers[f"r{row}{column}"] for column in (1, 2, 3)] for row in (1, 2, 3)]
+    pose[:3, 3] = -pose[:3, :3] @ [numbers[axis] for axis in "xyz"]
+    size = int(numbers["bottom"] - numbers["top"]) + 1, int(numbers["right"] - numbers["left"]) + 1
+    distortion = coefficients(lens, _ORDER)
+    return StoredCamera(name, f"{path}: {name}", intrinsics, pose, size, distortion)
