@@ -56,15 +56,13 @@ def one_line(error: Exception, verb: str) -> str:
 
 
 def _unread_override(error: OverrideParseException) -> str:
-    """An override that Hydra cannot read, with how to quote a plain value such as a path."""
-    key, equals, value = str(error.override).partition("=")
-    if not equals or value[:1] in tuple("[{\"'"):
+    """An override that Hydra cannot read; a plain value such as a path needs quotes."""
+    key, _, value = str(error.override).partition("=")
+    if not value or value[0] in "[{\"'":
         return f"{error.override}: expected key=value or group=option; found {error}"
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    quoted = shlex.quote(f'{key}="{escaped}"')
+    quoted = shlex.quote(f'{key}="{value}"')
     return (
-        f"{key}: expected quotes around a value with other characters than English letters, digits and"
-        f" /-_.:%+@, two kinds because of the shell: {quoted}; found {value}"
+        f"{key}: expected quotes around such a value, two kinds because of the shell: {quoted}; found {value}"
     )
 
 

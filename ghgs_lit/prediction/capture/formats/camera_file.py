@@ -1,5 +1,6 @@
 """Cameras of a file, and what the readers of all formats share."""
 
+import math
 import re
 import unicodedata
 import warnings
@@ -14,12 +15,9 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 
 _SUFFIXES = ("jpg", "jpeg", "png", "tif", "tiff", "bmp", "webp")
-# Entries about a lens, as :func:`plain` spells them, and models of lenses by a part of their names.
-_LENS = re.compile(
-    r"(?<!un)dist(?!ance)|lens|radial|tangent|fisheye|omni|ftheta|latlong|equirect|^[kps]\d$|^xi$"
-)
-_FISHEYE = re.compile("fisheye|equidistant|kannala")
-_OTHER = re.compile("omni|spher|equirect|theta|division|panoram|latlong|orthogr|prism|fov")
+# Entries about a lens, as :func:`plain` spells them, and models of which the entries do not say enough.
+_LENS = re.compile("(?<!un)dist(?!ance)|lens|radial|tangent|fisheye|model|omni|theta|^[kps][0-9]$|^xi$")
+_MODELS = re.compile("fisheye|equidist|kannala|omni|spher|equirect|theta|division|panoram|orthogr|prism|fov")
 
 
 @dataclass(frozen=True)
@@ -89,25 +87,8 @@ def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str])
 def _bends(value: Any) -> bool:
     """Whether an entry about the lens says something: numbers other than 0, or a model of another kind."""
     if isinstance(value, str):
-        return bool(_FISHEYE.search(plain(value)) or _OTHER.search(plain(value)))
+        return bool(_MODELS.search(plain(value)))
     return bool(np.any(np.asarray(value, object)))
-
-
-def is_fisheye(origin: str, flag: Any, model: Any) -> bool:
-    """Whether distortion is that of Kannala and Brandt's model, by a flag, or the model's name, or both.
-
-    Raises:
-        InputError: the flag is none, they contradict each other, or it is a model of another kind.
-    """
-    name = plain(str(model or ""))
-    by_name = bool(_FISHEYE.search(name))
-    expected = "a camera model of OpenCV (perspective or fisheye)"
-    require(by_name or not _OTHER.search(name), f"{origin}: camera model", expected, model)
-    if flag is None:
-        return by_name
-    require(flag in (0, 1), f"{origin}: fisheye", "true or false", flag)
-    require(not name or by_name == flag, f"{origin}: fisheye", f"the lens of {model}", flag)
-    return bool(flag)
 
 
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
@@ -128,6 +109,16 @@ def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: st
         raise InputError(f"{path}: expected {kind}; found {error}") from error
     require(isinstance(value, dict), str(path), content, type(value).__name__)
     return value
+
+
+def finite(origin: str, key: str, value: Any) -> float:
+    """The number that an entry holds."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    require(math.isfinite(number), f"{origin}: {key}", "a finite number", value)
+    return number
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

@@ -14,30 +14,15 @@ from ghgs_lit.prediction.capture.formats.camera_file import (
     CameraFile,
     check_unread,
     coefficients,
-    is_fisheye,
+    finite,
     pinhole,
     plain,
 )
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
-_KEYS = [
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "w",
-    "h",
-    "camera_angle_x",
-    "camera_angle_y",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-]
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_LENS)
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 # Read, or of no matter for a camera.
 _KNOWN = {
     *map(plain, _KEYS),
@@ -68,8 +53,10 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     fields = {**shared, **frame}
     model, flag = fields.get("camera_model"), fields.get("is_fisheye")
     choice(f"{origin}: camera_model", model, (None, *_MODELS))
-    fisheye = is_fisheye(origin, flag, model)
-    numbers = {key: _number(origin, key, fields[key]) for key in _KEYS if key in fields}
+    fisheye = model == "OPENCV_FISHEYE" if flag is None else bool(flag)
+    allowed = (None, False, True) if model is None else (None, model == "OPENCV_FISHEYE")
+    require(flag in allowed, f"{origin}: is_fisheye", f"{allowed[-1]} beside {model}", flag)
+    numbers = {key: finite(origin, key, fields[key]) for key in _KEYS if key in fields}
     size = (int(numbers["h"]), int(numbers["w"])) if {"h", "w"} <= set(numbers) else None
     intrinsics = _intrinsics(origin, numbers, size)
     names = "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3"
@@ -80,15 +67,6 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
     check_unread(origin, fields, _KNOWN)
     return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
-
-
-def _number(origin: str, key: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    require(math.isfinite(number), f"{origin}: {key}", "a finite number", value)
-    return number
 
 
 def _intrinsics(origin: str, numbers: Mapping[str, float], size: tuple[int, int] | None) -> np.ndarray:

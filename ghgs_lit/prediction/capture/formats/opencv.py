@@ -21,7 +21,7 @@ from ghgs_lit.prediction.capture.formats.camera_file import (
     CameraFile,
     check_unread,
     coefficients,
-    is_fisheye,
+    finite,
     plain,
     read_mapping,
 )
@@ -37,8 +37,7 @@ _NAMES = {
     "size": ("size", "imagesize", "imgsize", "resolution"),
     "width": ("width", "imagewidth", "w"),
     "height": ("height", "imageheight", "h"),
-    "fisheye": ("fisheye", "isfisheye", "usefisheye"),
-    "model": ("cameramodel", "distortionmodel", "lensmodel"),
+    "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
 }
 # Coefficients with an entry each.
 _SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -47,7 +46,8 @@ KNOWN = {
     *(name for names in _NAMES.values() for name in names),
     *_SINGLE,
     *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
-    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras", "sizes"),
+    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras"),
+    *("time", "n", "f", "v", "ccm", "bounds"),
 }
 
 
@@ -129,7 +129,9 @@ def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]
     for key, value in fields.items():
         # The longest name: K_1 beside K_cam_1.
         name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
-        cameras.get(name, others)[key.removesuffix(f"_{name}")] = value
+        field = key.removesuffix(f"_{name}")
+        # EasyVolcap's t is a time.
+        cameras.get(name, others)["time" if field == "t" else field] = value
     check_unread(origin, others, KNOWN)
     return cameras
 
@@ -169,10 +171,6 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
         InputError: a matrix is missing, or is none.
     """
 
-    spelled = [plain(key) for key in fields]
-    twice = [key for key in fields if spelled.count(plain(key)) > 1]
-    require(not twice, origin, "each entry once, without case and underscores", twice)
-
     def array(what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
         value, names = find(fields, what), " or ".join(_NAMES[what])
         require(value is not None, origin, f"{what} ({names})", sorted(fields))
@@ -185,15 +183,16 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     pose[:3, :3] = rotation
     pose[:3, 3] = array("translation", (3,), (3, 1), (1, 3)).ravel()
     intrinsics, size = array("intrinsics", (3, 3)), size_from_fields(origin, fields)
-    fisheye = is_fisheye(origin, find(fields, "fisheye"), find(fields, "model"))
+    fisheye = find(fields, "fisheye")
+    require(fisheye in (None, 0, 1), f"{origin}: fisheye", "true or false", fisheye)
     single = {plain(key): value for key, value in fields.items() if plain(key) in _SINGLE}
     if find(fields, "distortion") is not None:
         distortion = array("distortion", (None,), (None, 1), (1, None)).ravel()
     else:
-        numbers = {key: float(check_array(f"{origin}: {key}", value, [()])) for key, value in single.items()}
+        numbers = {key: finite(origin, key, value) for key, value in single.items()}
         distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
     check_unread(origin, fields, KNOWN)
-    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, bool(fisheye))
 
 
 def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:

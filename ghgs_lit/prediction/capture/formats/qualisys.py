@@ -22,6 +22,8 @@ def read_qualisys(path: Path) -> CameraFile:
     """
     try:
         cameras = [_camera(path, camera) for camera in ElementTree.parse(path).getroot().iter("camera")]
+    except InputError:
+        raise
     except (OSError, ElementTree.ParseError, AttributeError, KeyError, ValueError) as error:
         raise InputError(f"{path}: expected cameras of Qualisys; found {error!r}") from error
     require(bool(cameras), str(path), "cameras of Qualisys", "none")
