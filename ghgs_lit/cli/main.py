@@ -199,6 +199,10 @@ def _run(verb: str, argv: list[str]) -> int:
 def main() -> int:
     """The console script. Exit code 0, 1 for bad input, 2 for bad usage, 130 and 143 when interrupted."""
     argv = list(sys.argv)
+    # Schedulers and daemons may close both.
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     # OpenMP threads that spin while they wait slow down other processes on the same cores tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()

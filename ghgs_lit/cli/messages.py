@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -40,7 +41,7 @@ def one_line(error: Exception, verb: str) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
-        text = f"{error.override}: expected key=value or group=option; found {error}"
+        text = _unread_override(error)
     elif isinstance(error, HydraException):
         text = _composition(error, verb)
     elif isinstance(error, OSError):
@@ -52,6 +53,17 @@ def one_line(error: Exception, verb: str) -> str:
     else:  # of Hydra, which does not say which override it refuses
         text = f"{' '.join(sys.argv[1:])}: expected overrides that Hydra can apply; found {error}"
     return " ".join(text.split())
+
+
+def _unread_override(error: OverrideParseException) -> str:
+    """An override that Hydra cannot read; a plain value such as a path needs quotes."""
+    key, _, value = str(error.override).partition("=")
+    if not value or value[0] in "[{\"'":
+        return f"{error.override}: expected key=value or group=option; found {error}"
+    quoted = shlex.quote(f'{key}="{value}"')
+    return (
+        f"{key}: expected quotes around such a value, two kinds because of the shell: {quoted}; found {value}"
+    )
 
 
 def _missing_option(error: MissingConfigException) -> str:

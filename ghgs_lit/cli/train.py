@@ -1,6 +1,7 @@
 """``ghgs train``: train a model, then measure it."""
 
 import logging
+import os
 import time
 import warnings
 from functools import cache
@@ -9,6 +10,7 @@ from typing import Any
 
 import lightning.pytorch as L
 from hydra.core.hydra_config import HydraConfig
+from lightning.fabric.plugins.environments import LightningEnvironment
 from lightning.pytorch.callbacks import Callback, Checkpoint
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
@@ -95,12 +97,19 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
         config["trainer"],
         "trainer",
         logger=logs or False,
-        plugins=[AtomicCheckpointIO()],
+        plugins=[AtomicCheckpointIO(), *_environment()],
         callbacks=callbacks,
         default_root_dir=str(directory),
         enable_checkpointing=any(isinstance(c, Checkpoint) for c in callbacks),
         enable_progress_bar=any(isinstance(c, L.callbacks.ProgressBar) for c in callbacks),
     )
+
+
+def _environment() -> list[LightningEnvironment]:
+    """The plugin of a job of SLURM that no ``srun`` started: its tasks are no processes."""
+    starters = ("SLURM_STEP_ID", "SRUN_DEBUG", "TORCHELASTIC_RUN_ID")
+    is_alone = "SLURM_NTASKS" in os.environ and not any(name in os.environ for name in starters)
+    return [LightningEnvironment()] if is_alone else []
 
 
 def run(cfg: DictConfig) -> float | str | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -47,7 +48,7 @@ def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobR
 def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> list[Sequence[JobReturn]]:
     config, loader = sweeper.config, sweeper.hydra_context.config_loader
     planned = plan(
-        combinations(sweeper.params, arguments),
+        combinations(sweeper.params, arguments, loader),
         lambda overrides: loader.load_sweep_config(config, overrides),
     )
     for item in planned:  # an impossible launcher is refused before anything starts
@@ -68,9 +69,14 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
     return [returns]
 
 
-def combinations(params: Mapping[str, Any] | None, arguments: Sequence[str]) -> list[list[str]]:
-    """The overrides of each job; the command line's values of a key replace the sweep's own."""
-    parser = OverridesParser.create()
+def combinations(
+    params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
+) -> list[list[str]]:
+    """The overrides of each job; the command line's values of a key replace the sweep's own.
+
+    ``loader`` knows the options of groups, which ``glob(*)`` stands for.
+    """
+    parser = OverridesParser.create(config_loader=loader)
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
     own = parser.parse_overrides([f"{k}={v}" for k, v in (params or {}).items() if k not in keys])

@@ -55,8 +55,17 @@ def _sqlite(path: str) -> str:
     return f"sqlite:///{place}"
 
 
+def _folder(first: str | None, second: str) -> str:
+    return second if first is None else str(Path(first).expanduser())
+
+
 def register_resolvers() -> None:
-    """Register ``${config_hash:}``, a run's directory, and ``${sqlite:path}``, a database's URL."""
+    """Register what configurations may ask for.
+
+    ``${config_hash:}`` is a run's directory, ``${sqlite:path}`` a database's URL, ``${folder:first,second}``
+    the first of two folders, or the second where that is null.
+    """
+    OmegaConf.register_new_resolver("folder", _folder, replace=True)
     OmegaConf.register_new_resolver("config_hash", _hash_of_run, replace=True)
     OmegaConf.register_new_resolver("sqlite", _sqlite, replace=True)
 

@@ -105,7 +105,11 @@ class Synthetic(_Renderable):
         made_with = identity(self.rig.build(), self.render, self.people_seed) | {"people": people_version()}
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
-        return str(Path(cache).expanduser() / f"synthetic-{key}")
+        try:
+            return str(Path(cache).expanduser() / f"synthetic-{key}")
+        except RuntimeError:  # of users of a container whom it does not know
+            expected = "a folder, or one in GHGS_CACHE, where there is no home directory"
+            raise InputError(f"data.cache_dir: expected {expected}; found {cache}") from None
 
     @property
     def split_names(self) -> tuple[str, ...]:

@@ -30,6 +30,7 @@ from ghgs_lit.data.layout import position_name
 from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
@@ -208,7 +209,7 @@ def render_people(
 
 def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
     """Finished jobs, in the order in which they finish."""
-    workers = min(len(jobs), os.cpu_count() or 1 if workers is None else workers)
+    workers = min(len(jobs), allowed_cores() if workers is None else workers)
     if workers < 2:
         yield from map(render_subject, jobs)
         return

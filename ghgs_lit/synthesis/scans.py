@@ -8,10 +8,12 @@ import trimesh
 from PIL import Image
 
 from ghgs_lit.data.decoding import read_array, read_image
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
 _MESH_SUFFIXES = (".glb", ".gltf", ".obj")
+# Of glTF, which trimesh does not unpack.
+_COMPRESSION = b"EXT_meshopt_compression"
 _IMAGE_SUFFIXES = (".jpeg", ".jpg", ".png")
 
 
@@ -59,6 +61,8 @@ def _mesh_file(folder: Path) -> Path | None:
 
 def load_parts(path: Path) -> tuple[TexturedMesh, ...]:
     """All textured meshes of a file, in its world frame."""
+    is_compressed = path.suffix != ".obj" and _COMPRESSION in path.read_bytes()
+    require(not is_compressed, str(path), "a mesh without compression", _COMPRESSION.decode())
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # trimesh raises whatever its parsers raise

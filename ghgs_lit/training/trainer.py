@@ -63,7 +63,7 @@ class TrainerOptions(Options):
                 use_distributed_sampler=False,  # the data divides its samples among processes itself
                 **arguments,
             )
-        except (MisconfigurationException, TypeError, ValueError) as error:
+        except (MisconfigurationException, RuntimeError, TypeError, ValueError) as error:
             raise InputError(f"trainer: {error}") from None
         require_whole_parameters(trainer)
         return trainer

@@ -21,6 +21,8 @@ USAGE = [
     ("train views=[4", 1, "views=[4: expected key=value"),
     ("train 'data.people={{train: 4'", 1, "data.people={{train: 4: expected key=value"),
     ("table runs={tmp} columns=[psnr", 1, "columns=[psnr: expected key=value"),
+    ("evaluate checkpoint=epoch=3.ckpt", 1, "checkpoint: expected quotes", "'checkpoint=\"epoch=3.ckpt\"'"),
+    ("predict images=照片", 1, "images: expected quotes", "'images=\"照片\"'; found 照片"),
 ]
 
 MISSPELT = [

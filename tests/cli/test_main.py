@@ -113,6 +113,24 @@ def test_a_reader_that_closes_the_pipe_gets_no_traceback():
         assert (process.stderr.read(), process.wait()) == (b"", 141)
 
 
+def test_closed_output_is_no_error():
+    """Schedulers and daemons close it."""
+    command = f"{sys.executable} -m ghgs_lit --version >&-"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    done = subprocess.run(
+        f"{sys.executable} -m ghgs_lit prepare --cfg job >&-", shell=True, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_prediction_goes_where_out_says():
+    """A working directory that is read-only is no obstacle."""
+    for overrides, expected in ((["out=/a b/c"], "/a b/c"), ([], "runs/predict/")):
+        directory = compose("predict", overrides, with_hydra=True).hydra.run.dir
+        assert directory.startswith(expected)
+
+
 def test_a_prediction_does_not_wait_for_what_training_needs():
     """Lightning, torchmetrics and PyTorch's compiler take seconds to import."""
     code = "import sys, ghgs_lit.cli.predict, ghgs_lit; ghgs_lit.GHGS.from_checkpoint(); print(*sys.modules)"

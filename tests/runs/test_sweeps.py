@@ -225,6 +225,13 @@ def test_the_command_line_replaces_a_sweeps_own_values():
     assert len(combinations(own, ["ablation=full,neither"])) == 6
 
 
+def test_a_sweep_over_all_options_of_a_group(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    command = ("train", "-m", "experiment=demo", "dry_run=true", "ablation=glob(*)")
+    code, out, _ = call(monkeypatch, capsys, *command)
+    assert (code, out.count("ablation=")) == (0, 4), out
+
+
 @pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
 def test_time_budgets(value, seconds):
     """Expected times of a plan depend on both forms that Lightning accepts."""

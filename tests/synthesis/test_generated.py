@@ -1,5 +1,7 @@
 """DataModules from configuration, and generated people: built, cached, extended, refused."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -141,3 +143,13 @@ def test_rig_draws_do_not_depend_on_other_subjects():
     a, b = RIG.yaws(subject_rng(0, "a")), RIG.yaws(subject_rng(0, "b"))
     assert not np.allclose(a, b)
     np.testing.assert_array_equal(a, RIG.yaws(subject_rng(0, "a")))
+
+
+def test_a_user_without_a_home_learns_where_to_keep_people(monkeypatch):
+    """Such as ``docker --user 12345``, whom the container does not know."""
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.delenv("GHGS_CACHE", raising=False)
+    monkeypatch.setattr("pwd.getpwuid", Mock(side_effect=KeyError))
+    line = r"data\.cache_dir: expected a folder, or one in GHGS_CACHE, where there is no home directory"
+    with pytest.raises(InputError, match=line):
+        _ = Synthetic().root

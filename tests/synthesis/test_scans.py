@@ -1,5 +1,7 @@
 """Scans on disk: loaded as they are, rendered with one transform, and bad ones are named."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,18 @@ def test_glb_scans_keep_parts_frames_and_cutouts(tmp_path):
     plain = trimesh.Scene([trimesh.creation.box()])
     plain.export(tmp_path / "g" / "g.glb")
     with pytest.raises(InputError, match=r"g\.glb: expected a texture for the mesh"):
+        ScanSource(tmp_path).load("g")
+
+
+def test_compression_that_is_not_read_is_named(tmp_path):
+    (tmp_path / "g").mkdir()
+    content = json.dumps(
+        {"extensionsRequired": ["EXT_meshopt_compression", "KHR_mesh_quantization"]}
+    ).encode()
+    header = b"glTF" + np.array([2, 20 + len(content), len(content)], "<u4").tobytes() + b"JSON"
+    (tmp_path / "g" / "g.glb").write_bytes(header + content)
+    line = r"g\.glb: expected a mesh without compression; found 'EXT_meshopt_compression'"
+    with pytest.raises(InputError, match=line):
         ScanSource(tmp_path).load("g")
 
 

@@ -1,11 +1,12 @@
 """The machine that times were measured on."""
 
-import os
 import platform
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from ghgs_lit.kernels.cores import allowed_cores
 
 
 def processor_name() -> str:
@@ -21,7 +22,7 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
     return {
         "processor": processor_name(),
         "vectors": torch.backends.cpu.get_cpu_capability(),
-        "cores": os.cpu_count(),
+        "cores": allowed_cores(),
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
         "platform": platform.platform(),

@@ -1,6 +1,5 @@
 """All cases of a run: divided among processes, written as they end, and not computed twice."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.stage import DTYPES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
+from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.progress import track
 
@@ -102,6 +102,4 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterator]]:
 
 def processes(workers: int | None) -> int:
     """``workers``, or one for each processor of this process."""
-    if workers is None and hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return workers or 0
+    return allowed_cores() if workers is None else workers

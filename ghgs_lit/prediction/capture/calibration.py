@@ -21,6 +21,8 @@ PIXEL_CENTERS = ("half", "integer")
 
 #: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
+_CODED, _SHOWN = 1088, 1080
 # Sides of a photograph and of its calibration have one ratio up to the rounding of a resize, in pixels.
 _ROUNDING = 1.5
 
@@ -81,6 +83,11 @@ class StoredCamera:
     fisheye: bool = False
     mask: Path | None = None
 
+    def has_numbers_of(self, other: "StoredCamera") -> bool:
+        """Whether both mean the same camera."""
+        both = [(c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other)]
+        return all(np.array_equal(*pair) for pair in zip(*both, strict=True))
+
     def __post_init__(self) -> None:
         object.__setattr__(
             self, "intrinsics", check_intrinsics(f"{self.origin}: intrinsics", self.intrinsics)
@@ -121,6 +128,9 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
         InputError: the ratio of the sides differs.
     """
     size = camera.size or photograph
+    if not same_ratio(size, photograph):
+        shown = tuple(_SHOWN if side == _CODED else side for side in size)
+        size = shown if same_ratio(shown, photograph) else size
     intrinsics = camera.intrinsics.copy()
     height, width = size
     if convention.intrinsics != "pixels":

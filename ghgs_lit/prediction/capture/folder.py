@@ -24,6 +24,7 @@ from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
     Pixels,
+    composed,
     find_instants,
     fits_stored,
     image_named,
@@ -90,7 +91,9 @@ class CaptureFolder:
     def paths(self) -> dict[str, dict[str, Path]]:
         """``{instant: {camera: path}}``."""
         folder = Path(self.images).expanduser()
-        return find_instants(folder, self.file.cameras, dict(self._said("names", {})))
+        # Numbers, too, are names of cameras.
+        names = {composed(str(key)): composed(str(name)) for key, name in self._said("names", {}).items()}
+        return find_instants(folder, self.file.cameras, names)
 
     @property
     def instants(self) -> list[str]:

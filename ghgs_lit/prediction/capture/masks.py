@@ -25,13 +25,19 @@ _SPECK = 0.05
 
 
 def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
-    """The matte of the photograph as shown, from labels (any but 0), or from grey of 8 or 16 bits.
+    """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
+
+    An alpha channel counts unless it is the same everywhere. Of labels any but 0 is the subject, and the
+    largest number beside them, void, is not.
 
     Raises:
         InputError: it cannot be decoded, or fits the photograph neither as shown nor as stored.
     """
     image = read_image(path)
-    values = np.asarray(image.getchannel("A") if image.mode in ("LA", "RGBA") else image)
+    values = np.asarray(image)
+    if image.mode in ("LA", "RGBA"):
+        alpha = values[..., -1]
+        values = alpha if alpha.min() < alpha.max() else values[..., :-1]
     require(values.dtype.kind in "bui", str(path), "a mask of whole numbers", values.dtype)
     values = values if values.ndim == 2 else values.max(-1)
     if values.shape != pixels.size:
@@ -39,8 +45,11 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
         require(fits, str(path), f"the size of its photograph, {pixels.size} (height, width)", values.shape)
         values = np.rot90(values, pixels.turns)
     most = int(values.max(initial=0))
-    if most < _LABELS:
-        return (values > 0) * np.uint8(255)
+    labelled = (values > 0) & (values < _LABELS)
+    # Void is a rim of few pixels without a number between it and the labels, which a soft matte has.
+    is_void = (values == most).sum() < labelled.sum() and not ((values >= _LABELS) & (values < most)).any()
+    if most < _LABELS or is_void:
+        return labelled * np.uint8(255)
     return np.round(values * (1 / 257 if most > 255 else 1)).astype(np.uint8)
 
 
@@ -94,8 +103,10 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
 
 def mask_path(photograph: Path, images: Path, masks: Path) -> Path | None:
     """The mask's file: in the same place below ``masks`` as the photograph below ``images``; None: none."""
-    folder = masks / photograph.resolve().parent.relative_to(images.resolve())
+    # The folder's own path: photographs may be links to files elsewhere.
+    folder = masks / photograph.parent.relative_to(images)
     marked = f"{photograph.stem}{MASK_ENDING}"
     # Beside a photograph the image of its name is the photograph itself.
-    beside = folder.resolve() == photograph.resolve().parent
-    return image_named(folder, *([marked] if beside else [photograph.stem, marked]))
+    beside = folder.resolve() == photograph.parent.resolve()
+    # COLMAP's masks keep the suffix of the photograph: front.jpg.png.
+    return image_named(folder, *([marked] if beside else [photograph.stem, photograph.name, marked]))

@@ -1,5 +1,7 @@
 """Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
 
+import functools
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,6 +84,11 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
     return size is not None and same_ratio(size, pixels.stored_size) and not same_ratio(size, pixels.size)
 
 
+def composed(name: str) -> str:
+    """A name whose letters have one spelling: macOS writes an umlaut as two characters."""
+    return unicodedata.normalize("NFC", name)
+
+
 def images_in(folder: Path) -> dict[str, Path]:
     """Photographs of a folder by name without suffix, sorted; masks beside them are left out.
 
@@ -90,19 +97,26 @@ def images_in(folder: Path) -> dict[str, Path]:
     """
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not path.is_dir()
         if not is_image or path.stem.endswith(MASK_ENDING):
             continue
-        twin = paths.get(path.stem)
-        require(twin is None, str(path), "one file for each photograph", str(twin))
-        paths[path.stem] = path
+        name = composed(path.stem)
+        require(name not in paths, str(path), "one file for each photograph", str(paths.get(name)))
+        paths[name] = path
     return paths
 
 
 def image_named(folder: Path, *names: str) -> Path | None:
     """The image of a folder with one of these names (without suffix), None where there is none."""
-    places = (folder / f"{name}{suffix}" for name in names for suffix in SUFFIXES)
-    return next((path for path in places if path.exists()), None)
+    paths = _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
+    keys = ((composed(name), suffix) for name in names for suffix in SUFFIXES)
+    return next((paths[key] for key in keys if key in paths), None)
+
+
+@functools.lru_cache(maxsize=64)
+def _listed(folder: Path, changed: int) -> dict[tuple[str, str], Path]:
+    """Files by name and suffix, whose letters are spelled in one way; once for each change of the folder."""
+    return {(composed(path.stem), path.suffix.lower()): path for path in sorted(folder.iterdir())}
 
 
 def find_instants(
@@ -128,7 +142,11 @@ def find_instants(
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
     if photographs := images_in(folder):
         return {folder.resolve().name: _by_camera(folder, photographs, cameras, names)}
-    below = {path.name: images_in(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+    below = {
+        composed(path.name): images_in(path)
+        for path in sorted(folder.iterdir())
+        if path.is_dir() and not path.name.startswith(".")
+    }
     folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
     if all(names.get(name, name) in cameras for name in folders):

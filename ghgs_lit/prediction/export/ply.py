@@ -83,6 +83,15 @@ def vertices_ply(columns: Mapping[str, np.ndarray], comments: Sequence[str] = ()
     return content.getvalue()
 
 
+def _read(path: Path) -> PlyData:
+    """A PLY, also one whose comments are not ASCII, as some programs write them."""
+    try:
+        return PlyData.read(path)
+    except UnicodeDecodeError:
+        header, end, body = path.read_bytes().partition(b"end_header")
+        return PlyData.read(BytesIO(bytes(min(byte, 127) for byte in header) + end + body))
+
+
 def read_ply(path: Path) -> Gaussians:
     """Read such a file as the Gaussians of one subject, without colours that depend on the direction.
 
@@ -93,7 +102,7 @@ def read_ply(path: Path) -> Gaussians:
         InputError: not such a file.
     """
     try:
-        content = PlyData.read(path)
+        content = _read(path)
         vertices = content["vertex"]
         columns = {
             group: torch.from_numpy(np.stack([np.asarray(vertices[n], np.float32) for n in names], -1))

@@ -21,7 +21,7 @@ from ghgs_lit.prediction.export.gltf import glb_bytes
 from ghgs_lit.prediction.export.maps import depth_files, depth_unit, input_files, png, points_ply
 from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
-from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_name
+from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
@@ -52,7 +52,7 @@ class Format:
         names = []
         for pattern in self.files:
             if "{view}" in pattern:
-                names += [pattern.format(view=file_name(view)) for view in views]
+                names += [pattern.format(view=name) for name in file_names(views)]
             elif "{frame" in pattern:
                 names += [pattern.format(frame=frame) for frame in range(frames)]
             else:

@@ -1,6 +1,7 @@
 """One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -113,7 +114,7 @@ class ExportedSubject:
     @property
     def file_names(self) -> list[str]:
         """The names of the views as parts of the names of files."""
-        return [file_name(view) for view in self.views]
+        return file_names(self.views)
 
     @cached_property
     def stored(self) -> Gaussians:
@@ -201,6 +202,12 @@ def exported_subject(
     )
 
 
-def file_name(view: str) -> str:
-    """The name of a photograph as a part of a file's name."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+def file_names(views: Sequence[str]) -> list[str]:
+    """The names of photographs as parts of the names of files, all different also without case."""
+    names: dict[str, str] = {}
+    for view in views:
+        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in view)
+        while name.casefold() in names:
+            name += "_"
+        names[name.casefold()] = name
+    return list(names.values())

@@ -39,6 +39,15 @@ def test_a_ply_renders_as_what_was_written(tmp_path):
     assert torch.allclose(a, b, atol=1e-4)
 
 
+def test_comments_that_are_not_ascii(tmp_path):
+    written = gaussians()
+    write_ply(written, tmp_path / "a.ply")
+    content = (tmp_path / "a.ply").read_bytes()
+    comment = "\ncomment Größe\n".encode()
+    (tmp_path / "b.ply").write_bytes(content.replace(b"\n", comment, 1))
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").means, read_ply(tmp_path / "a.ply").means)
+
+
 def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
     """Viewers of 3D Gaussian Splatting read the columns by name; empty and bad files are handled."""
     plyfile = pytest.importorskip("plyfile")

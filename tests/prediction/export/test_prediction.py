@@ -22,7 +22,7 @@ from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
 from ghgs_lit.prediction.export import OutputOptions, output_options, write_prediction
 from ghgs_lit.prediction.export.maps import depth_unit
 from ghgs_lit.prediction.export.ply import read_ply
-from ghgs_lit.prediction.export.subject import for_other_renderers
+from ghgs_lit.prediction.export.subject import file_names, for_other_renderers
 from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.types import Batch, Cameras
@@ -31,6 +31,14 @@ from tests.helpers.splats import body, camera_ring, cloud
 from tests.helpers.training import Standin, example_batch
 
 CONFIG = {"formats": ["ply"], "up": None, "smooth": False, "turntable": {"frames": 2, "fps": 12}}
+
+
+def test_every_photograph_gets_a_file():
+    """Names that differ in signs alone, or in case, which some file systems ignore."""
+    views = ["left 1", "left_1", "left/1", "Left_1", "left_1_2", "b"]
+    names = file_names(views)
+    assert len({name.casefold() for name in names}) == len(views)
+    assert (names[0], names[5]) == ("left_1", "b")
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from ghgs_lit.prediction.capture.formats.colmap import model_folder, read_colmap
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json, read_json_file, read_toml
 from ghgs_lit.prediction.capture.formats.nerfstudio import read_nerfstudio
 from ghgs_lit.prediction.capture.formats.opencv import EASYMOCAP, read_easymocap, read_opencv
+from ghgs_lit.prediction.capture.formats.qualisys import read_qualisys
 
 __all__ = ["FORMATS", "CameraFile", "read_cameras"]
 
@@ -20,11 +21,12 @@ FORMATS: dict[str, Callable[[Path], CameraFile]] = {
     "opencv": read_opencv,
     "easymocap": read_easymocap,
     "toml": read_toml,
+    "qualisys": read_qualisys,
 }
 
 
 def read_cameras(path: str | Path, format: str = "auto") -> CameraFile:
-    """Read a file or a folder of cameras.
+    """Read a file or a folder of cameras; a warning names what is in it and not read.
 
     Args:
         path: of the file; COLMAP's models, OpenCV's files for each camera and EasyMocap's are folders.
@@ -55,9 +57,12 @@ def _format_of(path: Path) -> str:
         return "toml"
     elif suffix == ".json":
         return "nerfstudio" if "frames" in read_json_file(path) else "ghgs"
+    elif path.name.endswith(".qca.txt"):
+        return "qualisys"
     elif suffix in (".bin", ".txt") and model_folder(folder) is not None:
         return "colmap"
     raise InputError(
-        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, or TOML; "
+        f"{path}: expected JSON, transforms.json, a COLMAP model, YAML of OpenCV or EasyMocap, TOML, or"
+        f" Qualisys' .qca.txt; "
         f"found {'a folder without any' if path.is_dir() else repr(path.suffix)}"
     )

@@ -1,7 +1,11 @@
 """Cameras of a file, and what the readers of all formats share."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import math
+import re
+import unicodedata
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,9 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 
 _SUFFIXES = ("jpg", "jpeg", "png", "tif", "tiff", "bmp", "webp")
+# Entries about a lens, as :func:`plain` spells them, and models of which the entries do not say enough.
+_LENS = re.compile("(?<!un)dist(?!ance)|lens|radial|tangent|fisheye|model|omni|theta|^[kps][0-9]$|^xi$")
+_MODELS = re.compile("fisheye|equidist|kannala|omni|spher|equirect|theta|division|panoram|orthogr|prism|fov")
 
 
 @dataclass(frozen=True)
@@ -23,16 +30,65 @@ class CameraFile:
 
     @classmethod
     def of(cls, cameras: Sequence[StoredCamera], convention: Convention, format: str) -> "CameraFile":
-        """Cameras in their order; names of photographs lose folder and suffix, where they still differ."""
-        short = [_stem(camera.name) for camera in cameras]
-        names = short if len(set(short)) == len(short) else [camera.name for camera in cameras]
-        return cls(dict(zip(names, cameras, strict=True)), convention, format)
+        """Cameras in their order, named by their photographs without folder and suffix.
+
+        Where several cameras share these names, those of instants, they are named by folders, or as the file
+        has it. A camera that is listed for several photographs is one, without their masks.
+
+        Raises:
+            InputError: two cameras have one name.
+        """
+        for part in (-1, -2, 0):
+            named: dict[str, StoredCamera] = {}
+            for camera in cameras:
+                name = _parts(camera.name)[part:][0] if part else unicodedata.normalize("NFC", camera.name)
+                if name not in named:
+                    named[name] = camera
+                elif named[name].has_numbers_of(camera):
+                    named[name] = replace(camera, mask=None)
+                else:
+                    break
+            else:
+                return cls(named, convention, format)
+        raise InputError(f"{camera.origin}: expected cameras of different names; found {name} twice")
 
 
-def _stem(name: str) -> str:
-    last = name.replace("\\", "/").rpartition("/")[2]
+def _parts(name: str) -> list[str]:
+    """Folders and name of a photograph, without its suffix."""
+    *folders, last = unicodedata.normalize("NFC", name).replace("\\", "/").split("/")
     stem, dot, suffix = last.rpartition(".")
-    return stem if dot and suffix.lower() in _SUFFIXES else last
+    return [*folders, stem if dot and suffix.lower() in _SUFFIXES else last]
+
+
+def plain(key: str) -> str:
+    """A key without case, signs and the word coefficients or parameters, by which files differ."""
+    return re.sub(r"(coef|param)\w*$", "", "".join(filter(str.isalnum, key.lower())))
+
+
+def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> None:
+    """Name in a warning what a reader does not know.
+
+    Args:
+        origin: file and key, for messages.
+        fields: of a camera, or of the file.
+        known: what is read or of no matter, as :func:`plain` spells it.
+
+    Raises:
+        InputError: it is about the lens, and not empty or 0: without it the picture would be bent.
+    """
+    unread = {key: value for key, value in fields.items() if plain(key) not in known}
+    lens = [key for key, value in unread.items() if _LENS.search(plain(key)) and _bends(value)]
+    expected = "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4"
+    require(not lens, origin, expected, lens)
+    if unread:  # the same text for each camera, which Python shows once
+        warnings.warn(f"cameras: entries that are not read: {', '.join(sorted(unread))}", stacklevel=2)
+
+
+def _bends(value: Any) -> bool:
+    """Whether an entry about the lens says something: numbers other than 0, or a model of another kind."""
+    if isinstance(value, str):
+        return bool(_MODELS.search(plain(value)))
+    return bool(np.any(np.asarray(value, object)))
 
 
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
@@ -47,11 +103,22 @@ def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: st
         InputError: the file cannot be read or parsed, or holds something else.
     """
     try:
-        value = parse(path.read_text())
+        # Editors of Windows mark UTF-8.
+        value = parse(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: expected {kind}; found {error}") from error
     require(isinstance(value, dict), str(path), content, type(value).__name__)
     return value
+
+
+def finite(origin: str, key: str, value: Any) -> float:
+    """The number that an entry holds."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    require(math.isfinite(number), f"{origin}: {key}", "a finite number", value)
+    return number
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:

@@ -43,19 +43,35 @@ def read_colmap(path: Path) -> CameraFile:
         raise InputError(
             f"{path}: expected pycolmap to read COLMAP's models (pip install 'ghgs-lit[colmap]'); found none"
         ) from None
+    names = _names(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError, OSError) as error:
+        images = [image for image in model.images.values() if image.has_pose]
+    except (RuntimeError, ValueError, OSError, IndexError) as error:
         raise InputError(f"{folder}: expected a COLMAP model; found {error}") from error
-    images = [image for image in model.images.values() if image.has_pose]
     require(bool(images), str(folder), "photographs with a pose", "none")
-    cameras = [_camera(folder, image, model.cameras[image.camera_id]) for image in images]
+    cameras = [
+        _camera(folder, names.get(image.image_id, image.name), image, model.cameras[image.camera_id])
+        for image in images
+    ]
     return CameraFile.of(cameras, Convention(), "colmap")
 
 
-def _camera(folder: Path, image, camera) -> StoredCamera:
+def _names(folder: Path) -> dict[int, str]:
+    """The photographs of ``images.txt``, whose names COLMAP's own reader cuts at a space."""
+    path = folder / "images.txt"
+    if (folder / "images.bin").exists() or not path.exists():
+        return {}
+    lines = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    lines = [line for line in lines if not line.startswith("#")]
+    # Every second line has points.
+    images = [fields for line in lines[::2] if len(fields := line.split(maxsplit=9)) == 10]
+    return {int(fields[0]): fields[9].rstrip() for fields in images if fields[0].isdecimal()}
+
+
+def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
     """The camera of a registered photograph."""
-    origin, model = f"{folder}: {image.name}", camera.model.name
+    origin, model = f"{folder}: {name}", camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))
     fx, fy = (values.get(name, values.get("f")) for name in ("fx", "fy"))
@@ -65,4 +81,4 @@ def _camera(folder: Path, image, camera) -> StoredCamera:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
     size = (camera.height, camera.width)
-    return StoredCamera(image.name, origin, intrinsics, pose, size, distortion, fisheye)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, fisheye)

@@ -1,4 +1,4 @@
-"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim and Anipose."""
+"""This package's JSON, OpenCV's matrices as JSON, and the TOML of Pose2Sim, Anipose and Caliscope."""
 
 import json
 import tomllib
@@ -10,8 +10,13 @@ from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
-from ghgs_lit.prediction.capture.formats.opencv import cameras_from_fields, has_intrinsics, size_from_fields
+from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_unread, read_mapping
+from ghgs_lit.prediction.capture.formats.opencv import (
+    KNOWN,
+    cameras_from_fields,
+    has_intrinsics,
+    size_from_fields,
+)
 from ghgs_lit.prediction.export.maps import camera_entry, cameras_json
 
 _KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
@@ -37,22 +42,33 @@ def read_json(path: Path) -> CameraFile:
         InputError: a camera is missing or wrong.
     """
     content = read_json_file(path)
-    named = content.get("cameras", content)
-    require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
+    named = _cameras_of(path, content)
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
     if not with_extrinsics:
         return _read_matrices(path, named, "opencv")
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, KNOWN)
     cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
     return CameraFile.of(cameras, Convention(), "ghgs")
 
 
+def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Cameras by name, where they have an entry of their own beside others, in which they may be a list."""
+    named = content.get("cameras", content)
+    if isinstance(named, list) and all(isinstance(camera, Mapping) for camera in named):
+        named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
+    require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
+    if "cameras" in content:
+        check_unread(str(path), content, KNOWN)
+    return named
+
+
 def read_toml(path: Path) -> CameraFile:
-    """Pose2Sim's and Anipose's TOML: a table for each camera, named by its key ``name``.
+    """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
 
     Raises:
         InputError: a camera is missing or wrong.
     """
-    tables = read_mapping(path, tomllib.loads, "TOML", "TOML")
+    tables = _cameras_of(path, read_mapping(path, tomllib.loads, "TOML", "TOML"))
     named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
     return _read_matrices(path, named, "toml")
 
@@ -62,6 +78,7 @@ def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) ->
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
     with_intrinsics = {name: camera for name, camera in named.items() if has_intrinsics(camera)}
     cameras = cameras_from_fields(path, with_intrinsics, expected, sorted(named))
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, KNOWN)
     return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
 
 

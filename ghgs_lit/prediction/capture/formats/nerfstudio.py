@@ -10,26 +10,26 @@ import numpy as np
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
+from ghgs_lit.prediction.capture.formats.camera_file import (
+    CameraFile,
+    check_unread,
+    coefficients,
+    finite,
+    pinhole,
+    plain,
+)
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
-_KEYS = [
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "w",
-    "h",
-    "camera_angle_x",
-    "camera_angle_y",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-]
-_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", *_LENS)
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
+# Read, or of no matter for a camera.
+_KNOWN = {
+    *map(plain, _KEYS),
+    *("frames", "filepath", "transformmatrix", "maskpath", "cameramodel", "isfisheye", "aabbscale", "scale"),
+    *("offset", "appliedtransform", "appliedscale", "orientationoverride", "plyfilepath", "depthfilepath"),
+    *("colmapimid", "sharpness", "rotation", "trainfilenames", "valfilenames", "testfilenames", "time", "up"),
+}
 
 
 def read_nerfstudio(path: Path) -> CameraFile:
@@ -51,25 +51,22 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     for key in ("file_path", "transform_matrix"):
         require(key in frame, origin, key, sorted(frame))
     fields = {**shared, **frame}
-    model = fields.get("camera_model", "OPENCV")
-    choice(f"{origin}: camera_model", model, _MODELS)
-    fisheye = model == "OPENCV_FISHEYE"
-    numbers = {key: _number(origin, key, fields[key]) for key in _KEYS if key in fields}
+    model, flag = fields.get("camera_model"), fields.get("is_fisheye")
+    choice(f"{origin}: camera_model", model, (None, *_MODELS))
+    fisheye = model == "OPENCV_FISHEYE" if flag is None else bool(flag)
+    allowed = (None, False, True) if model is None else (None, model == "OPENCV_FISHEYE")
+    require(flag in allowed, f"{origin}: is_fisheye", f"{allowed[-1]} beside {model}", flag)
+    numbers = {key: finite(origin, key, fields[key]) for key in _KEYS if key in fields}
     size = (int(numbers["h"]), int(numbers["w"])) if {"h", "w"} <= set(numbers) else None
     intrinsics = _intrinsics(origin, numbers, size)
-    distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3")
+    names = "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3"
+    beyond = [key for key in _LENS if numbers.get(key) and key not in names.split()]
+    require(not beyond, origin, f"distortion {names}", beyond)
+    distortion = coefficients(numbers, names)
     pose = check_array(f"{origin}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
     mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
+    check_unread(origin, fields, _KNOWN)
     return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
-
-
-def _number(origin: str, key: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    require(math.isfinite(number), f"{origin}: {key}", "a finite number", value)
-    return number
 
 
 def _intrinsics(origin: str, numbers: Mapping[str, float], size: tuple[int, int] | None) -> np.ndarray:

@@ -17,27 +17,48 @@ from scipy.spatial.transform import Rotation
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, read_mapping
+from ghgs_lit.prediction.capture.formats.camera_file import (
+    CameraFile,
+    check_unread,
+    coefficients,
+    finite,
+    plain,
+    read_mapping,
+)
 
 #: The files of EasyMocap: intrinsics and poses.
 EASYMOCAP = ("intri.yml", "extri.yml")
-# Its keys carry the camera's name: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01.
-_WITH_NAME = re.compile(r"(K|dist|D|R|Rot|T|H|W)_(.+)")
-# Spelled without case and underscores; a rotation matrix is preferred to a vector where there are both.
+# Spelled as `plain` does; a rotation matrix is preferred to a vector where there are both.
 _NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
-    "distortion": ("d", "dist", "distortioncoefficients", "distcoeffs", "distortions", "distortion"),
+    "distortion": ("d", "dist", "distortion", "dists", "distortions", "lensdistortion", "kc"),
     "rotation": ("rot", "rotationmatrix", "r", "rvec", "rotation", "rotationvector"),
     "translation": ("t", "tvec", "translation", "translationvector"),
-    "size": ("size", "imagesize", "imgsize"),
+    "size": ("size", "imagesize", "imgsize", "resolution"),
     "width": ("width", "imagewidth", "w"),
     "height": ("height", "imageheight", "h"),
-    "fisheye": ("fisheye",),
+    "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
+}
+# Coefficients with an entry each.
+_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+#: Entries that are read, or of no matter for a camera.
+KNOWN = {
+    *(name for names in _NAMES.values() for name in names),
+    *_SINGLE,
+    *("name", "names", "id", "camid", "port", "serial", "rotationcount", "error", "exposure", "gridcount"),
+    *("ignore", "verifiedresolutions", "rectifyalpha", "metadata", "cameras"),
+    *("time", "n", "f", "v", "ccm", "bounds"),
 }
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with OpenCV's tag for matrices."""
+    """YAML with OpenCV's tag for matrices, and keys that stay text: 01 is the name of a camera."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and not key.tag.endswith(":merge"):
+                key.tag = self.DEFAULT_SCALAR_TAG
+        return super().construct_mapping(node, deep)
 
 
 def _matrix(loader: _Loader, node: yaml.Node) -> np.ndarray:
@@ -65,8 +86,9 @@ def read_opencv(path: Path) -> CameraFile:
             cameras.append(camera_from_fields(file.stem, str(file), fields))
         else:
             named = {name: value for name, value in fields.items() if has_intrinsics(value)}
+            named = named or _by_name(str(file), fields)
             expected = "a camera matrix (camera_matrix, K or K_<name>)"
-            cameras += cameras_from_fields(file, named or _by_name(fields), expected, sorted(fields))
+            cameras += cameras_from_fields(file, named, expected, sorted(fields))
     return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
 
 
@@ -81,7 +103,7 @@ def read_easymocap(path: Path) -> CameraFile:
     for file in (folder / name for name in EASYMOCAP):
         require(file.exists(), str(file), "EasyMocap's file beside the other", "no such file")
         fields |= _read_yaml(file)
-    named = _by_name(fields)
+    named = _by_name(str(folder), fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
     cameras = [camera_from_fields(name, f"{folder}: {name}", camera) for name, camera in named.items()]
     return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
@@ -100,13 +122,18 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
 
 
-def _by_name(fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Cameras whose keys carry their names."""
-    cameras: dict[str, dict[str, Any]] = {}
+def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Cameras whose keys carry their names: K_01, dist_01, R_01 (vector), Rot_01 (matrix), T_01."""
+    cameras: dict[str, dict[str, Any]] = {key[2:]: {} for key in fields if key.startswith("K_")}
+    others: dict[str, Any] = {}
     for key, value in fields.items():
-        if match := _WITH_NAME.fullmatch(key):
-            cameras.setdefault(match[2], {})[match[1]] = value
-    return {name: camera for name, camera in cameras.items() if has_intrinsics(camera)}
+        # The longest name: K_1 beside K_cam_1.
+        name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
+        field = key.removesuffix(f"_{name}")
+        # EasyVolcap's t is a time.
+        cameras.get(name, others)["time" if field == "t" else field] = value
+    check_unread(origin, others, KNOWN)
+    return cameras
 
 
 def cameras_from_fields(
@@ -123,7 +150,7 @@ def cameras_from_fields(
 
 def find(fields: Mapping[str, Any], what: str) -> Any:
     """The value of an entry of ``_NAMES``; None where no spelling of it is there."""
-    spelled = {key.lower().replace("_", ""): value for key, value in fields.items()}
+    spelled = {plain(key): value for key, value in fields.items()}
     return next((spelled[name] for name in _NAMES[what] if name in spelled), None)
 
 
@@ -155,10 +182,17 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = array("translation", (3,), (3, 1), (1, 3)).ravel()
-    no_distortion = find(fields, "distortion") is None
-    distortion = np.zeros(0) if no_distortion else array("distortion", (None,), (None, 1), (1, None)).ravel()
-    intrinsics, fisheye = array("intrinsics", (3, 3)), bool(find(fields, "fisheye"))
-    return StoredCamera(name, origin, intrinsics, pose, size_from_fields(origin, fields), distortion, fisheye)
+    intrinsics, size = array("intrinsics", (3, 3)), size_from_fields(origin, fields)
+    fisheye = find(fields, "fisheye")
+    require(fisheye in (None, 0, 1), f"{origin}: fisheye", "true or false", fisheye)
+    single = {plain(key): value for key, value in fields.items() if plain(key) in _SINGLE}
+    if find(fields, "distortion") is not None:
+        distortion = array("distortion", (None,), (None, 1), (1, None)).ravel()
+    else:
+        numbers = {key: finite(origin, key, value) for key, value in single.items()}
+        distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
+    check_unread(origin, fields, KNOWN)
+    return StoredCamera(name, origin, intrinsics, pose, size, distortion, bool(fisheye))
 
 
 def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] | None:
