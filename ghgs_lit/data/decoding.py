@@ -10,6 +10,7 @@ from PIL import ExifTags, Image
 
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import read_npy, require_file
 
 # How far from the image's centre a principal point may lie, as a fraction of the side.
 _OFF_CENTRE = 0.25
@@ -28,12 +29,11 @@ def read_image(path: Path) -> Image.Image:
     Raises:
         InputError: it is missing or cannot be decoded.
     """
-    if not path.exists():
-        raise InputError(f"{path}: expected an image; found no such file")
+    require_file(path, "an image")
     try:
         image = Image.open(path)
         image.load()
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+    except Exception as error:  # broken images raise anything
         raise InputError(f"{path}: expected a readable image; found {error}") from error
     return image
 
@@ -80,15 +80,7 @@ def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 def read_array(path: Path, shapes: Shapes) -> np.ndarray:
     """Read a finite float64 array from an ``.npy`` file; arguments and errors as :func:`check_array`."""
-    if not path.exists():
-        raise InputError(f"{path}: expected an array {_describe(shapes)}; found no such file")
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, TypeError) as error:
-        raise InputError(
-            f"{path}: expected an array {_describe(shapes)}; found a file that cannot be read: {error}"
-        ) from error
-    return check_array(path, array, shapes)
+    return check_array(path, read_npy(path, f"an array {_describe(shapes)}"), shapes)
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
