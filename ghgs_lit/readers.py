@@ -55,17 +55,7 @@ def read_json(path: Path, expected: str = "JSON") -> Any:
     Raises:
         InputError: also where it is no JSON, or nested deeper than 64 levels.
     """
-    value = _parsed(path, expected, json.loads)
-    layer = [value]
-    for _ in range(DEEPEST + 1):
-        layer = [
-            child
-            for item in layer
-            if isinstance(item, dict | list)
-            for child in (item.values() if isinstance(item, dict) else item)
-        ]
-    require(not layer, str(path), f"{expected} of at most {DEEPEST} levels", "more")
-    return value
+    return _parsed(path, expected, json.loads)
 
 
 def read_yaml(path: Path, expected: str = "YAML") -> Any:
@@ -117,8 +107,16 @@ def _plain_yaml(text: str) -> Any:
 
 def _parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
     try:
-        return parse(read_text(path, expected))
+        value = parse(read_text(path, expected))
+        if _levels(value) > DEEPEST:
+            raise ValueError(f"more than {DEEPEST} levels")
     except InputError:
         raise
     except (ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise InputError(f"{path}: expected {expected}; found {error}") from error
+    return value
+
+
+def _levels(value: Any) -> int:
+    children = value.values() if isinstance(value, dict) else value
+    return 1 + max(map(_levels, children), default=0) if isinstance(value, dict | list) else 0

@@ -18,6 +18,8 @@ _OFF_CENTRE = 0.25
 _ROTATION_TOLERANCE = 1e-3
 # Modes of images that convert to RGB without a loss of range, and the EXIF orientation that changes nothing.
 _EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
+#: The largest coordinate of a vertex: a kilometre in millimetres.
+_FURTHEST = 1e6
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
 Shapes = Sequence[tuple[int | None, ...]]
@@ -83,6 +85,24 @@ def read_array(path: Path, shapes: Shapes) -> np.ndarray:
     return check_array(path, read_npy(path, f"an array {_describe(shapes)}"), shapes)
 
 
+def read_vertices(path: Path) -> np.ndarray:
+    """The vertices [n, 3] float32 of a body, at least one, in an ``.npy`` file.
+
+    Raises:
+        InputError: it is missing or another array, or a coordinate is beyond 1e6.
+    """
+    vertices = read_array(path, [(None, 3)])
+    require(len(vertices) > 0, str(path), "vertices", "none")
+    check_extent(path, vertices)
+    return vertices.astype(np.float32)
+
+
+def check_extent(place: Path | str, vertices: np.ndarray) -> None:
+    """Refuse coordinates that no scan of a person has in any unit; they would make all others vanish."""
+    largest = float(np.abs(vertices).max(initial=0))
+    require(largest < _FURTHEST, str(place), f"coordinates below {_FURTHEST:.0e}", largest)
+
+
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
     """Convert to a finite float64 array.
 
@@ -95,7 +115,10 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
         InputError: it is not an array of numbers, has another shape, or is not finite.
     """
     try:
-        array = np.asarray(array).astype(np.float64)
+        array = np.asarray(array)
+        if array.dtype.kind in "cmM":
+            raise TypeError(f"numbers of type {array.dtype}")
+        array = array.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise InputError(f"{place}: expected an array {_describe(shapes)}; found {error}") from error
     fits = any(

@@ -2,37 +2,19 @@
 
 import contextlib
 import hashlib
-import pickle
 from functools import cache
 from pathlib import Path
 
 import llvmlite.binding
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.serialize import dumps
+from numba.core.caching import FunctionCache
 
 # Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
-class _Sealed(CompileResultCacheImpl):
-    """Machine code beside its digest: a damaged file is not run."""
-
-    def reduce(self, cres):
-        code = dumps(super().reduce(cres))
-        return hashlib.sha256(code).digest(), code
-
-    def rebuild(self, target_context, payload):
-        digest, code = payload
-        if hashlib.sha256(code).digest() != digest:
-            raise ValueError("machine code that was changed since it was written")
-        return super().rebuild(target_context, pickle.loads(code))
-
-
 class _Cache(FunctionCache):
     """Numba's cache of one function; a file that cannot be read, or is of other sources, is made anew."""
-
-    _impl_class = _Sealed
 
     def __init__(self, py_func):
         super().__init__(py_func)

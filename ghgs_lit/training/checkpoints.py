@@ -21,28 +21,22 @@ from ghgs_lit.weights.checkpoint import content_digest
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
-#: What Lightning writes beside the weights.
-_LIGHTNING = {
-    "pytorch-lightning_version": str,
-    "epoch": int,
-    "global_step": int,
-    "loops": Mapping,
-    "callbacks": Mapping,
-    "optimizer_states": list,
-    "lr_schedulers": list,
-}
-
-
 def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
     """Refuse a checkpoint whose state of the training has another form than Lightning's."""
-    for key in _LIGHTNING.keys() & checkpoint.keys():
-        value, kind = checkpoint[key], _LIGHTNING[key]
-        require(isinstance(value, kind), f"{path}: {key}", f"a {kind.__name__}", value)
-    for number, state in enumerate(checkpoint.get("optimizer_states", ())):
-        groups = state.get("param_groups") if isinstance(state, Mapping) else None
-        fits = isinstance(groups, list) and all(isinstance(group, Mapping) for group in groups)
-        expected = "the state of an optimizer with param_groups"
-        require(fits, f"{path}: optimizer_states[{number}]", expected, type(state).__name__)
+    kinds = {"epoch": int, "global_step": int, "loops": Mapping, "callbacks": Mapping}
+    kinds |= {"optimizer_states": list, "lr_schedulers": list}
+    for key in kinds.keys() & checkpoint.keys():
+        require(
+            isinstance(checkpoint[key], kinds[key]),
+            f"{path}: {key}",
+            f"a {kinds[key].__name__}",
+            checkpoint[key],
+        )
+    for state in checkpoint["optimizer_states"]:
+        fits = isinstance(state, Mapping) and isinstance(state.get("param_groups"), list)
+        require(
+            fits, f"{path}: optimizer_states", "states of optimizers with param_groups", type(state).__name__
+        )
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

@@ -45,18 +45,17 @@ def test_machine_code_of_other_sources_is_not_taken_from_the_cache(hits):
 
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "a folder"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "foreign", "a folder"])
 def test_a_damaged_file_of_the_cache_is_made_anew(hits, tmp_path, suffix, damage):
     hits()
     (file,) = tmp_path.rglob(f"*.{suffix}")
-    content = bytearray(file.read_bytes())
+    content = file.read_bytes()
     if damage == "a folder":
         file.unlink()
         file.mkdir()
     else:
-        content[len(content) // 2] ^= 0x10
-        cut = {"truncated": len(content) // 2, "empty": 0, "flipped": len(content)}[damage]
-        file.write_bytes(content[:cut])
+        cut = {"truncated": len(content) // 2, "empty": 0, "foreign": 0}[damage]
+        file.write_bytes(content[:cut] + b"{}" * (damage == "foreign"))
     first, second = hits(), hits()
     assert (first, second) == ((0, 0) if damage == "a folder" else (0, 1))
 

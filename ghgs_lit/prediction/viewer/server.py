@@ -2,6 +2,7 @@
 
 import logging
 import math
+import socket
 import threading
 from typing import Any
 
@@ -17,6 +18,15 @@ from ghgs_lit.visualization.turntable import pixel_size
 PICTURES = ("render", "photograph", "FLIP")
 
 
+def _require_address(host: str) -> None:
+    """Refuse an address that is none of this machine: viser would wait for it without a word."""
+    try:
+        family, *_ = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        socket.create_server((host, 0), family=family).close()
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"host: expected an address of this machine; found {host!r} ({error})") from error
+
+
 class Viewer:
     """A running page.
 
@@ -26,7 +36,7 @@ class Viewer:
         port: the first one to try.
 
     Raises:
-        InputError: viser is not installed.
+        InputError: viser is not installed, or this machine has no such address.
     """
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
@@ -36,6 +46,7 @@ class Viewer:
             raise InputError(
                 f"ghgs view: expected the extra viewer (pip install 'ghgs-lit[viewer]'); found {error}"
             ) from error
+        _require_address(host)
         self.content = content
         self._lock = threading.Lock()  # controls are answered by several threads
         logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor otherwise
