@@ -26,17 +26,11 @@ def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> Non
     kinds = {"epoch": int, "global_step": int, "loops": Mapping, "callbacks": Mapping}
     kinds |= {"optimizer_states": list, "lr_schedulers": list}
     for key in kinds.keys() & checkpoint.keys():
-        require(
-            isinstance(checkpoint[key], kinds[key]),
-            f"{path}: {key}",
-            f"a {kinds[key].__name__}",
-            checkpoint[key],
-        )
+        value, kind = checkpoint[key], kinds[key]
+        require(isinstance(value, kind), f"{path}: {key}", f"a {kind.__name__}", value)
     for state in checkpoint["optimizer_states"]:
         fits = isinstance(state, Mapping) and isinstance(state.get("param_groups"), list)
-        require(
-            fits, f"{path}: optimizer_states", "states of optimizers with param_groups", type(state).__name__
-        )
+        require(fits, f"{path}: optimizer_states", "states with param_groups", type(state).__name__)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
