@@ -104,7 +104,7 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
         )
         raise InputError(f"data: expected {expected}; found neither")
     trained = read_checkpoint(cfg.checkpoint)["config"]
-    if "data" not in trained:
+    if not trained.get("data"):
         raise InputError(
             f"data: expected data=<option> for weights that were imported ({cfg.checkpoint}); found none"
         )

@@ -5,10 +5,12 @@
 ``rendering/`` was made elsewhere: everything in it counts as complete.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from ghgs_lit.errors import require
+from ghgs_lit.readers import read_json
 
 #: The renderer's notes, below the root of a data set.
 FOLDER = "rendering"
@@ -33,7 +35,11 @@ class Completeness:
     def plan(self) -> dict[str, list[str]]:
         """Subjects of each phase that were requested so far, complete or not."""
         path = self.folder / "plan.json"
-        return json.loads(path.read_text()) if path.exists() else {}
+        plan = read_json(path) if path.exists() else {}
+        subjects = plan.values() if isinstance(plan, dict) else [plan]
+        fits = all(isinstance(names, list) and all(isinstance(n, str) for n in names) for names in subjects)
+        require(fits, str(path), "lists of subjects by phase", plan)
+        return plan
 
     def marker(self, phase: str, name: str) -> Path:
         """The file that marks a subject as complete."""

@@ -10,6 +10,7 @@ from PIL import ExifTags, Image
 
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import read_npy, require_file
 
 # How far from the image's centre a principal point may lie, as a fraction of the side.
 _OFF_CENTRE = 0.25
@@ -17,6 +18,8 @@ _OFF_CENTRE = 0.25
 _ROTATION_TOLERANCE = 1e-3
 # Modes of images that convert to RGB without a loss of range, and the EXIF orientation that changes nothing.
 _EIGHT_BITS, _UPRIGHT = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"), 1
+#: The largest coordinate of a vertex: a kilometre in millimetres.
+_FURTHEST = 1e6
 _SAFE_NAME = re.compile(r"[\w.+-]+")
 
 Shapes = Sequence[tuple[int | None, ...]]
@@ -28,12 +31,11 @@ def read_image(path: Path) -> Image.Image:
     Raises:
         InputError: it is missing or cannot be decoded.
     """
-    if not path.exists():
-        raise InputError(f"{path}: expected an image; found no such file")
+    require_file(path, "an image")
     try:
         image = Image.open(path)
         image.load()
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+    except Exception as error:  # broken images raise anything
         raise InputError(f"{path}: expected a readable image; found {error}") from error
     return image
 
@@ -80,15 +82,25 @@ def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 def read_array(path: Path, shapes: Shapes) -> np.ndarray:
     """Read a finite float64 array from an ``.npy`` file; arguments and errors as :func:`check_array`."""
-    if not path.exists():
-        raise InputError(f"{path}: expected an array {_describe(shapes)}; found no such file")
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, TypeError) as error:
-        raise InputError(
-            f"{path}: expected an array {_describe(shapes)}; found a file that cannot be read: {error}"
-        ) from error
-    return check_array(path, array, shapes)
+    return check_array(path, read_npy(path, f"an array {_describe(shapes)}"), shapes)
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """The vertices [n, 3] float32 of a body, at least one, in an ``.npy`` file.
+
+    Raises:
+        InputError: it is missing or another array, or a coordinate is beyond 1e6.
+    """
+    vertices = read_array(path, [(None, 3)])
+    require(len(vertices) > 0, str(path), "vertices", "none")
+    check_extent(path, vertices)
+    return vertices.astype(np.float32)
+
+
+def check_extent(place: Path | str, vertices: np.ndarray) -> None:
+    """Refuse coordinates that no scan of a person has in any unit; they would make all others vanish."""
+    largest = float(np.abs(vertices).max(initial=0))
+    require(largest < _FURTHEST, str(place), f"coordinates below {_FURTHEST:.0e}", largest)
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
@@ -103,7 +115,10 @@ def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
         InputError: it is not an array of numbers, has another shape, or is not finite.
     """
     try:
-        array = np.asarray(array).astype(np.float64)
+        array = np.asarray(array)
+        if array.dtype.kind in "cmM":
+            raise TypeError(f"numbers of type {array.dtype}")
+        array = array.astype(np.float64)
     except (ValueError, TypeError) as error:
         raise InputError(f"{place}: expected an array {_describe(shapes)}; found {error}") from error
     fits = any(

@@ -26,10 +26,11 @@ from ghgs_lit.data.decoding import (
     read_array,
     read_map,
     read_photograph,
+    read_vertices,
 )
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.view import View
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 _IMAGE_SUFFIXES = (".jpg", ".png", ".jpeg")
 _POSITION = re.compile(r"(.+)_(\d{3,})")
@@ -150,7 +151,7 @@ class Layout(Reader):
         for model in _BODY_MODELS:
             path = self._folders[name] / model / name / "vertices.npy"
             if path.exists():
-                return read_array(path, [(None, 3)]).astype(np.float32)
+                return read_vertices(path)
         return None if self.further_bodies is None else self.further_bodies(name)
 
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
@@ -170,11 +171,14 @@ class Layout(Reader):
                     f"{path}: expected 16 bits of inverse depth; found {inverse.min()} to {inverse.max()}"
                 )
             inverse = inverse.astype(np.uint16)
+            seen = inverse.any() or not mask.any()
+            require(seen, str(path), "inverse depth above 0 at the subject", "0 everywhere")
         path, matte = self._folder(name, "alpha", position) / f"{view}.png", None
         if path.exists():
             matte = read_map(path, size)
             if matte.dtype != np.uint8:
                 raise InputError(f"{path}: expected 8 bits of grey; found {matte.dtype}")
+            require(matte.any() or not mask.any(), str(path), "shares above 0 at the subject", "0 everywhere")
         intrinsics, extrinsics = _read_camera(self._folder(name, "parm", position), view)
         intrinsics[:2, 2] += self._shift
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import read_npy
 
 
 def _bytes(text: str, encoding: str = "latin1") -> bytes:
@@ -109,8 +110,8 @@ def load_npy(path: Path) -> Any:
             if header(stream)[2].hasobject:
                 content = _load(path, stream)
                 return content.item() if isinstance(content, np.ndarray) and content.ndim == 0 else content
-        return np.load(path, allow_pickle=False)
+        return read_npy(path)
     except InputError:
         raise
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
+    except Exception as error:  # headers are Python, whose tokenizer has errors of its own
         raise InputError(f"{path}: expected a readable .npy file; found {error}") from error

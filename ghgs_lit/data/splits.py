@@ -1,6 +1,5 @@
 """Splits of named subjects into ``train`` and ``val``: from files, lists and ranges, or by a fraction."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import read_json, read_text
 
 _SPLIT_FILES = ("splits.json", "split_train.txt")
 
@@ -86,22 +86,18 @@ def _expand(entry: object, names: Sequence[str]) -> list[str]:
 def _lists(place: Path | str, content: Mapping) -> dict[str, list]:
     chosen = {"train": content.get("train"), "val": content.get("val", content.get("test"))}
     for phase, listed in chosen.items():
-        if not isinstance(listed, Sequence) or isinstance(listed, str):
+        is_list = isinstance(listed, Sequence) and not isinstance(listed, str)
+        if not is_list or not all(isinstance(entry, str | int) for entry in listed):
             raise InputError(f"{place}: expected a list {phase!r} (test does for val); found {listed!r}")
     return {phase: list(listed) for phase, listed in chosen.items()}
 
 
 def _read_split(path: Path) -> dict[str, list[str]]:
     if path.suffix == ".json":
-        try:
-            content = json.loads(path.read_text())
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: expected JSON; found {error}") from error
+        content = read_json(path)
         return _lists(path, content if isinstance(content, Mapping) else {})
     result = {}
     for phase in PHASES:
         file = path.with_name(f"split_{phase}.txt")
-        if not file.exists():
-            raise InputError(f"{file}: expected one id a line; found no such file")
-        result[phase] = file.read_text().split()
+        result[phase] = read_text(file, "one id a line").split()
     return result

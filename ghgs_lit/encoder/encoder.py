@@ -121,6 +121,8 @@ class VGGTEncoder(nn.Module):
     def _check(self, images: Tensor, masks: Tensor) -> None:
         b, v, channels, height, width = images.shape
         require(channels == 3, "images", "3 channels", channels)
+        narrow = images.dtype != torch.float64 or self.aggregator.camera_token.dtype == torch.float64
+        require(narrow, "images", "float32 where the weights are no float64", images.dtype)
         expected = f"height and width divisible by the patch size {self.patch_size}"
         divisible = height % self.patch_size == width % self.patch_size == 0 < min(height, width)
         require(divisible, "images", expected, f"{height} x {width}")

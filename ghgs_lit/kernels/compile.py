@@ -1,21 +1,47 @@
 """Compile kernels with Numba and keep their machine code on disk while their sources stay the same."""
 
+import contextlib
 import hashlib
 from functools import cache
 from pathlib import Path
 
 import llvmlite.binding
 import numba
+from numba.core.caching import FunctionCache
 
 # Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
+class _Cache(FunctionCache):
+    """Numba's cache of one function; a file that cannot be read, or is of other sources, is made anew."""
+
+    def __init__(self, py_func):
+        super().__init__(py_func)
+        self._cache_file._source_stamp = _digest(Path(py_func.__code__.co_filename).parent)
+
+    def load_overload(self, sig, target_context):
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # damaged pickles raise anything
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig, data):
+        with contextlib.suppress(OSError):  # such as a full disk: the kernel runs without a file
+            super().save_overload(sig, data)
+
+
 @cache
 def _digest(folder: Path) -> str:
-    """Digest of every source file that the machine code of a kernel in ``folder`` depends on."""
+    """Digest of every source file that the machine code of a kernel in ``folder`` depends on.
+
+    Those of this package, and of the room that the folder is in: kernels read constants of both, no others.
+    """
     digest = hashlib.sha256()
-    for path in sorted({*Path(__file__).parent.glob("*.py"), *folder.glob("*.py")}):
+    rooms = (Path(__file__).parent, folder, folder.parent)
+    for path in sorted({path for room in rooms for path in room.glob("*.py")}):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
 
@@ -25,14 +51,11 @@ def kernel(function):
 
     Numba's cache notices a changed file, but not changed globals or other modules whose code was
     inlined, and installers may keep a file's time stamp. So cached code is stamped with the digest of all
-    sources of this package and of the kernel's folder. Where no folder for the cache is writable, each
-    process compiles again.
+    sources that it can depend on. Where no folder for the cache is writable, each process compiles again.
     """
-    try:
-        compiled = numba.njit(cache=True, **_OPTIONS)(function)
-        compiled._cache._cache_file._source_stamp = _digest(Path(function.__code__.co_filename).parent)
-    except (RuntimeError, AttributeError):
-        compiled = numba.njit(**_OPTIONS)(function)
+    compiled = numba.njit(**_OPTIONS)(function)
+    with contextlib.suppress(RuntimeError):  # no folder for the cache
+        compiled._cache = _Cache(function)
     return compiled
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import ghgs_lit
+from ghgs_lit.readers import read_lines_of_json
 
 Rows = list[dict[str, Any]]
 
@@ -62,10 +63,6 @@ class Journal:
 
     def _read(self) -> Iterator[tuple[str, Rows]]:
         """Lines of other code, and a last line that was cut off, are left out."""
-        for line in self.path.read_text().splitlines() if self.path.exists() else ():
-            try:
-                entry = json.loads(line)
-            except ValueError:
-                continue
-            if entry["code"] == code_digest():
+        for entry in read_lines_of_json(self.path) if self.path.exists() else ():
+            if entry.get("code") == code_digest():
                 yield entry["key"], entry["rows"]

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-import yaml
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import read_rows, read_yaml
 from ghgs_lit.runs.run import RunDirectory, State
 
 
@@ -46,8 +46,8 @@ def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
 def _trains(path: Path) -> bool:
     """Whether a ``config.yaml`` is that of a training, which may not have begun."""
     try:
-        return "trainer" in yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError, TypeError):
+        return "trainer" in read_yaml(path)
+    except (InputError, TypeError):
         return False
 
 
@@ -57,11 +57,13 @@ def _best(run: RunDirectory) -> str:
         best = max(rows, key=lambda row: row["psnr"], default=None)
         return best and f"{best['psnr']:.2f} dB ({best['method']}, {best['views']} views, {best['targets']})"
     log = run.path / "csv" / "metrics.csv"
-    scores = pd.read_csv(log).get("val/psnr") if log.is_file() and log.stat().st_size else None
-    return "" if scores is None or scores.isna().all() else f"{scores.max():.2f} dB (validation)"
+    rows = read_rows(log) if log.is_file() else []
+    scores = pd.to_numeric(pd.Series([row.get("val/psnr") for row in rows], dtype=object), errors="coerce")
+    return "" if scores.isna().all() else f"{scores.max():.2f} dB (validation)"
 
 
 def _overrides(path: Path) -> str:
     """What the command line said; nothing where the run was not started by Hydra."""
     file = path / ".hydra" / "overrides.yaml"
-    return " ".join(yaml.safe_load(file.read_text()) or []) if file.is_file() else ""
+    said = read_yaml(file) if file.is_file() else []
+    return " ".join(map(str, said)) if isinstance(said, list) else ""

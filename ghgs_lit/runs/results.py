@@ -7,12 +7,13 @@ import math
 import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.readers import read_json
 from ghgs_lit.runs.provenance import config_hash
 
 FORMAT_VERSION = 3
@@ -105,7 +106,7 @@ def write_results(directory: Path, rows: Sequence[Row], provenance: Mapping[str,
 class _Mean(BaseModel):
     """What others rely on in an entry of ``summary``: all that is not named is a number."""
 
-    model_config = ConfigDict(extra="allow", strict=True)
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
     __pydantic_extra__: dict[str, float | None]
     method: str
     views: int
@@ -122,7 +123,7 @@ class _Row(_Mean):
 class _Results(BaseModel):
     model_config = ConfigDict(strict=True)
     provenance: dict[str, Any]
-    summary: list[_Mean]
+    summary: Annotated[list[_Mean], Field(min_length=1)]
     rows: list[_Row]
 
 
@@ -146,10 +147,7 @@ def read_results(path: Path) -> dict[str, Any]:
         InputError: the file is not a whole ``metrics.json`` of today's format, or its configuration is not
             the one that was measured; the message names it.
     """
-    try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a metrics.json; found {error}") from error
+    content = read_json(path, "a metrics.json")
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT_VERSION:
         again = "`ghgs evaluate` measures again"

@@ -17,6 +17,7 @@ from typing import Any
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import is_locked, lock, lock_owner
+from ghgs_lit.readers import read_lines_of_json
 from ghgs_lit.runs.results import read_results
 
 
@@ -54,7 +55,7 @@ class RunDirectory:
     def metric(self) -> float | None:
         """Mean PSNR of the first protocol, by which a sweep compares its runs."""
         results = self.results
-        return None if results is None else results["summary"][0]["psnr"]
+        return None if results is None else results["summary"][0].get("psnr")
 
     @property
     def checkpoint(self) -> Path | None:
@@ -84,16 +85,9 @@ class RunDirectory:
 
     def sessions(self) -> list[dict[str, Any]]:
         """One entry for each process that worked on the run; a killed one has no ``outcome``."""
-        try:
-            lines = (self.path / "sessions.jsonl").read_text().splitlines()
-        except FileNotFoundError:
-            return []
+        path = self.path / "sessions.jsonl"
         found: list[dict[str, Any]] = []
-        for line in lines:
-            try:
-                entry = json.loads(line)
-            except json.JSONDecodeError:  # the process died while it wrote this line
-                continue
+        for entry in read_lines_of_json(path) if path.exists() else ():
             if "started" in entry:
                 found.append(entry)
             elif found:

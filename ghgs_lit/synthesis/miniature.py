@@ -13,8 +13,9 @@ from ghgs_lit.data.dataset import DataSet, required_folder
 from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.readers import read_json
 from ghgs_lit.synthesis.miniatures import humman, thuman2, zju_mocap
 from ghgs_lit.synthesis.thuman2 import THuman2
 
@@ -80,7 +81,10 @@ def _check_own(folder: Path) -> None:
     marker = folder / MARKER
     found = _files(folder) if folder.is_dir() else []
     if marker.is_file():
-        own = json.loads(marker.read_text())["files"]
+        content = read_json(marker, "a miniature's list of its files")
+        own = content.get("files") if isinstance(content, dict) else "no mapping"
+        is_list = isinstance(own, list) and all(isinstance(name, str) for name in own)
+        require(own is None or is_list, f"{marker}: files", "a list of names or null", own)
         found = [] if own is None else sorted(set(found) - set(own))
     if found:
         raise InputError(

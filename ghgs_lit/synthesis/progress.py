@@ -16,6 +16,7 @@ from ghgs_lit.config.keys import flatten
 from ghgs_lit.data.completeness import Completeness
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import is_locked, lock, lock_owner, write_text_atomically
+from ghgs_lit.readers import read_json
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class Progress:
                     f"{self.root}: expected an empty folder or one rendered here before; found other files"
                 )
             _write_json(path, settings)
-        found = flatten(json.loads(path.read_text()))
+        found = flatten(read_json(path))
         settings = flatten(json.loads(json.dumps(settings)))  # tuples to lists, as they were stored
         for key in sorted(settings.keys() | found.keys()):
             if settings.get(key) != found.get(key):

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from ghgs_lit.data.decoding import read_array, read_image
+from ghgs_lit.data.decoding import check_extent, read_image, read_vertices
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 
@@ -47,7 +47,7 @@ class ScanSource:
         if path is None:
             raise InputError(f"{folder}: expected {name}.obj or {name}.glb; found neither")
         body_path = folder / "body_vertices.npy"
-        body = read_array(body_path, [(None, 3)]).astype(np.float32) if body_path.exists() else None
+        body = read_vertices(body_path) if body_path.exists() else None
         return Person(name=name, parts=load_parts(path), body_vertices=body)
 
     def facing(self, name: str) -> float:
@@ -88,8 +88,10 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
         uv = np.zeros((len(mesh.vertices), 2))
     if uv is None or len(uv) != len(mesh.vertices):
         raise InputError(f"{path}: expected texture coordinates for the mesh {name!r}; found none")
+    vertices = trimesh.transform_points(mesh.vertices, transform)
+    check_extent(f"{path}: {name}", vertices)
     return TexturedMesh(
-        vertices=trimesh.transform_points(mesh.vertices, transform).astype(np.float32),
+        vertices=vertices.astype(np.float32),
         faces=np.asarray(mesh.faces, np.int64),
         uv=np.asarray(uv, np.float32),
         texture=texture,

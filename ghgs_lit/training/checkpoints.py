@@ -1,6 +1,5 @@
 """Checkpoints on disk: complete or not there at all, whenever the run is killed."""
 
-import hashlib
 import os
 import shutil
 from collections.abc import Mapping
@@ -15,36 +14,23 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from pydantic import Field, model_validator
 
 from ghgs_lit.config.options import Index, Options, Positive, Text
+from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
+from ghgs_lit.weights.checkpoint import content_digest
 
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
 
-def content_digest(checkpoint: Mapping[str, Any]) -> str:
-    """SHA-256 of all that training goes on from: weights, optimizer, schedule, loops and callbacks.
-
-    The configuration is left out: it is read in today's keys, and what differs from it is reported.
-    """
-    digest = hashlib.sha256()
-    _add({key: value for key, value in checkpoint.items() if key not in ("digest", "config")}, digest)
-    return digest.hexdigest()
-
-
-def _add(value: Any, digest: Any) -> None:
-    if isinstance(value, torch.Tensor):
-        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-    elif isinstance(value, Mapping):
-        digest.update(f"mapping of {len(value)}".encode())
-        for key in value:
-            digest.update(repr(key).encode())
-            _add(value[key], digest)
-    elif isinstance(value, (list, tuple)):
-        digest.update(f"list of {len(value)}".encode())
-        for entry in value:
-            _add(entry, digest)
-    else:
-        digest.update(repr(value).encode())
+def check_training_state(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint whose state of the training has another form than Lightning's."""
+    kinds = {"epoch": int, "global_step": int, "loops": Mapping, "callbacks": Mapping}
+    kinds |= {"optimizer_states": list, "lr_schedulers": list}
+    for key in kinds.keys() & checkpoint.keys():
+        value, kind = checkpoint[key], kinds[key]
+        require(isinstance(value, kind), f"{path}: {key}", f"a {kind.__name__}", value)
+    for state in checkpoint["optimizer_states"]:
+        fits = isinstance(state, Mapping) and isinstance(state.get("param_groups"), list)
+        require(fits, f"{path}: optimizer_states", "states with param_groups", type(state).__name__)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -65,7 +51,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
     ) -> dict[str, Any]:
         """Tensors and plain data only, whatever the default of the installed PyTorch is."""
-        return torch.load(path, map_location=map_location, weights_only=True)
+        content = torch.load(path, map_location=map_location, weights_only=True)
+        content.setdefault("pytorch-lightning_version", L.__version__)
+        return content
 
 
 def validates_now(trainer: L.Trainer) -> bool:

@@ -1,6 +1,5 @@
 """Loggers that continue after a restart, and the values that a sweep compares its runs by."""
 
-import csv
 import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from ghgs_lit.config.keys import NOT_HYPERPARAMETERS, is_below, lookup
 from ghgs_lit.config.options import Options, Text
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import read_rows
 
 #: The final numbers that runs are compared by: TensorBoard's HParams tab shows the first five of them
 #: at once. ``metrics.json`` has all.
@@ -27,8 +27,7 @@ class CsvLog(CSVLogger):
         path = Path(self.log_dir) / "metrics.csv"
         rows = []
         if path.is_file():
-            with open(path, newline="") as file:
-                rows = [row for row in csv.DictReader(file) if _is_before(row.get("step"), step)]
+            rows = [row for row in read_rows(path) if _is_before(row.get("step"), step)]
         writer = self.experiment  # begins with an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()

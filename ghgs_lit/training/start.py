@@ -8,8 +8,8 @@ from torch import nn
 
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.training.checkpoints import content_digest
-from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite
+from ghgs_lit.training.checkpoints import check_training_state
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 from ghgs_lit.weights.switches import differences as differing_switches
 
 
@@ -39,17 +39,14 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
         InputError: not a checkpoint of a training run, of another model (names the tensor), or changed
             since it was written.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, whole=True)
     for key in ("global_step", "optimizer_states"):
         if key not in checkpoint:
             raise InputError(
                 f"{path}: expected a checkpoint of a training run; found none of its {key!r}"
                 " (init_from=... starts from weights alone)"
             )
-    digest = checkpoint.get("digest")  # earlier versions wrote none
-    if digest is not None:
-        found = content_digest(checkpoint)
-        require(found == digest, f"{path}: digest", f"{str(digest)[:12]}..., as written", f"{found[:12]}...")
+    check_training_state(path, checkpoint)
     load_strictly(model, model_state(checkpoint), path)
     _check_optimizer(path, checkpoint, config)
     return checkpoint["global_step"], differences(checkpoint["config"], config)
@@ -93,12 +90,12 @@ def initialize(
         InputError: not a checkpoint of this project; nothing fits; a parameter that does not learn stays as
             initialised; with ``strict``, a tensor that does not fit or is missing on either side (names it).
     """
-    state, own = model_state(read_checkpoint(path)), model.state_dict()
+    state, own = model_state(read_checkpoint(path, whole=True)), model.state_dict()
     if strict:
         load_strictly(model, state, path)
     fitting, lines = {}, []
     for key in [*own, *(key for key in state if key not in own)]:
-        here, there = (tuple(s[key].shape) if key in s else None for s in (own, state))
+        here, there = (shape_of(s[key]) if key in s else None for s in (own, state))
         if here is None:
             lines.append(f"ignored      {key} {there}: the model has no such tensor")
         elif there is None:

@@ -1,5 +1,7 @@
 """Checkpoints of this package: plain data with the whole configuration, enough to rebuild the model."""
 
+import hashlib
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -7,10 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
-from ghgs_lit.weights.reading import open_file
+from ghgs_lit.weights.reading import file_of, open_file
 
 #: Version of the checkpoints that are written; earlier ones are read too.
 FORMAT_VERSION = 2
@@ -19,17 +22,23 @@ FORMAT_VERSION = 2
 STATE_PREFIX = "model."
 
 
-def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
+#: Precisions of weights.
+_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+
+
+def read_checkpoint(path: str | Path, map_location: Any = "cpu", whole: bool = False) -> dict[str, Any]:
     """Read a checkpoint of this package.
 
     Args:
         path: the file; its tensors are mapped from the disk, not read.
         map_location: the device of the tensors, as for ``torch.load``.
+        whole: read every byte once and refuse a file that was changed since it was written (2 s for 1 GB).
 
     Raises:
         FileNotFoundError: there is no such file.
         InputError: the file is not a checkpoint of this package; names what was expected and found.
     """
+    _check_sums(path, tensors=False)
     checkpoint = open_file(path, map_location)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
@@ -42,7 +51,80 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     if not 1 <= version <= FORMAT_VERSION:
         newer = ", of a newer version of this package" if version > FORMAT_VERSION else ""
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
+    _check_content(path, checkpoint)
+    if whole and "digest" in checkpoint:
+        _check_digest(path, checkpoint["digest"])
+    elif whole:
+        _check_sums(path, tensors=True)
     return dict(checkpoint)
+
+
+def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
+    """Refuse nodes and tensors of kinds that no checkpoint has; what a node says is checked where it acts."""
+    for name, node in checkpoint["config"].items():
+        require(isinstance(name, str), f"{path}: config", "keys of text", name)
+        expected = "a mapping of its keys"
+        require(
+            name not in KINDS or node is None or isinstance(node, Mapping),
+            f"{path}: config.{name}",
+            expected,
+            node,
+        )
+    for name, value in checkpoint["state_dict"].items():
+        require(isinstance(name, str), f"{path}: state_dict", "names of tensors", name)
+        if isinstance(value, Tensor):
+            dense = value.layout is torch.strided and not value.is_meta
+            known = dense and (not value.is_floating_point() or value.dtype in _FLOATS)
+            found = f"{value.dtype}, {value.layout} on {value.device}"
+            require(known, f"{path}: {name}", "a dense tensor of 16, 32 or 64 bits", found)
+
+
+def _check_sums(path: str | Path, tensors: bool) -> None:
+    """Refuse a PyTorch file whose bytes of ``tensors``, or of all else, do not fit its checksums."""
+    if not zipfile.is_zipfile(file := file_of(path)):
+        return  # reading it says what is wrong
+    try:
+        with zipfile.ZipFile(file) as archive:
+            for record in archive.infolist():
+                if record.compress_type == zipfile.ZIP_STORED and ("/data/" in record.filename) == tensors:
+                    with archive.open(record) as stream:
+                        while stream.read(1 << 24):
+                            pass
+    except (zipfile.BadZipFile, EOFError, RuntimeError) as error:
+        raise InputError(f"{path}: expected the bytes that were written; found others ({error})") from error
+
+
+def _check_digest(path: str | Path, digest: str) -> None:
+    """Refuse a file whose content, but for the configuration, is not that of its ``digest``."""
+    found = content_digest(open_file(path))  # a mapping of its own: pages that were read count as memory
+    require(found == digest, f"{path}: digest", f"{str(digest)[:12]}..., as written", f"{found[:12]}...")
+
+
+def content_digest(checkpoint: Mapping[str, Any]) -> str:
+    """SHA-256 of all that training goes on from: weights, optimizer, schedule, loops and callbacks.
+
+    The configuration is left out: it is read in today's keys, and what differs from it is reported.
+    """
+    digest = hashlib.sha256()
+    _add({key: value for key, value in checkpoint.items() if key not in ("digest", "config")}, digest)
+    return digest.hexdigest()
+
+
+def _add(value: Any, digest: Any) -> None:
+    if isinstance(value, torch.Tensor):
+        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    elif isinstance(value, Mapping):
+        digest.update(f"mapping of {len(value)}".encode())
+        for key in value:
+            digest.update(repr(key).encode())
+            _add(value[key], digest)
+    elif isinstance(value, (list, tuple)):
+        digest.update(f"list of {len(value)}".encode())
+        for entry in value:
+            _add(entry, digest)
+    else:
+        digest.update(repr(value).encode())
 
 
 def _is_published(content: Any) -> bool:

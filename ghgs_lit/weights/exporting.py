@@ -27,7 +27,7 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
         InputError: both files are None, or a tensor has no published name; then nothing is written.
     """
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
-    content = read_checkpoint(checkpoint)
+    content = read_checkpoint(checkpoint, whole=True)
     state = model_state(content)
     encoder = {name: tensor for name, tensor in state.items() if name.startswith("encoder.")}
     heads = {name: tensor for name, tensor in state.items() if name not in encoder}

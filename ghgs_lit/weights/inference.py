@@ -25,7 +25,7 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
     """
     if Path(checkpoint).resolve() == Path(path).resolve():
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
-    content = read_checkpoint(checkpoint)
+    content = read_checkpoint(checkpoint, whole=True)
     state = cast(lambda: model_state(read_checkpoint(checkpoint)), lambda *_: getattr(torch, dtype))
     require_finite(state, f"{checkpoint} as {dtype}")
     facts = {name: content[name] for name in _FACTS if name in content}

@@ -30,7 +30,7 @@ def load_weights(
         InputError: the file is not a checkpoint of this package, or its weights are not finite or do not fit
             the model.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, whole=True)
     require_fit(model, model_state(checkpoint), path)
     check_preset(model, checkpoint, path)
 

@@ -218,6 +218,10 @@ def damage(root, kind: str) -> str:
     if kind == "matte of 16 bits":
         Image.fromarray(np.zeros((SIZE, SIZE), np.uint16)).save(alpha)
         return r"alpha/box_000/0\.png: expected 8 bits of grey; found uint16"
+    if kind in ("matte of zeros", "depth of zeros"):
+        path, dtype = (alpha, np.uint8) if kind == "matte of zeros" else (depth / "0.png", np.uint16)
+        Image.fromarray(np.zeros((SIZE, SIZE), dtype)).save(path)
+        return r"box_000/0\.png: expected .* above 0 at the subject; found '0 everywhere'"
     if kind == "matte size":
         Image.new("L", (20, 30)).save(alpha)
         return r"alpha/box_000/0\.png: expected the size of its photograph, 56x56; found 30x20"
@@ -252,6 +256,8 @@ BAD_IMAGES = [
     "depth of 8 bits",
     "matte of 16 bits",
     "matte size",
+    "matte of zeros",
+    "depth of zeros",
 ]
 BAD_CAMERAS = ["zero focal", "nan camera", "camera shape", "no rotation", "camera garbage", "camera missing"]
 
@@ -263,6 +269,21 @@ def test_bad_files_are_named(root, kind):
     with pytest.raises(InputError, match=pattern) as caught:
         photographs(root).view("box", 0, 0)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("vertices", "message"),
+    [
+        (np.zeros((0, 3)), "expected vertices; found 'none'"),
+        (np.full((4, 3), 1e30), "expected coordinates below 1e.06; found 1e.30"),
+        (np.zeros((4, 3), "datetime64[s]"), "expected an array nx3; found numbers of type datetime64"),
+        (np.zeros((4, 3), complex), "expected an array nx3; found numbers of type complex"),
+    ],
+)
+def test_bodies_of_no_person_are_named(root, vertices, message):
+    np.save(root / "train" / "smpl" / "box" / "vertices.npy", vertices)
+    with pytest.raises(InputError, match=rf"box/vertices\.npy: {message}"):
+        photographs(root).body("box")
 
 
 def test_missing_roots_and_phases(tmp_path):

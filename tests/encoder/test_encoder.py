@@ -91,6 +91,13 @@ def test_batch_elements_are_independent():
             torch.testing.assert_close(x, y[part], rtol=1e-9, atol=1e-9)
 
 
+def test_images_that_are_wider_than_the_weights_are_named():
+    """They would end in a convolution of one of the heads."""
+    images, masks = _views(1, 2, 28, 28)
+    with pytest.raises(InputError, match=r"images: expected float32 .*; found torch\.float64"):
+        _encoder()(images.double(), masks)
+
+
 def test_only_the_first_view_is_special():
     """The order of the later views must not change their tokens."""
     encoder = _encoder().double()

@@ -1,10 +1,8 @@
 """The CPU backend with several threads and processes, other processors, and cached machine code."""
 
 import dataclasses
-import importlib.util
 import multiprocessing
 import platform
-import sys
 import threading
 import warnings
 
@@ -12,7 +10,7 @@ import numba
 import pytest
 import torch
 
-from ghgs_lit.kernels import compile, pool
+from ghgs_lit.kernels import pool
 from ghgs_lit.rendering import render
 from ghgs_lit.rendering.cpu import backend
 from tests.helpers.processes import run_python
@@ -107,28 +105,6 @@ def train_in_workers():
     for found, (image, gradient) in zip(loader, wanted, strict=True):
         assert torch.equal(found[0], image)
         assert torch.equal(found[1], gradient)
-
-
-def test_machine_code_of_other_sources_is_not_taken_from_the_cache(tmp_path):
-    """Machine code of older sources is never loaded; that of the same sources is."""
-    source = tmp_path / "scaled.py"
-    source.write_text(
-        "from ghgs_lit.kernels import compile\n\n\n@compile.kernel\ndef double(x):\n    return x + x\n"
-    )
-
-    def hits(digest):
-        original, compile._digest = compile._digest, lambda folder: digest
-        try:
-            spec = importlib.util.spec_from_file_location("scaled", source)
-            module = importlib.util.module_from_spec(spec)
-            sys.modules["scaled"] = module
-            spec.loader.exec_module(module)
-            assert module.double(2) == 4
-            return sum(module.double.stats.cache_hits.values())
-        finally:
-            compile._digest = original
-
-    assert [hits("a"), hits("a"), hits("b"), hits("b")] == [0, 1, 0, 1]
 
 
 @pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])

@@ -43,6 +43,19 @@ def test_results_whose_configuration_was_changed_are_refused(tmp_path):
         read_results(path)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "20", [20]])
+@pytest.mark.parametrize("part", ["rows", "summary"])
+def test_figures_that_are_no_finite_numbers_are_refused(tmp_path, part, value):
+    write_finished_run(tmp_path, {"seed": 1})
+    path = tmp_path / "metrics.json"
+    content = json.loads(path.read_text())
+    content[part][0]["psnr"] = value
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=rf"metrics\.json\.{part}\[0\]\.psnr: expected"):
+        read_results(path)
+    assert not RunDirectory(tmp_path).done
+
+
 def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):
     """The half-written file of a killed process is removed by the next one, and is no result."""
     child = SPAWN.Process(target=os.getpid)

@@ -1,6 +1,7 @@
 """Scans on disk: loaded as they are, rendered with one transform, and bad ones are named."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -75,6 +76,10 @@ def test_bad_scans_are_named(tmp_path):
     path = write_obj_scan(tmp_path, "bare", textured=False)
     with pytest.raises(InputError, match=r"bare\.obj: expected a texture for the mesh .*; found none"):
         ScanSource(tmp_path).load("bare")
+    far = write_obj_scan(tmp_path, "far")
+    far.write_text(re.sub(r"(?m)^v \S+", "v 1e30", far.read_text(), count=1))
+    with pytest.raises(InputError, match=r"far\.obj: .*: expected coordinates below 1e\+06; found"):
+        ScanSource(tmp_path).load("far")
     path.write_text("f 1 2 3\n")
     with pytest.raises(InputError, match=r"bare\.obj: expected"):
         ScanSource(tmp_path).load("bare")

@@ -4,7 +4,6 @@ Each has ``K`` (3, 3), ``R`` (3, 3) and ``T`` (3), OpenCV's, world to camera in 
 distortion. The world is the frame of ``kinect_color_000``: y points down.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 
 from ghgs_lit.data.decoding import check_array, check_extrinsics, check_intrinsics
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import read_json
 
 KINECTS = range(10)
 # Metres: least and greatest plausible distance between cameras of one studio.
@@ -42,12 +42,7 @@ def read_calibration(path: Path, kind: str) -> Calibration:
     Raises:
         InputError: it is missing or broken, a camera is missing or bad, or translations are not in metres.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: expected the cameras of a sequence; found no such file")
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected JSON; found {error}") from error
+    content = read_json(path, "the cameras of a sequence in JSON")
     cameras = [_camera(path, content, f"kinect_{kind}_{k:03d}") for k in KINECTS]
     intrinsics, extrinsics = (np.stack(matrices) for matrices in zip(*cameras, strict=True))
     centers = -np.einsum("nji,nj->ni", extrinsics[:, :3, :3], extrinsics[:, :3, 3])

@@ -11,7 +11,6 @@ A row with ``subject`` has the values of one subject and can be tested; a row wi
 ``subjects`` subjects (optional). ``seed`` is optional.
 """
 
-import json
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.records import SETTING, Variant
+from ghgs_lit.readers import read_json
 from ghgs_lit.runs.results import validated
 
 _Text = Annotated[str, Field(min_length=1)]
@@ -61,11 +61,7 @@ def read_others(path: Path) -> pd.DataFrame:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
-    try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON; found {error}") from error
-    others = validated(_Others, content, path.name)
+    others = validated(_Others, read_json(path), path.name)
     rows = pd.DataFrame([row.model_dump() for row in others.rows])
     cell = [*SETTING, "views", "seed"]
     repeated = rows.duplicated([*cell, "subject"])

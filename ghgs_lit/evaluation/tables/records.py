@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from ghgs_lit.config import conf_dir
 from ghgs_lit.config.ablation import ABLATIONS, switches_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.readers import read_yaml
 from ghgs_lit.runs.listing import files_below
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
@@ -94,7 +94,7 @@ class Sweep:
 
 @cache
 def _shipped_encoders() -> dict[str, dict]:
-    return {path.stem: yaml.safe_load(path.read_text()) for path in (conf_dir() / "encoder").glob("*.yaml")}
+    return {path.stem: read_yaml(path) for path in (conf_dir() / "encoder").glob("*.yaml")}
 
 
 def encoder_name(config: Mapping[str, Any]) -> str:
@@ -218,14 +218,16 @@ def _read_run(path: Path, by: Sequence[str]) -> tuple[pd.DataFrame, dict[str, An
 def _planned(path: Path, by: Sequence[str]) -> Planned | None:
     """The training run of a ``config.yaml``; None where it is that of another verb or incomplete."""
     try:
-        config = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        config = read_yaml(path)
+    except InputError:
         return None
     needed = ("trainer", "data", "recalibration")
     if not isinstance(config, Mapping) or not all(key in config for key in needed):
         return None
     data, done = str(lookup(config, "data.name")), (path.parent / "metrics.json").exists()
-    return Planned(model_variant(config, str(path), by), data, int(config.get("seed", 0)), done)
+    seed = config.get("seed", 0)
+    require(isinstance(seed, int), f"{path}: seed", "a whole number", seed)
+    return Planned(model_variant(config, str(path), by), data, seed, done)
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:

@@ -5,12 +5,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
+from ghgs_lit.readers import read_yaml
 
 
 @cache
 def _content() -> dict[str, Any]:
-    return yaml.safe_load((Path(__file__).parent / "reported.yaml").read_text())
+    return read_yaml(Path(__file__).parent / "reported.yaml")
 
 
 def data_title(name: str) -> str:

@@ -55,7 +55,8 @@ class Convention:
         choice("calibration.pixel_centers", self.pixel_centers, PIXEL_CENTERS)
         for name in ("resized", "unit"):
             value = getattr(self, name)
-            require(0 < value < float("inf"), f"calibration.{name}", "a number above 0", value)
+            expected = "a number above 0, from 1e-9 to 1e9"
+            require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from ghgs_lit.config.keys import lookup
 from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
@@ -137,7 +138,7 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
 
     Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
     """
-    return config.get("data", {}).get("size") or config["encoder"].get("image_size", 518)
+    return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
 
 
 @functools.lru_cache(maxsize=1)

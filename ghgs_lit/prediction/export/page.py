@@ -46,8 +46,8 @@ def page(
     text = files("ghgs_lit.prediction.export").joinpath("page.html").read_text()
     values = {
         "title": html.escape(name),
-        # A script ends at "</" whatever is around it.
-        "scene": json.dumps(scene).replace("</", "<\\/"),
+        # "<!--", "<script" and "</" mean something inside a script, too.
+        "scene": json.dumps(scene).replace("<", "\\u003c"),
         "data": data,
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda name: values[name[1]], text)

@@ -23,6 +23,7 @@ from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
 from ghgs_lit.prediction.export.video import mp4_bytes
+from ghgs_lit.readers import read_json
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.runs.results import plain
@@ -150,8 +151,8 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 def _report_before(directory: Path) -> dict[str, Any]:
     """The report of an earlier prediction in a directory; empty where there is none."""
     try:
-        report = json.loads((directory / REPORT).read_text())
-    except (OSError, ValueError):
+        report = read_json(directory / REPORT)
+    except InputError:
         return {}
     return report if isinstance(report, dict) and isinstance(report.get("files"), dict) else {}
 
@@ -159,7 +160,8 @@ def _report_before(directory: Path) -> dict[str, Any]:
 def _written_before(directory: Path) -> list[str]:
     """The files that earlier predictions wrote into a directory."""
     report = _report_before(directory)
-    return [*report.get("files", ()), *report.get("earlier_files", ())]
+    earlier = report.get("earlier_files")
+    return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]
 
 
 @torch.no_grad()

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from ghgs_lit.bounds import VisualHull
+from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.metrics import flip_map, psnr
@@ -113,8 +113,10 @@ def _read_inputs(directory: Path) -> Batch:
     pictures, cameras = [], []
     for name, camera in stored.cameras.items():
         file = directory / "inputs" / f"{name}.png"
+        inside = file.resolve().parent == (directory / "inputs").resolve()
+        require(inside, str(file), f"the photograph of camera {name} in this folder", "a file outside")
         require(file.exists(), str(file), f"the photograph of camera {name}", "none")
-        pictures.append(np.asarray(Image.open(file).convert("RGBA")))
+        pictures.append(np.asarray(read_image(file).convert("RGBA")))
         cameras.append(calibrate(camera, stored.convention, pictures[-1].shape[:2]))
     shapes = {picture.shape for picture in pictures}
     require(len(shapes) == 1, str(directory / "inputs"), "photographs of one size", sorted(shapes))

@@ -1,9 +1,13 @@
 """The page: a viser server with the Gaussians, cameras, points and hull, and controls for them."""
 
+import contextlib
 import logging
 import math
+import socket
 import threading
+from collections.abc import Callable, Iterator
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -17,6 +21,38 @@ from ghgs_lit.visualization.turntable import pixel_size
 PICTURES = ("render", "photograph", "FLIP")
 
 
+def _require_address(host: str) -> None:
+    """Refuse an address that is none of this machine: viser would wait for it without a word."""
+    try:
+        family, *_ = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0]
+        socket.create_server((host, 0), family=family).close()
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"host: expected an address of this machine; found {host!r} ({error})") from error
+
+
+@contextlib.contextmanager
+def _own_pages_only() -> Iterator[None]:
+    """Let servers that begin meanwhile refuse pages of other sites: viser takes requests of any origin."""
+    from websockets.asyncio import server
+
+    serve = server.serve
+
+    def strict(*arguments: Any, process_request: Callable, **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            origin = request.headers.get("Origin")
+            if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
+                return connection.respond(403, "expected a request of this page\n")
+            return process_request(connection, request)
+
+        return serve(*arguments, process_request=checked, **options)
+
+    server.serve = strict
+    try:
+        yield
+    finally:
+        server.serve = serve
+
+
 class Viewer:
     """A running page.
 
@@ -26,7 +62,7 @@ class Viewer:
         port: the first one to try.
 
     Raises:
-        InputError: viser is not installed.
+        InputError: viser is not installed, or this machine has no such address.
     """
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
@@ -36,10 +72,12 @@ class Viewer:
             raise InputError(
                 f"ghgs view: expected the extra viewer (pip install 'ghgs-lit[viewer]'); found {error}"
             ) from error
+        _require_address(host)
         self.content = content
         self._lock = threading.Lock()  # controls are answered by several threads
         logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor otherwise
-        self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
+        with _own_pages_only():
+            self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
         self.server.scene.set_up_direction(content.up.numpy())
         self._prepare()
         with self.server.gui.add_folder("Gaussians"):

@@ -114,13 +114,14 @@ def test_a_ply_is_lossless(gaussians, tmp_path):
 def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     """One file: no address, the records as they are in .splat, the cameras; names cannot end the script."""
     cameras = camera_ring(2, 100, 80)[0]
-    name = "</title><script>{{data}}"
-    text = page(gaussians, cameras, ("a", "</script>"), UP, torch.tensor([0.0, 0.1, 0.2]), name)
+    name, wicked = "</title><script>{{data}}", "</script><!--<script>"  # the last two open a second script
+    text = page(gaussians, cameras, ("a", wicked), UP, torch.tensor([0.0, 0.1, 0.2]), name)
     assert not re.search(r"https?://|src=|href=|import ", text)
     assert text.count("<script") == text.count("</script>") == 3
+    assert "<!--" not in text
     parts = dict(re.findall(r'<script type="[^"]+" id="(\w+)">(.*?)</script>', text, re.S))
     scene = json.loads(parts["scene"])
-    assert [camera["name"] for camera in scene["cameras"]] == ["a", "</script>"]
+    assert [camera["name"] for camera in scene["cameras"]] == ["a", wicked]
     assert np.allclose(scene["cameras"][1]["extrinsics"], cameras.extrinsics[1])
     assert scene["size"] == [80, 100]
     assert np.allclose(scene["target"], [0, 0.1, 0.2])

@@ -1,6 +1,9 @@
 """The page to look around in a prediction."""
 
 import dataclasses
+import json
+import shutil
+import socket
 import urllib.request
 
 import numpy as np
@@ -116,3 +119,54 @@ def test_the_verb_says_who_can_open_the_page(directory, tmp_path, capsys):
     assert ghgs("view", *arguments) == 0
     text = "(for this machine only; host=0.0.0.0 opens it to the network); Ctrl-C ends it"
     assert text in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("host", ["192.0.2.7", "no.such.host.invalid", ".", "a" * 300])
+def test_an_address_of_another_machine_is_named(directory, host):
+    """viser tries a thousand ports of it, and then waits without a word."""
+    with pytest.raises(InputError, match="host: expected an address of this machine; found"):
+        Viewer(read_content(directory, None), host, PORT)
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        ("http://{host}", 101), (None, 101), ("http://evil.example", 403),
+        ("http://{host}.evil.example", 403), ("null", 403),
+    ],
+)  # fmt: skip
+def test_pages_of_other_sites_get_no_connection(tmp_path, origin, status):
+    """A page that is open in the same browser must not read the photographs."""
+    write_ply(body(50, 60), tmp_path / "a.ply")
+    viewer = Viewer(read_content(tmp_path / "a.ply", None), port=PORT)
+    try:
+        host = viewer.address.removeprefix("http://")
+        lines = [
+            "GET / HTTP/1.1", f"Host: {host}", "Upgrade: websocket", "Connection: Upgrade",
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13",
+        ]  # fmt: skip
+        lines += [f"Origin: {origin.format(host=host)}"] if origin else []
+        name, port = host.split(":")
+        with socket.create_connection((name, int(port)), timeout=20) as connection:
+            connection.sendall("\r\n".join([*lines, "", ""]).encode())
+            assert connection.recv(100).split()[1] == str(status).encode()
+    finally:
+        viewer.stop()
+
+
+@pytest.mark.parametrize("name", ["../outside", "{tmp}/outside", "link"])
+def test_the_viewer_opens_nothing_outside_its_folder(directory, tmp_path, name):
+    folder = tmp_path / "prediction"
+    shutil.copytree(directory, folder)
+    photograph = next((folder / "inputs").glob("*.png"))
+    shutil.copy(photograph, tmp_path / "outside.png")
+    shutil.copy(photograph, folder / "outside.png")
+    (folder / "inputs" / "link.png").symlink_to(tmp_path / "outside.png")
+    cameras = json.loads((folder / "cameras.json").read_text())
+    first, second, _ = cameras["cameras"]
+    cameras["cameras"][name.format(tmp=tmp_path)] = cameras["cameras"].pop(first)
+    if name != "link":  # names of two folders keep them
+        cameras["cameras"]["other/outside"] = cameras["cameras"].pop(second)
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    with pytest.raises(InputError, match=r"\.png: expected the photograph of camera .* in this folder"):
+        read_content(folder, None)

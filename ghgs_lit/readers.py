@@ -1,0 +1,122 @@
+"""Files of text and arrays, read within limits: every defect is an :class:`InputError`."""
+
+import csv
+import io
+import json
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ghgs_lit.errors import InputError, require
+
+#: Bytes of a file of text, and levels of its mappings and lists.
+LARGEST, DEEPEST = 1 << 28, 64
+
+
+def require_file(path: str | os.PathLike, expected: str) -> None:
+    """Refuse what is no regular file: missing, a folder, a link to itself, a pipe that never ends."""
+    try:
+        is_file = stat.S_ISREG(os.stat(path).st_mode)
+    except OSError as error:
+        missing = isinstance(error, FileNotFoundError)
+        raise InputError(
+            f"{path}: expected {expected}; found {'no such file' if missing else error.strerror}"
+        ) from error
+    require(is_file, str(path), expected, "a folder" if os.path.isdir(path) else "no regular file")
+
+
+def read_text(path: Path, expected: str = "text") -> str:
+    """The text of a file in UTF-8; a byte order mark is left out.
+
+    Args:
+        path: the file.
+        expected: what it should be, for messages.
+
+    Raises:
+        InputError: it is missing, no file, larger than 256 MB or in another encoding.
+    """
+    require_file(path, expected)
+    try:
+        size = path.stat().st_size
+        require(size <= LARGEST, str(path), f"{expected} of at most {LARGEST >> 20} MB", f"{size >> 20} MB")
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected {expected}; found {error}") from error
+
+
+def read_json(path: Path, expected: str = "JSON") -> Any:
+    """The content of a JSON file; arguments and errors as for :func:`read_text`.
+
+    Raises:
+        InputError: also where it is no JSON, or nested deeper than 64 levels.
+    """
+    return _parsed(path, expected, json.loads)
+
+
+def read_yaml(path: Path, expected: str = "YAML") -> Any:
+    """The plain data of a YAML file; as :func:`read_json`, and without aliases, which grow without limit."""
+    return _parsed(path, expected, _plain_yaml)
+
+
+def read_rows(path: Path, expected: str = "CSV with a header") -> list[dict[str, str]]:
+    """The lines of a CSV file by the names of its header; arguments and errors as for :func:`read_text`."""
+    return _parsed(path, expected, lambda text: list(csv.DictReader(io.StringIO(text, newline=""))))
+
+
+def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
+    """The mappings of a file with one on each line; lines that a killed process left are skipped."""
+    require_file(path, "a mapping in JSON on each line")
+    for line in path.read_bytes().splitlines():
+        try:
+            entry = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(entry, dict):
+            yield entry
+
+
+def read_npy(path: Path, expected: str = "a readable .npy file") -> np.ndarray:
+    """The array of an ``.npy`` file without objects.
+
+    Raises:
+        InputError: it is missing, another format, or shorter than its header says.
+    """
+    require_file(path, expected)
+    try:
+        # A mapping is refused where the file is too short; reading would ask for the memory first.
+        return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
+    except Exception as error:  # headers are Python, whose tokenizer has errors of its own
+        raise InputError(f"{path}: expected {expected}; found a file that cannot be read: {error}") from error
+
+
+def _plain_yaml(text: str) -> Any:
+    level = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError("an alias (*name)")
+        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if level > DEEPEST:
+            raise ValueError(f"more than {DEEPEST} levels")
+    return yaml.safe_load(text)
+
+
+def _parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
+    try:
+        value = parse(read_text(path, expected))
+        if _levels(value) > DEEPEST:
+            raise ValueError(f"more than {DEEPEST} levels")
+    except InputError:
+        raise
+    except (ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
+        raise InputError(f"{path}: expected {expected}; found {error}") from error
+    return value
+
+
+def _levels(value: Any) -> int:
+    children = value.values() if isinstance(value, dict) else value
+    return 1 + max(map(_levels, children), default=0) if isinstance(value, dict | list) else 0

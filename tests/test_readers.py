@@ -1,0 +1,158 @@
+"""Files that are broken, foreign or without end: one line that names them, in no time."""
+
+import contextlib
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, PngImagePlugin
+
+from ghgs_lit.data.completeness import Completeness
+from ghgs_lit.data.decoding import read_array, read_image
+from ghgs_lit.data.pickles import load_npy
+from ghgs_lit.data.splits import read_split
+from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.tables.others import read_others
+from ghgs_lit.evaluation.tables.records import read_sweep
+from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
+from ghgs_lit.runs.journal import Journal
+from ghgs_lit.runs.listing import list_runs
+from ghgs_lit.runs.results import read_results
+from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.synthesis.progress import Progress
+
+READERS = (read_text, read_json, read_yaml, read_rows, read_npy)
+
+
+def large(path):
+    path.touch()
+    os.truncate(path, LARGEST + 1)
+
+
+#: What no reader takes, by name: makes the file.
+NO_FILES = {
+    "missing": lambda path: None,
+    "a folder": Path.mkdir,
+    "a pipe": os.mkfifo,
+    "a link to itself": lambda path: path.symlink_to(path),
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+}
+
+
+@pytest.mark.parametrize("reader", [*READERS, read_image], ids=lambda reader: reader.__name__)
+@pytest.mark.parametrize("kind", NO_FILES)
+def test_what_is_no_file_is_refused_at_once(tmp_path, reader, kind):
+    path = tmp_path / "it"
+    NO_FILES[kind](path)
+    with pytest.raises(InputError, match=r"it: expected .*; found \W?(no such f|a f|no reg|Too many)"):
+        reader(path)
+
+
+LAUGHS = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
+
+
+@pytest.mark.parametrize(
+    ("reader", "content", "found"),
+    [
+        (read_json, b'{"a": ', "Expecting value"),
+        (read_json, b"\xff\xfe{}", "codec can't decode"),
+        (read_json, b"", "Expecting value"),
+        (read_json, b"[" * 100_000, "recursion"),
+        (read_json, b"[" * 70 + b"]" * 70, "more than 64 levels"),
+        (read_yaml, b"a: [1, 2", "expected ','"),
+        (read_yaml, b"\x00", "(control|special) characters"),
+        (read_yaml, b"a: !!python/object/apply:os.system [x]", "could not determine a constructor"),
+        (read_yaml, LAUGHS.encode(), r"an alias \(\*name\)"),
+        (read_yaml, b"[" * 5000, "more than 64 levels"),
+        (read_yaml, b"[" * 70 + b"]" * 70, "more than 64 levels"),
+        (read_rows, b"a\n" + b"x" * 200_000, "field larger"),
+        (read_rows, b"\xff", "codec can't decode"),
+        (read_npy, b"\x93NUMPY\x01\x00", "cannot be read"),
+        (read_npy, b"", "cannot be read"),
+        (read_text, large, "256 MB"),
+    ],
+)  # fmt: skip
+def test_broken_content_is_one_line(tmp_path, reader, content, found):
+    path = tmp_path / "it"
+    content(path) if callable(content) else path.write_bytes(content)
+    with pytest.raises(InputError, match=f"(?s)it: expected .*; found .*{found}"):
+        reader(path)
+
+
+def test_a_byte_order_mark_is_no_content(tmp_path):
+    (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"a": [1]}')
+    assert read_json(tmp_path / "a.json") == {"a": [1]}
+    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfa,b\r\n1,2\r\n")
+    assert read_rows(tmp_path / "a.csv") == [{"a": "1", "b": "2"}]
+
+
+@pytest.mark.parametrize("header", [
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,)}",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': (",
+    "{'descr': '<f8', 'fortran_order': False, 'shape': ('a',)}",
+])  # fmt: skip
+@pytest.mark.parametrize("reader", [read_npy, load_npy, lambda path: read_array(path, [(3, 3)])])
+def test_a_header_that_promises_terabytes_or_is_broken(tmp_path, reader, header):
+    text = header.ljust(117).encode() + b"\n"
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + bytes(64))
+    with pytest.raises(InputError, match=r"a\.npy: expected"):
+        reader(path)
+
+
+@pytest.mark.parametrize(
+    "array", [np.zeros(0), np.array(3.0), np.arange(6.0).reshape(2, 3), np.ones((2, 3), order="F")]
+)
+def test_arrays_come_back(tmp_path, array):
+    np.save(tmp_path / "a.npy", array)
+    assert np.array_equal(read_npy(tmp_path / "a.npy"), array)
+
+
+def test_a_picture_with_a_text_that_unpacks_without_end(tmp_path):
+    info = PngImagePlugin.PngInfo()
+    info.add_text("a", "x" * (PngImagePlugin.MAX_TEXT_CHUNK + 1), zip=True)
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png", pnginfo=info)
+    with pytest.raises(InputError, match=r"a\.png: expected a readable image; found"):
+        read_image(tmp_path / "a.png")
+
+
+FOREIGN = (b"\xff\xfe", b'{"a":', b"5", b"[5]", b'{"train": 5}', b'{"train": [[1]]}', b"[" * 2000, b"null")
+
+
+@pytest.mark.parametrize("content", FOREIGN)
+def test_foreign_content_of_files_of_this_program(tmp_path, content):
+    """Plans, settings, split lists and results that something else wrote are named."""
+    folder = tmp_path / "rendering"
+    folder.mkdir()
+    readers = {
+        folder / "plan.json": lambda: Completeness(tmp_path).plan,
+        folder / "settings.json": lambda: Progress(tmp_path).check_settings({"size": 3}),
+        tmp_path / "splits.json": lambda: read_split(tmp_path / "splits.json", ["a"]),
+        tmp_path / "metrics.json": lambda: read_results(tmp_path / "metrics.json"),
+        tmp_path / "other.json": lambda: read_others(tmp_path / "other.json"),
+    }
+    for path, read in readers.items():
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=path.name.replace(".", r"\.")):
+            read()
+
+
+@pytest.mark.parametrize("content", [*FOREIGN, b"seed: text\ntrainer: 3\ndata: []\nrecalibration: {}"])
+def test_runs_of_foreign_content_are_listed_or_named(tmp_path, content):
+    run = RunDirectory(tmp_path)
+    for name in ("config.yaml", "sessions.jsonl", "csv/metrics.csv", ".hydra/overrides.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(content)
+    run.sessions()
+    assert not run.done
+    for read in (list_runs, read_sweep):
+        with contextlib.suppress(InputError):
+            read([tmp_path])
+
+
+def test_lines_that_a_killed_process_left_are_skipped(tmp_path):
+    path = tmp_path / "a.jsonl"
+    path.write_bytes(b'{"a": 1}\n5\n{"a": \n[[[\n\xff\n{"b": 2}')
+    assert list(read_lines_of_json(path)) == [{"a": 1}, {"b": 2}]
+    assert "x" not in Journal(path)
