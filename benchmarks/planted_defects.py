@@ -1,9 +1,11 @@
-"""Defects planted in a copy of the package, and the cases of the stress test that catch them.
+"""Defects planted one at a time in a copy of the package, and the tests that catch them.
 
-    python benchmarks/planted_defects.py
+    python benchmarks/planted_defects.py            # all: some seconds each
+    python benchmarks/planted_defects.py rounds/ seed   # those whose file or description has one of the words
 
-Each defect is one changed line; ``ghgs stress quick=true`` runs the stage that computes it on the copy,
-before and after. Exit code 1 where a defect is not caught.
+``planted_defects.json`` lists the defects: what is wrong, the file of the package, the text before and after, and
+the tests (files or ids) or the stage of ``ghgs stress`` that must fail with it and pass without. Prints what
+catches each and the score; exit code 1 where a defect is not caught.
 """
 
 import json
@@ -12,82 +14,116 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+LIST = Path(__file__).with_suffix(".json")
+#: Caches of kernels are copied: they are stamped with their sources, and compiling them takes a minute.
+LEFT = shutil.ignore_patterns(".git", ".*_cache", "*.pyc", "runs", "outputs", "multirun", "build", "dist")
 
 
 @dataclass(frozen=True)
 class Defect:
-    """What is wrong, the line (file, before, after) and the stage of the stress test that computes it."""
+    """What is wrong, the changed text of ``file``, and the tests or the stage that must notice."""
 
     says: str
     file: str
     before: str
     after: str
-    stage: str
+    tests: tuple[str, ...] = ()
+    stage: str | None = None
+
+    @property
+    def room(self) -> str:
+        """The part of the package."""
+        return self.file.split("/")[0].removesuffix(".py")
+
+    def has(self, words: list[str]) -> bool:
+        """Whether the file or the description has one of the words; none: True."""
+        return not words or any(word in self.file or word in self.says for word in words)
+
+    def planted(self, text: str) -> str:
+        """The file's text with the defect.
+
+        Raises:
+            ValueError: the text before does not stand there exactly once, or changes nothing.
+        """
+        if text.count(self.before) != 1 or self.before == self.after:
+            raise ValueError(f"{self.file} ({self.says}): expected once: {self.before!r}")
+        return text.replace(self.before, self.after)
 
 
-DEFECTS = (
-    Defect("an epsilon removed", "heads/dpt.py", "NORM_EPS = 1e-5", "NORM_EPS = 0.0", "dense head"),
-    Defect(
-        "a distance in float16", "recalibration/neighbors.py", "torch.cdist(points[rows], points,",
-        "torch.cdist(points[rows].half().float(), points.half().float(),", "neighbours",
-    ),
-    Defect(
-        "a dropped clamp", "heads/activations.py", "c.clamp(max=EXP_LIMIT).exp()", "c.exp()",
-        "depth activation",
-    ),
-    Defect(
-        "a mask on the result, not the argument", "geometry/vectors.py",
-        "keepdim=True).masked_fill(is_zero, 1.0)", "keepdim=True)", "unit vectors",
-    ),
-    Defect(
-        "a Jacobian without its clamp", "rendering/cpu/projection.py", "geometry.clamped(view, x, y)", "x, y",
-        "compositing",
-    ),
-)  # fmt: skip
+def defects() -> list[Defect]:
+    """Those of the list."""
+    return [Defect(**{**one, "tests": tuple(one.get("tests", ()))}) for one in json.loads(LIST.read_text())]
 
 
-def failures(copy: Path, stages: list[str]) -> list[dict]:
-    """The cells with failures of a quick run on the package in ``copy``."""
+def failing_tests(copy: Path, tests: list[str]) -> list[str]:
+    """Ids of the tests that fail in ``copy``; a test file that cannot be read is one, too."""
+    done = _python(copy, "pytest", "-x", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests)
+    if done.returncode == 0:
+        return []
+    failed = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    if not failed:
+        raise SystemExit(done.stdout + done.stderr)
+    return failed
+
+
+def failing_families(copy: Path, stage: str) -> list[str]:
+    """Families of inputs with which a stage fails in a quick run of the stress test on ``copy``."""
     out = copy / "out"
     shutil.rmtree(out, ignore_errors=True)
-    command = [sys.executable, "-m", "ghgs_lit", "stress", "quick=true", "workers=0"]
-    done = subprocess.run(
-        [*command, f"stages=[{','.join(stages)}]", f"hydra.run.dir={out}"], cwd=copy, capture_output=True,
-        text=True, env={**os.environ, "PYTHONPATH": str(copy), "NUMBA_CACHE_DIR": str(copy / "numba")},
-    )  # fmt: skip
+    settings = ("quick=true", "workers=0", f"stages=[{stage}]", f"hydra.run.dir={out}")
+    done = _python(copy, "ghgs_lit", "stress", *settings)
     if not (out / "stress.json").exists():
         raise SystemExit(done.stdout + done.stderr)
-    return [cell for cell in json.loads((out / "stress.json").read_text())["cells"] if cell["failures"]]
+    cells = json.loads((out / "stress.json").read_text())["cells"]
+    return list(dict.fromkeys(f"{stage}: {cell['family']}" for cell in cells if cell["failures"]))
 
 
-def main() -> None:
+def _python(copy: Path, module: str, *arguments: str) -> subprocess.CompletedProcess:
+    """A module run on the copy. Python's own caches are not written: they know a change by its second only."""
+    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", module, *arguments]
+    return subprocess.run(command, cwd=copy, capture_output=True, text=True, env=environment)
+
+
+def caught_by(copy: Path, defect: Defect) -> list[str]:
+    """What fails with the defect."""
+    path = copy / "ghgs_lit" / defect.file
+    text = path.read_text()
+    path.write_text(defect.planted(text))
+    try:
+        if defect.stage:
+            return failing_families(copy, defect.stage)
+        return failing_tests(copy, list(defect.tests))
+    finally:
+        path.write_text(text)
+
+
+def main(words: list[str]) -> None:
+    chosen = [defect for defect in defects() if defect.has(words)]
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder)
-        for name in ("ghgs_lit", "hydra_plugins", "conf"):
-            shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
-        before = failures(copy, [defect.stage for defect in DEFECTS])
+        copy = Path(folder) / "copy"
+        shutil.copytree(ROOT, copy, ignore=LEFT)
+        tests = sorted({test for defect in chosen for test in defect.tests})
+        before = failing_tests(copy, tests) if tests else []
+        for stage in sorted({defect.stage for defect in chosen if defect.stage}):
+            before += failing_families(copy, stage)
         if before:
-            raise SystemExit(f"without a defect: {len(before)} cells fail, the first is {before[0]}")
-        print("| defect | changed line | caught by |\n|---|---|---|")
-        missed = 0
-        for defect in DEFECTS:
-            path = copy / "ghgs_lit" / defect.file
-            text = path.read_text()
-            if text.count(defect.before) != 1:
-                raise SystemExit(f"{path}: expected {defect.before!r} once")
-            path.write_text(text.replace(defect.before, defect.after))
-            found = failures(copy, [defect.stage])
-            path.write_text(text)
-            missed += not found
-            families = ", ".join(dict.fromkeys(cell["family"] for cell in found))
-            caught = f"{defect.stage}: {families}" if found else "NOTHING"
-            print(f"| {defect.says} | `{defect.file}`: `{defect.after}` | {caught} |", flush=True)
-    raise SystemExit(min(missed, 1))
+            raise SystemExit(f"without a defect: {before} fail")
+        print("| defect | file | caught by |\n|---|---|---|")
+        caught, planted = Counter(), Counter(defect.room for defect in chosen)
+        for defect in chosen:
+            failed = caught_by(copy, defect)
+            caught[defect.room] += bool(failed)
+            print(f"| {defect.says} | `{defect.file}` | {', '.join(failed) or 'NOTHING'} |", flush=True)
+    print(", ".join(f"{room} {caught[room]}/{count}" for room, count in planted.items()))
+    print(f"caught: {caught.total()} of {planted.total()}")
+    raise SystemExit(int(caught.total() < planted.total()))
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
