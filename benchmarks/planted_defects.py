@@ -84,7 +84,7 @@ def failing_families(copy: Path, stage: str) -> list[str]:
 
 
 def _python(copy: Path, module: str, *arguments: str) -> subprocess.CompletedProcess:
-    """A module run on the copy. Python's own caches are not written: they know a change by its second only."""
+    """A module run on the copy. Python's own caches are not written: they know changes by the second."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", module, *arguments]
     return subprocess.run(command, cwd=copy, capture_output=True, text=True, env=environment)
