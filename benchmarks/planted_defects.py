@@ -1,11 +1,11 @@
 """Defects planted one at a time in a copy of the package, and the tests that catch them.
 
-    python benchmarks/planted_defects.py            # all: some seconds each
+    python benchmarks/planted_defects.py                # all, some 15 seconds each
     python benchmarks/planted_defects.py rounds/ seed   # those whose file or description has one of the words
 
-``planted_defects.json`` lists the defects: what is wrong, the file of the package, the text before and after, and
-the tests (files or ids) or the stage of ``ghgs stress`` that must fail with it and pass without. Prints what
-catches each and the score; exit code 1 where a defect is not caught.
+``planted_defects.json`` lists the defects: what is wrong, the file of the package, the text before and
+after, and the tests (files or ids) or the stage of ``ghgs stress`` that must fail with it and pass without.
+Prints what catches each and the score; exit code 1 where a defect is not caught.
 """
 
 import json
@@ -20,8 +20,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".json")
-#: Caches of kernels are copied: they are stamped with their sources, and compiling them takes a minute.
-LEFT = shutil.ignore_patterns(".git", ".*_cache", "*.pyc", "runs", "outputs", "multirun", "build", "dist")
+#: Copied. Caches of kernels are, too: they are stamped with their sources, and compiling takes a minute.
+COPIED = ("ghgs_lit", "hydra_plugins", "conf", "tests", "benchmarks", "examples", "pyproject.toml")
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,12 @@ def main(words: list[str]) -> None:
     chosen = [defect for defect in defects() if defect.has(words)]
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
-        shutil.copytree(ROOT, copy, ignore=LEFT)
+        copy.mkdir()
+        for path in (ROOT / name for name in COPIED):
+            if path.is_dir():
+                shutil.copytree(path, copy / path.name, ignore=shutil.ignore_patterns("*.pyc"))
+            else:
+                shutil.copy(path, copy)
         tests = sorted({test for defect in chosen for test in defect.tests})
         before = failing_tests(copy, tests) if tests else []
         for stage in sorted({defect.stage for defect in chosen if defect.stage}):
