@@ -1,6 +1,6 @@
 """Defects planted one at a time in a copy of the package, and the tests that catch them.
 
-    python benchmarks/planted_defects.py                # all, some 15 seconds each
+    python benchmarks/planted_defects.py                # all, some seconds each
     python benchmarks/planted_defects.py rounds/ seed   # those whose file or description has one of the words
 
 ``planted_defects.json`` lists the defects: what is wrong, the file of the package, the text before and
@@ -9,6 +9,7 @@ Prints what catches each and the score; exit code 1 where a defect is not caught
 """
 
 import json
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -16,12 +17,17 @@ import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".json")
 #: Copied. Caches of kernels are, too: they are stamped with their sources, and compiling takes a minute.
 COPIED = ("ghgs_lit", "hydra_plugins", "conf", "tests", "benchmarks", "examples", "pyproject.toml")
+#: What tests take seconds to import, and is not ours.
+LOADED = ("pytest", "torch", "lightning.pytorch", "kornia", "hydra", "pandas", "scipy.spatial", "trimesh")
 
 
 @dataclass(frozen=True)
@@ -60,14 +66,44 @@ def defects() -> list[Defect]:
     return [Defect(**{**one, "tests": tuple(one.get("tests", ()))}) for one in json.loads(LIST.read_text())]
 
 
+class _Failures:
+    """A plugin of pytest that notes the ids of tests that fail, and of files that cannot be read."""
+
+    def __init__(self):
+        self.ids: list[str] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.ids += [report.nodeid] * report.failed
+
+    pytest_collectreport = pytest_runtest_logreport
+
+
+def _run_tests(copy: Path, tests: list[str], results: Connection) -> None:
+    """Send pytest's exit code and the failures of a run on the copy."""
+    os.chdir(copy)
+    failures = _Failures()
+    code = pytest.main(
+        ["-x", "--tb=no", "-p", "no:cacheprovider", "--capture=fd", *tests], plugins=[failures]
+    )
+    results.send((int(code), failures.ids))
+
+
 def failing_tests(copy: Path, tests: list[str]) -> list[str]:
-    """Ids of the tests that fail in ``copy``; a test file that cannot be read is one, too."""
-    done = _python(copy, "pytest", "-x", "--tb=no", "-rfE", "-p", "no:cacheprovider", *tests)
-    if done.returncode == 0:
-        return []
-    failed = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    if not failed:
-        raise SystemExit(done.stdout + done.stderr)
+    """Ids of the tests that fail in ``copy``, up to the first; a file that cannot be read is one, too.
+
+    A process of its own runs them, forked from one that has loaded the packages that ours needs.
+    """
+    results, sent = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("forkserver").Process(target=_run_tests, args=(copy, tests, sent))
+    process.start()
+    sent.close()
+    try:
+        code, failed = results.recv()
+    except EOFError:
+        code, failed = 1, ["a process that ended"]
+    process.join()
+    if code not in (0, 1, 2) or bool(code) != bool(failed):
+        raise SystemExit(f"pytest {' '.join(tests)}: exit code {code}")
     return failed
 
 
@@ -76,18 +112,12 @@ def failing_families(copy: Path, stage: str) -> list[str]:
     out = copy / "out"
     shutil.rmtree(out, ignore_errors=True)
     settings = ("quick=true", "workers=0", f"stages=[{stage}]", f"hydra.run.dir={out}")
-    done = _python(copy, "ghgs_lit", "stress", *settings)
+    command = [sys.executable, "-m", "ghgs_lit", "stress", *settings]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     if not (out / "stress.json").exists():
         raise SystemExit(done.stdout + done.stderr)
     cells = json.loads((out / "stress.json").read_text())["cells"]
     return list(dict.fromkeys(f"{stage}: {cell['family']}" for cell in cells if cell["failures"]))
-
-
-def _python(copy: Path, module: str, *arguments: str) -> subprocess.CompletedProcess:
-    """A module run on the copy. Python's own caches are not written: they know changes by the second."""
-    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", module, *arguments]
-    return subprocess.run(command, cwd=copy, capture_output=True, text=True, env=environment)
 
 
 def caught_by(copy: Path, defect: Defect) -> list[str]:
@@ -108,6 +138,9 @@ def main(words: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
         copy.mkdir()
+        # Python's own caches know a changed file by the second only.
+        os.environ |= {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+        multiprocessing.set_forkserver_preload(list(LOADED))
         for path in (ROOT / name for name in COPIED):
             if path.is_dir():
                 shutil.copytree(path, copy / path.name, ignore=shutil.ignore_patterns("*.pyc"))
