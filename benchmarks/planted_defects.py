@@ -81,10 +81,10 @@ class _Failures:
 def _run_tests(copy: Path, tests: list[str], results: Connection) -> None:
     """Send pytest's exit code and the failures of a run on the copy."""
     os.chdir(copy)
-    failures = _Failures()
-    code = pytest.main(
-        ["-x", "--tb=no", "-p", "no:cacheprovider", "--capture=fd", *tests], plugins=[failures]
-    )
+    silence, failures = os.open(os.devnull, os.O_WRONLY), _Failures()
+    for stream in (1, 2):
+        os.dup2(silence, stream)
+    code = pytest.main(["-x", "--tb=no", "-p", "no:cacheprovider", *tests], plugins=[failures])
     results.send((int(code), failures.ids))
 
 
