@@ -57,3 +57,9 @@ def test_an_empty_mask_has_no_vote_and_takes_none_away():
     batch = make_batch(1, 4, 56, 56)
     batch.masks[0, 1] = False
     assert voting(batch) == [[True, False, True, True]]
+
+
+@pytest.mark.parametrize("wrong", ["half", "shifted"])
+def test_of_two_views_none_loses_its_vote(wrong):
+    """Nobody can tell which one is wrong."""
+    assert voting(spoil(make_batch(1, 2, 112, 112), wrong)) == [[True, True]]

@@ -9,10 +9,10 @@ import torch.nn.functional as F
 from ghgs_lit.bounds import NoBounds, SubjectBox, VisualHull
 from ghgs_lit.bounds.box import subject_box
 from ghgs_lit.bounds.rays import depths_in_box
-from ghgs_lit.bounds.silhouettes import dilate
+from ghgs_lit.bounds.silhouettes import dilate, silhouettes
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, DepthBounds
 from tests.helpers.scenes import CENTER, RADII, ellipsoid, make_batch, ring
 
 STAGES = [SubjectBox, VisualHull]
@@ -204,3 +204,22 @@ def test_impossible_options_are_refused(option, key):
     """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=rf"bounds\.{key}"):
         VisualHull(**option)
+
+
+@pytest.mark.parametrize("size", [(40, 160), (160, 40)])
+def test_dilation_is_a_share_of_the_longer_side(size):
+    """In whole cells, at the resolution of the search, of upright and lying photographs."""
+    masks = torch.zeros(1, 2, *size, dtype=torch.bool)
+    for resolution, stride, dilation in ((160, 1, 8), (80, 2, 4)):
+        found = silhouettes(masks, ring(1, 2, *size), resolution, 0.05)
+        assert (found.stride, found.dilation) == (stride, dilation)
+
+
+def test_the_box_has_a_margin_on_every_side(monkeypatch):
+    batch, asked = make_batch(1, 4), []
+    anything = DepthBounds(batch.depths, batch.depths)
+    monkeypatch.setattr(SubjectBox, "_within", lambda self, *given: asked.append(given) or anything)
+    SubjectBox()(batch)
+    _, coarse, _, lower, upper = asked[0]
+    expected = subject_box(coarse.masks, coarse.cameras, coarse.dilation)
+    torch.testing.assert_close(torch.stack((lower + 0.03, upper - 0.03)), torch.stack(expected))

@@ -181,3 +181,19 @@ def test_flags_may_stand_anywhere():
         "-m", "--config-dir", "x", "seed=1", "seed=2",
     ]  # fmt: skip
     assert flags_first(["--cfg=job", "seed=1"]) == ["--cfg", "job", "seed=1"]
+
+
+class Seeded(BaseException):
+    """Ends a verb where it sets the random numbers of the process."""
+
+
+@pytest.mark.parametrize("verb", ["train", "pretext"])
+def test_random_numbers_of_a_process_are_those_of_the_seed(monkeypatch, capsys, tmp_path, verb):
+    """The first weights of a model are random."""
+
+    def ended(seed, **options):
+        raise Seeded(seed)
+
+    monkeypatch.setattr("lightning.pytorch.seed_everything", ended)
+    with pytest.raises(Seeded, match=r"^5$"):
+        call(monkeypatch, capsys, verb, "seed=5", f"hydra.run.dir={tmp_path}")

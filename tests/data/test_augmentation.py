@@ -45,11 +45,37 @@ def test_nothing_varies_by_default(root):
 def test_batches_depend_on_seed_and_step_alone(root):
     """Neither on loading processes nor on what was read before; steps and seeds differ."""
     batches = list(module(root, augmentation=EVERYTHING, workers=2).train_dataloader())
-    for step in (5, 0, 3):
-        assert equal(module(root, augmentation=EVERYTHING).training_batch(step), batches[step])
+    assert len(batches) == 6
+    data = module(root, augmentation=EVERYTHING)
+    for step in (5, 0, 3, 1, 4, 2, 5):
+        assert equal(data.training_batch(step), batches[step])
     assert len({(batch.images.shape, round(batch.images.sum().item(), 3)) for batch in batches}) == 6
-    other = module(root, augmentation=EVERYTHING, seed=1).training_batch(0)
-    assert not torch.equal(other.cameras.intrinsics[:, :3], batches[0].cameras.intrinsics[:, :3])
+    others = [module(root, augmentation=EVERYTHING, seed=1).training_batch(step) for step in range(6)]
+    assert not any(map(equal, batches, others))
+
+
+def test_imperfections_and_sizes_differ_between_seeds_steps_and_samples(root):
+    """The same photographs in another step, run or place of the batch are imperfect in another way."""
+    clean, varied = module(root).training_batch(0), Augmentation(**EVERYTHING)
+
+    def drawn(seed, step, indices=(6, 7)):
+        return varied.imperfect(clean, seed, step, indices)
+
+    first = drawn(0, 3)
+    assert equal(first, drawn(0, 3))
+    for other in (drawn(1, 3), drawn(0, 6), drawn(0, 3, (8, 9))):
+        for name in ("intrinsics", "extrinsics"):
+            one, two = (getattr(batch.cameras, name) for batch in (first, other))
+            assert (one != two).flatten(1).any(1).all()
+        assert (first.images != other.images).flatten(1).any(1).all()
+    sizes = [[varied.draw_sizes((28, 28), (56, 56), seed, step) for step in range(12)] for seed in (0, 0, 1)]
+    assert sizes[0] == sizes[1] != sizes[2]
+    sometimes = Augmentation(**IMPERFECT, chance=0.5)
+    changed = [
+        [not equal(sometimes.imperfect(clean, seed, step, (0, 1)), clean) for step in range(20)]
+        for seed in (0, 0, 1)
+    ]
+    assert changed[0] == changed[1] != changed[2]
 
 
 def test_sizes_are_drawn_for_a_step_and_cameras_follow(root):
@@ -199,7 +225,12 @@ def test_imperfections_do_not_depend_on_batch_mates(root):
 def test_validation_does_not_vary(root):
     """Numbers of different runs are measured on the same photographs."""
     clean, varied = (module(root, views=V4, augmentation=a) for a in ({}, EVERYTHING))
-    assert all(map(equal, clean.val_dataloader(), varied.val_dataloader()))
+    pairs = list(zip(clean.val_dataloader(), varied.val_dataloader(), strict=True))
+    assert [batch.subjects for batch, _ in pairs] == [("s3",)]
+    assert all(equal(*pair) for pair in pairs)
+    everyone = [list(data.evaluation_loader(split="train")) for data in (clean, varied)]
+    assert sum(len(batch.subjects) for batch in everyone[0]) == 3
+    assert all(map(equal, *everyone))
 
 
 def test_shipped_variation_is_built():

@@ -1,9 +1,11 @@
 """Options of data sets: one flat mapping, checked, with the keys of the data set and of its batches."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from ghgs_lit.data.datamodule import trained_batches
 from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.datasets import Scans, Synthetic
@@ -38,3 +40,16 @@ def test_evaluation_takes_protocols_and_no_bare_names(tmp_path):
     """A name alone would ignore the file of the protocol in conf/targets."""
     with pytest.raises(InputError, match="targets: expected a mapping of its keys; found 'midway'"):
         rendered(tmp_path).evaluation_loader(targets="midway")
+
+
+@pytest.mark.parametrize(
+    ("step", "accumulated", "length", "limit", "batches"),
+    [(3, 1, 4, 4, 3), (3, 2, 8, 8, 6), (5, 2, 8, 8, 10), (4, 2, 7, 7, 7), (5, 2, 7, 7, 9), (5, 2, 8, 4, 10)],
+)
+def test_a_resumed_run_knows_how_many_batches_it_has_had(step, accumulated, length, limit, batches):
+    """Steps times the batches of a step; the last step of an epoch takes those that are left."""
+    trainer = SimpleNamespace(
+        global_step=step, accumulate_grad_batches=accumulated, num_training_batches=limit
+    )
+    assert trained_batches(trainer, length) == batches
+    assert trained_batches(None, length) == 0

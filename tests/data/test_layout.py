@@ -166,8 +166,13 @@ def test_data_without_mattes_is_read_as_before(root):
     assert plain.matte is None
     assert plain.alpha is None
     np.testing.assert_array_equal(plain.mask, soft.mask)
-    np.testing.assert_array_equal(plain.image, soft.image)
-    assert photographs(root, (28, 28)).view("box", 0, 0).matte is None
+    for name in ("image", "depth", "intrinsics", "extrinsics"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(soft, name), err_msg=name)
+    small = photographs(root, (28, 28)).view("box", 0, 0)
+    assert small.matte is None
+    share = plain.mask.reshape(28, 2, 28, 2).mean((1, 3))
+    np.testing.assert_array_equal(small.mask, share >= 0.5)
+    np.testing.assert_array_equal(small.depth > 0, small.mask)
 
 
 def test_masks_of_one_channel_are_read(root):
@@ -299,3 +304,24 @@ def test_missing_roots_and_phases(tmp_path):
         Layout(tmp_path, "train")
     with pytest.raises(InputError, match=r"found 0 \(x is missing"):
         Layout(tmp_path, "train", names=["x"])
+
+
+def test_a_half_rendered_subject_is_refused(root):
+    """Where this package renders, a subject without its mark is not whole."""
+    (root / "rendering" / "done" / "train").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"expected 1 whole subjects; found 0 \(box is missing or half-rend"):
+        Layout(root, "train")
+    lenient = Layout(root, "train", strict=False)
+    assert not lenient.subjects
+    assert "half-rendered" in str(lenient.problems[0])
+    (root / "rendering" / "done" / "train" / "box").touch()
+    assert list(Layout(root, "train").subjects) == ["box"]
+
+
+def test_a_mask_is_where_it_is_above_half_of_its_maximum(root):
+    """Compression leaves small values beside the subject, and others than the largest on it."""
+    path = root / "train" / "mask" / "box_000" / "0.png"
+    mask = np.asarray(Image.open(path))[..., 0] > 0
+    noise = np.random.default_rng(0).integers(0, 30, mask.shape)
+    Image.fromarray(np.where(mask, 250 - noise, noise).astype(np.uint8)).save(path)
+    np.testing.assert_array_equal(photographs(root).view("box", 0, 0).mask, mask)

@@ -382,3 +382,37 @@ def test_a_number_of_views_that_a_ring_does_not_have_is_refused(root, count):
     """0 views were measured as 4, and 17 of 16 took one position twice."""
     with pytest.raises(InputError, match=f"evaluation with {count} views: expected different positions"):
         module(root).evaluation_loader(views=count)
+
+
+def test_seeds_choose_photographs_as_well_as_the_order_of_subjects():
+    """Of a single subject, whose order is no choice; numbers of views and targets of evaluation, too."""
+    one = {"subjects": {"a": FULL}, "batch_size": 1}
+
+    def drawn(seed):
+        return [sampler(seed=seed, **one).batch(step)[0] for step in range(20)]
+
+    assert drawn(0) == drawn(0)
+    pairs = list(zip(drawn(0), drawn(1), strict=True))
+    assert sum(len(a.inputs) != len(b.inputs) for a, b in pairs) > 5
+    fixed = ViewProtocol(name="v4", training_counts=(4,))
+    inputs = [{sampler(fixed, seed=s, **one).batch(t)[0].inputs for t in range(20)} for s in range(2)]
+    assert not inputs[0] & inputs[1]
+    names = [[d.subject for t in range(20) for d in sampler(seed=s).batch(t)] for s in range(2)]
+    assert names[0] != names[1]
+    targets = TargetProtocol(name="random", per_subject=3)
+    measured = [evaluation_samples({"a": FULL, "b": FULL}, 4, [targets], 16, seed) for seed in (0, 0, 1)]
+    assert measured[0] == measured[1]
+    assert all(a.targets != b.targets for a, b in zip(measured[0], measured[2], strict=True))
+
+
+def test_the_seed_of_the_data_reaches_training_and_random_targets(root):
+    """Two seeds differ and one repeats, as batches."""
+    random = {"name": "random", "per_subject": 3}
+    for draw in (
+        lambda seed: [
+            (b.subjects, b.views, b.targets.names)
+            for b in map(module(root, seed=seed).training_batch, range(4))
+        ],
+        lambda seed: [b.targets.names for b in module(root, seed=seed).evaluation_loader(4, random)],
+    ):
+        assert draw(0) == draw(0) != draw(1)

@@ -335,3 +335,16 @@ def test_targets_between_cameras_that_stand_still_are_refused(root):
         with pytest.raises(InputError, match=r"targets: expected cameras for data=zju_mocap.*; found"):
             draw()
     assert len(data.evaluation_loader(targets=CAMERAS)) > 0
+
+
+def test_photographs_are_undistorted_about_their_own_pixel_centers(root):
+    """Calibrations count centres from integers; half a pixel would bend the photograph elsewhere."""
+    annotations = read_annotations(root / "CoreView_386" / "annots.npy")
+    bent = photographs(root, undistorted=False).view("CoreView_386_000000", 7)
+    path = root / "CoreView_386" / annotations.frames[0][7]
+    image = np.asarray(Image.open(path).convert("RGB"))
+    lens = half_centers(annotations.intrinsics[7]), annotations.distortions[7]
+    straight, matte = undistort(image, bent.mask * np.uint8(255), undistorting_grid(*lens, *image.shape[:2]))
+    view = photographs(root).view("CoreView_386_000000", 7)
+    np.testing.assert_array_equal(view.mask, matte > 127)
+    np.testing.assert_array_equal(view.image, np.where(view.mask[..., None], straight, 0))

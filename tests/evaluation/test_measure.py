@@ -370,3 +370,54 @@ def test_two_processes_train_together_and_write_once(boxes, tmp_path):
     assert (training["steps"], training["processes"]) == (2, 2)
     assert min(training["seconds"], training["peak_bytes"]) > 0
     assert GHGS.from_checkpoint(directory / "checkpoints" / "last.ckpt") is not None
+
+
+def test_what_refines_takes_part_in_what_is_measured():
+    """Gaussians with the cameras that were corrected: neither is left out without a word."""
+    batch = example_batch()
+    given = flat_renderer(Standin()(batch).gaussians, batch.targets.cameras).image
+
+    def halved(gaussians, batch):
+        return dataclasses.replace(gaussians, colors=gaussians.colors / 2)
+
+    def darker(batch):
+        return dataclasses.replace(batch, images=batch.images / 4)
+
+    for refinement, cameras, share in ((halved, None, 2), (None, darker, 4), (halved, darker, 8)):
+        method = ModelMethod(Standin(), flat_renderer, refinement, cameras)
+        with torch.no_grad():
+            torch.testing.assert_close(method(batch).image, given / share)
+
+
+def test_depth_errors_are_those_of_the_subject():
+    """Depths beside it are anything."""
+    batch = example_batch(subjects=2)
+    depth = torch.where(batch.masks, 2.1, 9.0)
+    batch = dataclasses.replace(batch, depths=torch.full_like(depth, 2.1))
+    valid = torch.ones_like(batch.masks)
+    estimate = Estimate(batch.targets.images, depth + 0.02, valid)
+    rows = measure(lambda b: estimate, "model", [batch], OFF)
+    assert [row["depth_error_mm"] for row in rows] == pytest.approx([20, 20], abs=1e-2)
+
+
+def test_seconds_are_those_of_a_subject(monkeypatch):
+    """A batch of two that takes six seconds takes three for each."""
+    ticks = iter([10.0, 16.0])
+    monkeypatch.setattr("ghgs_lit.evaluation.measure.time.perf_counter", lambda: next(ticks))
+    rows = measure(lambda b: Estimate(b.targets.images), "model", [example_batch(subjects=2)], OFF)
+    assert [row["seconds"] for row in rows] == [3, 3]
+
+
+def test_two_seeds_of_an_evaluation_differ_and_one_repeats(boxes, tmp_path):
+    """Random targets are those of the seed that is said."""
+    run = [
+        "evaluate", *data_of(boxes), "baselines=[black]", "evaluation.views=[3]",
+        "evaluation.targets=[random]", "evaluation.pictures=0",
+    ]  # fmt: skip
+    targets = []
+    for number, seed in enumerate((1, 1, 2)):
+        where = tmp_path / str(number)
+        assert ghgs(*run, f"seed={seed}", f"hydra.run.dir={where}") == 0
+        targets.append([row["target"] for row in json.loads((where / "metrics.json").read_text())["rows"]])
+    assert len(targets[0]) == 2  # one of each subject
+    assert targets[0] == targets[1] != targets[2]

@@ -142,3 +142,50 @@ def test_an_element_has_the_same_frame_alone():
     one = Batch(batch.images[1:], batch.masks[1:], batch.cameras[1:])
     for name in ("origin", "axes", "metre"):
         assert torch.equal(getattr(Frame.of(one), name)[0], getattr(whole, name)[1])
+
+
+def test_each_element_has_its_own_unit():
+    """One in metres and one in millimetres, in one batch: depths, bounds and sizes of each are its own."""
+    batch = make_batch(2, 3)
+    extrinsics = batch.cameras.extrinsics.double().clone()
+    extrinsics[1, :, :3, 3] *= 1000
+    mixed = dataclasses.replace(batch, cameras=dataclasses.replace(batch.cameras, extrinsics=extrinsics))
+    model = make_model("model=hull").eval()
+    with torch.no_grad():
+        found, expected = model(mixed), model(batch)
+    unit = torch.tensor([1.0, 1000.0])[:, None, None, None]
+    torch.testing.assert_close(found.depth / unit, expected.depth, rtol=1e-4, atol=0)
+    for bound in ("near", "far"):
+        one, other = (getattr(p.depth_maps.bounds, bound) for p in (found, expected))
+        torch.testing.assert_close(one / unit, other, rtol=1e-4, atol=0)
+    element = found.gaussians.image // 3
+    for name in ("scales", "means"):
+        one, other = (getattr(p.gaussians, name).float() for p in (found, expected))
+        torch.testing.assert_close(one / unit[:, :, 0, 0][element], other, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(
+        found.gaussians.metre, expected.gaussians.metre * unit[:, 0, 0, 0], rtol=1e-4, atol=0
+    )
+
+
+def test_units_of_nested_frames_are_multiplied():
+    """Gaussians that know how long a metre is in their frame know it in the world around that frame."""
+    gaussians = original("hull")[2].gaussians
+    inner = dataclasses.replace(gaussians, metre=torch.tensor([4.0]))
+    frame = Frame(torch.zeros(1, 3).double(), torch.eye(3).double()[None], torch.tensor([2.5]).double())
+    assert frame._gaussians(inner, 3, torch.float32).metre.tolist() == [10.0]
+    assert frame._gaussians(dataclasses.replace(inner, metre=None), 3, torch.float32).metre.tolist() == [2.5]
+
+
+def test_points_far_from_the_worlds_origin_keep_their_digits():
+    """100 km away float32 knows 8 mm: what leaves the frame has the precision of the cameras."""
+    _, batch, expected, _ = original("hull")
+    away = torch.tensor([1e5, -3e4, 2e4]).double()
+    with torch.no_grad():
+        found = original("hull")[0](
+            dataclasses.replace(batch, cameras=moved(batch.cameras, shift=tuple(away.tolist())))
+        )
+    for one, other in (
+        (found.gaussians.means, expected.gaussians.means), (found.points.tokens, expected.points.tokens),
+    ):  # fmt: skip
+        assert one.dtype == torch.float64
+        assert (one - away - other).abs().max() < 2e-4

@@ -5,7 +5,7 @@ import torch
 
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.types import Batch, Cameras
+from ghgs_lit.types import Batch, Cameras, Gaussians
 
 
 def cameras(b, v, height, width):
@@ -46,3 +46,17 @@ def test_padding_is_centred_and_undone(size, top, left, padded):
     inside = unproject_maps(padding.cut(depth), batch.cameras)
     assert torch.allclose(padding.cut(unproject_maps(depth, part.cameras)), inside, atol=1e-4)
     assert pad_to_patches(part.masks, 14) is None
+
+
+@pytest.mark.parametrize("size", [(41, 27), (50, 60)])
+def test_gaussians_are_named_by_pixels_of_the_photograph(size):
+    """The index of each pixel in the padded image becomes that in the photograph."""
+    padding = pad_to_patches(torch.zeros(1, 1, *size, dtype=torch.bool), 14)
+    rows, columns = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+    inside = ((rows - padding.top) * padding.width + columns - padding.left).flatten()
+    n = len(inside)
+    gaussians = Gaussians(
+        torch.zeros(n, 3), torch.zeros(n, 4), torch.zeros(n, 3), torch.zeros(n), torch.zeros(n, 3), (n,),
+        torch.zeros(n, dtype=torch.long), inside,
+    )  # fmt: skip
+    assert torch.equal(padding._cut_gaussians(gaussians).pixel, torch.arange(n))

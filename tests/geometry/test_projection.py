@@ -4,6 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.geometry.projection import inverse_intrinsics, project, unproject
+from tests.helpers.scenes import CENTER, ring
 
 
 def test_the_inverse_of_intrinsics_is_the_inverse_of_the_matrix():
@@ -37,3 +38,16 @@ def test_projection_is_the_product_of_matrices_and_unprojection_its_inverse():
     torch.testing.assert_close(depth, expected[:, 2])
     torch.testing.assert_close(pixels[front], (expected[:, :2] / expected[:, 2:])[front])
     torch.testing.assert_close(unproject(pixels, depth, intrinsics, extrinsics)[front], points[front])
+
+
+def test_resized_cameras_see_points_at_the_same_share_of_the_photograph():
+    """Rows by the height and columns by the width, of photographs that are not square."""
+    cameras = ring(1, 2, 40, 64)
+    points = CENTER + 0.2 * torch.randn(7, 3, generator=torch.Generator().manual_seed(0))
+
+    def seen(cameras):
+        lens, pose = (matrix[0, :, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
+        return project(points.expand(2, 7, 3), lens, pose)[0]
+
+    expected = seen(cameras) * torch.tensor([32 / 64, 120 / 40])
+    torch.testing.assert_close(seen(cameras.resized(120, 32)), expected)

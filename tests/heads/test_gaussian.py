@@ -228,3 +228,12 @@ def test_the_last_projection_is_wide_under_autocast():
         expected = hidden(descriptors).float()
     last = head.offset_header[-1]
     torch.testing.assert_close(offset, torch.nn.functional.linear(expected, last.weight, last.bias))
+
+
+def test_footprints_are_of_the_mean_focal_length():
+    """Pixels that are not square: the geometric mean of their sides."""
+    batch = make_batch()
+    lenses = batch.cameras.intrinsics.clone()
+    lenses[..., 0, 0] *= 4
+    stretched = dataclasses.replace(batch, cameras=dataclasses.replace(batch.cameras, intrinsics=lenses))
+    torch.testing.assert_close(run(make_head(), stretched).scales, run(make_head(), batch).scales / 2)

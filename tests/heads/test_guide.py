@@ -100,3 +100,13 @@ def test_the_encoder_sees_bounds_where_it_is_told_to():
     assert not torch.allclose(tokens.latent[-1], deeper.latent[-1])
     with pytest.raises(InputError, match=r"encoder\.bounds_input"):
         encoder(batch.images, batch.masks)
+
+
+def test_the_guide_shows_mattes_where_there_are_some():
+    """Masks would draw the edges that mattes are there to soften."""
+    batch = make_batch()
+    share = torch.rand(batch.masks.shape, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(photo_guide(batch)[1][:, 0], batch.masks.flatten(0, 1).float())
+    soft = photo_guide(dataclasses.replace(batch, alpha=share))
+    assert torch.equal(soft[1][:, 0], share.flatten(0, 1))
+    assert torch.equal(soft[0], batch.images.flatten(0, 1))

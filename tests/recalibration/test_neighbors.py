@@ -1,5 +1,7 @@
 """Neighbours against their definition and SciPy: ties, few points, points of all sizes."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -121,3 +123,20 @@ def test_neighbors_of_elements_are_joined_with_invalid_ones_where_there_are_fewe
     assert torch.equal(found.index[:6], elements[0].index)
     assert torch.equal(found.index[6:, :3], elements[1].index + 6)
     assert found.valid.sum(1).tolist() == [4] * 6 + [3] * 3
+
+
+def test_at_each_place_of_the_image_plane_the_own_view_comes_first():
+    """One more neighbour than there are views: it is of the query's own view, whichever that is."""
+    tokens, points = scene(((16, 16, 16, 16),))
+    module = make_stage(neighborhood="image_plane", k=5)
+    near = nearest_neighbors(module.positions(tokens, points), tokens.image, 5, module.places(tokens))
+    turn = (tokens.image[near.index] - tokens.image[:, None]) % 4
+    assert torch.equal(turn, torch.tensor([0, 1, 2, 3, 0]).expand(64, 5))
+
+
+def test_neighbors_are_searched_without_a_gradient():
+    """Who is near is no reason to move a point."""
+    tokens, points = scene()
+    points = dataclasses.replace(points, tokens=points.tokens.clone().requires_grad_())
+    for neighborhood in ("xyz", "image_plane"):
+        assert not make_stage(neighborhood=neighborhood).positions(tokens, points).requires_grad

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.rendering import render
 from ghgs_lit.rounds.observation import CHANNELS, observe
 from ghgs_lit.types import Gaussians
 from tests.helpers.scenes import make_batch, with_soft_rims
@@ -109,3 +110,16 @@ def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
     assert torch.equal(each[..., :6], plain[..., :6])
     between = [((found[..., 6] > 0.05) & (found[..., 6] < 0.95)).sum() for found in (each, plain)]
     assert between[0] > between[1]
+
+
+def test_errors_are_the_photograph_minus_the_render():
+    """Splats that are too dark have positive errors, those of their own pixel."""
+    batch = make_batch(1, 3)
+    dark = splats(batch)
+    dark = dataclasses.replace(dark, colors=0.5 * dark.colors)
+    error = batch.images - render(dark, batch.cameras).image
+    expected = error.flatten(0, 1).flatten(2).mT[dark.image, dark.pixel]
+    each = observe(dark, batch)
+    assert expected.mean() > 0.05
+    torch.testing.assert_close(each[:, 0, 3:6], expected, rtol=0, atol=1e-3)
+    torch.testing.assert_close(each[:, 0, :3], dark.colors, rtol=0, atol=1e-3)

@@ -1,6 +1,7 @@
 """Rounds: where they start, that they stay within bounds, that they learn."""
 
 import dataclasses
+import itertools
 
 import lightning.pytorch as L
 import pytest
@@ -156,3 +157,36 @@ def test_validation_shows_what_each_round_is_worth():
     for name in ("psnr", "depth_error_mm"):
         before = [found[f"val/{name}_before_round_{number}"] for number in (1, 2)]
         assert before == pytest.approx([found[f"val/{name}"]] * 2, rel=1e-4)
+
+
+def test_each_round_changes_half_as_much_as_the_one_before():
+    """Raw attributes, and how far depths may move: with the same output of the network each round."""
+    batch, recurrent = make_batch(1, 3), model("rounds.gains=false")
+    recurrent.rounds.count = 3
+    torch.nn.init.constant_(recurrent.rounds.change[-1].bias, 0.01)
+    states = []
+    recurrent.rounds.register_forward_hook(lambda module, inputs, found: states.extend(found))
+    with torch.no_grad():
+        recurrent(batch)
+    for name in ("offset", "scale", "rotation", "opacity"):
+        values = [getattr(state.raw, name) for state in states]
+        for number, (before, after) in enumerate(itertools.pairwise(values)):
+            expected = torch.full_like(after, 0.01 * 0.5**number)
+            torch.testing.assert_close(after - before, expected, rtol=0, atol=1e-5)
+    depths = [state.depth_maps.depth[batch.masks] for state in states]
+    moved = [(after - before).mean() for before, after in itertools.pairwise(depths)]
+    assert moved[0] > 0
+    assert float(moved[1] / moved[0]) == pytest.approx(0.5, rel=0.05)
+    assert float(moved[2] / moved[0]) == pytest.approx(0.25, rel=0.05)
+
+
+def test_depths_are_compared_between_near_and_far_only():
+    """However far a round may search."""
+    batch, wild = make_batch(1, 4), model("rounds.reach=1", kick=30.0)
+    wild.rounds.count = 1
+    with torch.no_grad():
+        maps = wild(batch).rounds[1]
+    depth, near, far = (x[maps.valid] for x in (maps.depth, maps.bounds.near, maps.bounds.far))
+    assert (depth >= near - 1e-5 * depth).all()
+    assert (depth <= far + 1e-5 * depth).all()
+    assert ((depth > far - 1e-3) | (depth < near + 1e-3)).any()  # it went as far as it may

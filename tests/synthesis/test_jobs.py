@@ -14,7 +14,8 @@ import pytest
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.jobs import render_people
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.jobs import SyntheticSource, render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
 
@@ -274,3 +275,21 @@ def test_portrait_photographs(scans, tmp_path):
     assert view.intrinsics[0, 0] == pytest.approx(0.8 * 56)
     columns = np.flatnonzero(view.mask.any(0))
     assert abs((columns[0] + columns[-1] + 1) / 2 - 14) < 3
+
+
+def test_two_seeds_of_rendering_differ_and_one_repeats(scans, reference, tmp_path):
+    """Other heights, directions and lights: no photograph and no camera is that of the other seed."""
+    for seed in (0, 1):
+        render_boxes(tmp_path / str(seed), scans, 3, 1, settings=SMALL, seed=seed)
+    assert contents(tmp_path / "0") == reference
+    other = contents(tmp_path / "1")
+    assert other.keys() == reference.keys()
+    differing = [name for name in other if "/img/" in name or name.endswith("extrinsic.npy")]
+    assert len(differing) == 4 * 3 * 2 * 2
+    assert all(other[name] != reference[name] for name in differing)
+
+
+def test_generated_people_are_those_of_their_seed(monkeypatch):
+    monkeypatch.setattr(people, "generate", lambda seed, index, active: (seed, index, active))
+    assert SyntheticSource(7).load("p12") == (7, 12, False)
+    assert SyntheticSource(8).load("a03") == (8, 3, True)

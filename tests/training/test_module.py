@@ -285,3 +285,38 @@ def test_impossible_values_name_their_key(values, key):
     """A value that cannot work fails when it is read, with its key."""
     with pytest.raises(InputError, match=key):
         Optimization(**values)
+
+
+def test_random_numbers_of_a_step_are_those_of_seed_step_part_and_process(monkeypatch):
+    """Each changes them, and nothing else does."""
+    monkeypatch.setattr(GHGSModule, "global_step", property(lambda self: self._trainer.global_step))
+    monkeypatch.setattr(GHGSModule, "global_rank", property(lambda self: self._trainer.global_rank))
+
+    def seed(seed=1, step=7, part=0, rank=0):
+        subject = module()
+        subject.config = {**CONFIG, "seed": seed}
+        subject._trainer = SimpleNamespace(global_step=step, global_rank=rank, accumulate_grad_batches=2)
+        torch.manual_seed(int(torch.randint(1000, ())))
+        return subject.step_seed(4 + part)
+
+    different = [seed(), seed(seed=2), seed(step=8), seed(part=1), seed(rank=1)]
+    assert len(set(different)) == 5
+    assert different == [seed(), seed(seed=2), seed(step=8), seed(part=1), seed(rank=1)]
+
+
+def test_two_seeds_of_training_differ_and_one_repeats(tmp_path):
+    """Points of the Chamfer loss are drawn at random: whatever the process has drawn before."""
+
+    class Curve(L.Callback):
+        def on_train_batch_end(self, trainer, pl_module, outputs, *_):
+            curve.append(outputs["loss"].item())
+
+    curves = []
+    for seed in (1, 1, 2):
+        curve = []
+        curves.append(curve)
+        losses, config = losses_of({"chamfer": 1.0}, chamfer_points=3), {**CONFIG, "seed": seed}
+        subject = GHGSModule(Standin(), flat_renderer, losses, Optimization(lr=0.05), config)
+        trainer(tmp_path, 2, [Curve()], limit_val_batches=0).fit(subject, loader())
+    assert curves[0] == curves[1]
+    assert all(one != other for one, other in zip(curves[1], curves[2], strict=True))

@@ -351,3 +351,19 @@ def test_minutes_and_steps_exclude_one_another():
     """One callback saves by steps or by time; both would silently mean one of them."""
     with pytest.raises(InputError, match="minutes: expected null where every_n_train_steps is given"):
         CheckpointOptions(filename="last", minutes=1, every_n_train_steps=3)
+
+
+def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):
+    """Its score would keep every later one from being written."""
+    path = tmp_path / "best.ckpt"
+    before, after = (
+        CheckpointOptions(filename="best", monitor="val/psnr", mode="max").build() for _ in range(2)
+    )
+    before.dirpath = after.dirpath = str(tmp_path)
+    before.best_model_path, before.best_model_score = str(path), torch.tensor(30.0)
+    before.best_k_models = {str(path): torch.tensor(30.0)}
+    after.load_state_dict(before.state_dict())
+    assert (after.best_model_path, after.best_model_score, after.best_k_models) == ("", None, {})
+    path.touch()
+    after.load_state_dict(before.state_dict())
+    assert (after.best_model_path, after.best_model_score) == (str(path), 30)

@@ -97,3 +97,15 @@ def test_a_long_report_ends(tmp_path):
     text = report(lines, "a.ckpt", tmp_path / "all.txt")
     assert text.splitlines()[-1] == "... and 30 more"
     assert len((tmp_path / "all.txt").read_text().splitlines()) == 50
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path, wrong):
+    """Every prediction would be empty; no tensor of the model is changed."""
+    other, model = Standin(), Standin()
+    with torch.no_grad():
+        other.shift[1] = wrong
+    path = checkpoint(tmp_path / "a.ckpt", other)
+    with pytest.raises(InputError, match=r"a\.ckpt: shift: expected finite numbers; found 'NaN or infinity'"):
+        initialize(model, path)
+    assert model.shift.isfinite().all()

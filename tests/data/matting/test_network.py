@@ -94,3 +94,14 @@ def test_colors_nearby_are_weighted_means():
     found = _near(torch.cat((color * weight, weight), 1), 3, torch.Size((48, 48)))
     torch.testing.assert_close(found[..., :20], color.expand(1, 3, 48, 20), atol=1e-3, rtol=0)
     assert (found[..., 40:] == 0).all()
+
+
+def test_colors_do_not_train_the_matte(network):
+    """A matte that lets in more of the background would be the easiest way to other colours."""
+    images, mattes = photographs()
+    found, subjects = network.train()(images, mattes)
+    colors = (subjects / found[:, None]).movedim(1, -1)[found > 0.2]
+    colors.sum().backward()
+    gradient = network.out.bias.grad.abs()
+    assert gradient[1:].min() > 1
+    assert gradient[0] < 1e-3

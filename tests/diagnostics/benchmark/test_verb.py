@@ -49,11 +49,16 @@ def test_the_json_has_one_row_for_each_preset_and_stage(measured):
     content = json.loads((measured / "benchmark.json").read_text())
     assert {"processor", "vectors", "cores", "threads", "torch"} <= set(content["machine"])
     assert all(set(row) >= KEYS for row in content["rows"])
-    stages = [row["stage"] for row in content["rows"] if row["preset"] == "exact"]
-    assert stages == [
+    stages = [
         "bounds", "encoder.patch_tokens", "encoder", "depth_head", "unprojection", "recalibration",
         "gaussian_head", "render", "other", "total",
     ]  # fmt: skip
+    for preset in ("none", "exact", "balanced", "auto"):
+        assert [row["stage"] for row in content["rows"] if row["preset"] == preset] == stages, preset
+    assert len(content["rows"]) == 4 * len(stages)
+    for row in content["rows"]:
+        assert row["seconds"] >= 0
+        assert (row["psnr"] is not None) == (row["stage"] == "total"), row
     whole = totals(content)
     assert list(whole) == ["none", "exact", "balanced", "auto"]
     assert whole["none"]["max_rel_diff"] == whole["none"]["psnr_loss_db"] == 0

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 import torch
 
 from ghgs_lit.config import build, compose, resolve
@@ -61,3 +62,15 @@ def test_discs_draw_the_surface_better_than_round_splats():
         discs = splatted(batch, true_depth, RENDERER)
         found = [psnr(drawn.image[0], truth[0]).item() for drawn in (splats, discs)]
         assert found[1] > found[0] + 3
+
+
+@pytest.mark.parametrize("splatting", [splats_at, discs_at])
+def test_sizes_are_of_each_views_own_focal_length(splatting):
+    """A lens of one view that is twice as long makes its splats half as wide, and no others."""
+    batch = make_batch(2, 3)
+    lenses = batch.cameras.intrinsics.clone()
+    lenses[1, 2, [0, 1], [0, 1]] *= 2
+    longer = dataclasses.replace(batch, cameras=dataclasses.replace(batch.cameras, intrinsics=lenses))
+    found, given = (splatting(one, batch.depths, batch.masks) for one in (longer, batch))
+    expected = torch.where(found.image == 5, 0.5, 1.0)[:, None] * given.scales
+    torch.testing.assert_close(found.scales, expected)

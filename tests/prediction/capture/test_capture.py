@@ -249,3 +249,15 @@ def test_a_folder_for_each_instant_and_one_for_each_camera(tmp_path):
         assert one.name == two.name
         np.testing.assert_array_equal(one.image, two.image)
         np.testing.assert_array_equal(one.mask, two.mask)
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_a_mask_of_the_stored_pixels_is_turned_as_its_photograph(tmp_path, turns):
+    """Photographs of phones are turned when they are read; their masks may be stored either way."""
+    stored = np.zeros((4, 6), np.uint8)
+    stored[0, :2] = 255
+    shown = np.rot90(stored, turns)
+    pixels = Pixels(np.zeros((*shown.shape, 3), np.uint8), None, turns)
+    for name, mask in (("stored", stored), ("shown", np.ascontiguousarray(shown))):
+        Image.fromarray(mask).save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(matte_of_file(tmp_path / f"{name}.png", pixels), shown)

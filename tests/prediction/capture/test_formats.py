@@ -8,7 +8,13 @@ import pycolmap
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.prediction.capture.calibration import Calibration, calibrate, quarter_turned
+from ghgs_lit.prediction.capture.calibration import (
+    Calibration,
+    Convention,
+    calibrate,
+    extrinsics_of,
+    quarter_turned,
+)
 from ghgs_lit.prediction.capture.formats import read_cameras
 from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from tests.helpers.rigs import POINTS, SIZE, opencv_pixels, rig
@@ -148,6 +154,8 @@ def test_own_json_comes_back(tmp_path):
     calibrations = {n: (calibrate(c, read.convention, SIZE), SIZE) for n, c in read.cameras.items()}
     write_json(tmp_path / "cameras.json", calibrations)
     check(tmp_path / "cameras.json", "ghgs")
+    stored = json.loads((tmp_path / "cameras.json").read_text())["cameras"]
+    assert {(camera["height"], camera["width"]) for camera in stored.values()} == {SIZE}
 
 
 def test_a_photograph_of_another_size_scales_the_intrinsics():
@@ -171,3 +179,26 @@ def test_a_turned_photograph_turns_its_camera(turns):
         [[turned_row, turned_column]] = np.argwhere(np.rot90(spot, turns))
         pixel = projected(quarter_turned(straight, turns, SIZE), point[None])[0]
         assert np.abs(pixel - [turned_column + 0.5, turned_row + 0.5]).max() <= 0.5 + 1e-9
+
+
+def test_a_frames_own_intrinsics_win_over_those_of_the_file(tmp_path):
+    """Of nerfstudio, where cameras differ: each number by itself."""
+    frame = {"transform_matrix": np.eye(4).tolist()}
+    frames = [{**frame, "file_path": "a.png"}, {**frame, "file_path": "b.png", "fl_x": 500, "cy": 90}]
+    shared = {"fl_x": 1000, "fl_y": 900, "cx": 100, "cy": 80, "w": 200, "h": 160}
+    (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    cameras = read_cameras(tmp_path / "transforms.json").cameras
+    np.testing.assert_array_equal(cameras["a"].intrinsics, [[1000, 0, 100], [0, 900, 80], [0, 0, 1]])
+    np.testing.assert_array_equal(cameras["b"].intrinsics, [[500, 0, 100], [0, 900, 90], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("extrinsics", ["world_to_camera", "camera_to_world"])
+def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
+    """A rig in millimetres: cameras stand a thousandth as far away."""
+    camera = rig()["cam_01"]
+    pose = np.vstack((np.column_stack((camera["R"], camera["T"])), [0, 0, 0, 1]))
+    metres, millimetres = (
+        extrinsics_of(pose, Convention(extrinsics=extrinsics, unit=unit)) for unit in (1.0, 0.001)
+    )
+    np.testing.assert_allclose(millimetres[:3, 3], metres[:3, 3] / 1000)
+    np.testing.assert_array_equal(millimetres[:3, :3], metres[:3, :3])

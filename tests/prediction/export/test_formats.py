@@ -2,9 +2,11 @@
 
 import base64
 import gzip
+import io
 import json
 import re
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pygltflib
@@ -13,12 +15,14 @@ import torch
 import trimesh
 from gaussforge import GaussForge
 from imageio_ffmpeg import get_ffmpeg_exe, read_frames
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import psnr
 from ghgs_lit.prediction.export.compact import CONVERTED, RECORD, converted, to_records
 from ghgs_lit.prediction.export.gltf import EXTENSION, glb_bytes
+from ghgs_lit.prediction.export.maps import input_files
 from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import SH_CONSTANT, ply_bytes, read_ply
 from ghgs_lit.prediction.export.video import mp4_bytes
@@ -150,3 +154,18 @@ def test_a_video_shows_the_pictures_in_their_colors(tmp_path):
     middle = np.arange(61) % 10 // 3 == 1  # 4:2:0 mixes colours at their borders
     for found, wanted in zip(read, pictures, strict=True):
         assert np.abs(found - wanted)[:, middle].mean() < 4
+
+
+def test_cameras_say_the_height_and_width_of_their_photographs():
+    """Of photographs that are not square, beside PNGs of that size."""
+    cameras = camera_ring(2, 30, 20)[0]
+    images, mattes = torch.rand(2, 3, 30, 20), torch.ones(2, 30, 20)
+    names = ("front", "back")
+    subject = SimpleNamespace(images=images, mattes=mattes, cameras=cameras, file_names=names)
+    *pictures, text = input_files(subject)
+    assert [Image.open(io.BytesIO(picture)).size for picture in pictures] == [(20, 30)] * 2
+    stored = json.loads(text)["cameras"]
+    assert {name: (camera["width"], camera["height"]) for name, camera in stored.items()} == dict.fromkeys(
+        names, (20, 30)
+    )
+    np.testing.assert_allclose(stored["back"]["intrinsics"], cameras.intrinsics[1], rtol=1e-6)

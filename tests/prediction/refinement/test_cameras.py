@@ -11,6 +11,7 @@ from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.prediction.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.prediction.refinement.cameras import _views
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import off, painted_ellipsoid, ring
@@ -177,3 +178,14 @@ def test_any_unit_and_origin():
 def test_no_rounds_are_refused():
     with pytest.raises(InputError, match="refine_cameras: expected 1 or more rounds"):
         CameraRefinement(0, predictor(scene(size=28)), RENDERER)
+
+
+def test_a_view_is_compared_with_what_the_other_views_of_its_element_say():
+    """Its own Gaussians reproduce its photograph wherever its camera is."""
+    truth = scene(batch=2, views=3, size=28)
+    inside = Frame.of(truth).enter(truth)
+    views = _views(predictor(truth)(inside), inside)
+    assert set(views.owner.tolist()) == set(range(6))
+    for view in range(6):
+        shown = set(views.gaussians.image[views.owner == view].tolist())
+        assert shown == {3 * (view // 3) + other for other in range(3)} - {view}

@@ -10,6 +10,7 @@ from ghgs_lit.evaluation.baselines import splats_at
 from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.metrics.functional import psnr
 from ghgs_lit.prediction.refinement import Refinement
+from ghgs_lit.prediction.refinement.refinement import _footprints
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import painted_ellipsoid, ring
@@ -123,3 +124,24 @@ def test_what_cannot_be_refined_is_refused():
         Refinement(1, RENDERER)(dataclasses.replace(splats, image=None), inputs)
     with pytest.raises(InputError, match="refine: expected 1 or more steps"):
         Refinement(0, RENDERER)
+
+
+def test_silhouettes_alone_make_what_is_too_thin_denser():
+    """A black subject on black: its colours say nothing, its silhouette says how opaque it is."""
+    splats, inputs, _ = scene(size=28)
+    black = dataclasses.replace(inputs, images=torch.zeros_like(inputs.images))
+    thin = dataclasses.replace(
+        splats, colors=torch.zeros_like(splats.colors), opacities=torch.full_like(splats.opacities, 0.3)
+    )
+    refined = Refinement(5, RENDERER)(thin, black)
+    assert (refined.opacities > thin.opacities + 0.01).float().mean() > 0.8
+
+
+def test_footprints_are_of_each_photographs_own_mean_focal_length():
+    """A lens that is longer along one axis, in one view alone."""
+    splats, inputs, _ = scene(size=28)
+    lenses = inputs.cameras.intrinsics.clone()
+    lenses[0, 1, 0, 0] *= 4
+    longer = dataclasses.replace(inputs, cameras=dataclasses.replace(inputs.cameras, intrinsics=lenses))
+    expected = torch.where(splats.image[:, None] == 1, 0.5, 1.0) * _footprints(splats, inputs)
+    torch.testing.assert_close(_footprints(splats, longer), expected)
