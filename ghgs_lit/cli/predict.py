@@ -40,7 +40,6 @@ from ghgs_lit.prediction.export import (
     write_prediction,
 )
 from ghgs_lit.prediction.export.video import mp4_bytes
-from ghgs_lit.prediction.refinement import Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Cameras, Gaussians
@@ -96,7 +95,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     check_size(data, model)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    result = predict_batch(batch, model, renderer, config["refine_cameras"])
+    result = predict_batch(batch, model, renderer, config["refine_cameras"], config["refine"])
     write_result(directory, result, model, renderer, config, options)
 
 
@@ -124,9 +123,10 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     totals: dict[str, float] = {}
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
+    refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     begin = time.perf_counter()
     for capture, waited in captures_of(folder):
-        result = predict(capture, model, size, config["refine_cameras"], config["refine_masks"])
+        result = predict(capture, model, size, **refining, renderer=renderer)
         result.seconds["read"] = waited
         gaussians, seconds = write_result(directories[capture.name], result, model, renderer, config, options)
         if several and "mp4" in options.formats:
@@ -165,7 +165,7 @@ def write_result(
     config: dict[str, Any],
     options: OutputOptions,
 ) -> tuple[Gaussians, dict[str, float]]:
-    """Refine a result where asked, write its files, and print what was done and written.
+    """Write the files of a result, and print what was done and written.
 
     Returns:
         The Gaussians that were written, and the run time of each stage in seconds.
@@ -183,14 +183,9 @@ def write_result(
     if model.auto is not None:
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)
-    if config["refine"]:
-        begin, refinement = time.perf_counter(), Refinement(config["refine"], renderer)
-        gaussians = refinement(prediction.gaussians, result.batch)
-        seconds["refine"] = time.perf_counter() - begin
-        report = refinement.report(prediction.gaussians, gaussians, result.batch)
-        facts["refine"] = dataclasses.asdict(report)
-        print(report, flush=True)
-        prediction = dataclasses.replace(prediction, gaussians=gaussians)
+    if result.refined is not None:
+        facts["refine"] = dataclasses.asdict(result.refined)
+        print(result.refined, flush=True)
     begin = time.perf_counter()
     paths = write_prediction(directory, result.batch, prediction, renderer, options, facts)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)

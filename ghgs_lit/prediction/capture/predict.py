@@ -15,7 +15,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -32,6 +32,7 @@ class TimedPrediction:
         seconds: run time by stage.
         moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
         changed: which share of the subject refining changed in each crop; nothing where masks stay.
+        refined: what refining the Gaussians gained; None where they are as predicted. Depths stay.
     """
 
     batch: Batch
@@ -39,6 +40,7 @@ class TimedPrediction:
     seconds: dict[str, float] = field(default_factory=dict)
     moved: tuple[float, ...] = ()
     changed: tuple[float, ...] = ()
+    refined: Report | None = None
 
     @property
     def gaussians(self) -> Gaussians:
@@ -52,6 +54,8 @@ def predict(
     size: int | tuple[int, int] | None = None,
     refine_cameras: int = 0,
     refine_masks: int = 0,
+    refine: int = 0,
+    renderer: Renderer | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a capture.
 
@@ -65,6 +69,9 @@ def predict(
             (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
         refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then searched in the
             photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
+        refine: steps that bring the Gaussians nearer to the photographs (:class:`Refinement`), such as 15; 0:
+            none.
+        renderer: what refining draws with; None: that of the device.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
@@ -83,7 +90,7 @@ def predict(
         frame = Frame.of(batch)
         return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
 
-    result = predict_batch(batch, model, Renderer(), refine_cameras, in_frame)
+    result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, in_frame)
     return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed)
 
 
@@ -92,6 +99,7 @@ def predict_batch(
     model: GHGS,
     renderer: Renderer,
     refine_cameras: int = 0,
+    refine: int = 0,
     forward: Callable[[Batch], Prediction] | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a batch of one subject, which keeps its targets.
@@ -99,21 +107,34 @@ def predict_batch(
     Args:
         batch: photographs, masks and cameras.
         model: on the device of the batch.
-        renderer: draws what :class:`CameraRefinement` compares.
-        refine_cameras: its rounds, at most; 0: none.
+        renderer: draws what :class:`CameraRefinement` and :class:`Refinement` compare.
+        refine_cameras: rounds of the one, at most; 0: none.
+        refine: steps of the other; 0: none.
         forward: the prediction of a batch without targets; None: the model's.
     """
-    moved, seconds, start = (), {}, time.perf_counter()
+    forward, moved, seconds, start = forward or model, (), {}, time.perf_counter()
     if refine_cameras:
         given, batch = batch, CameraRefinement(refine_cameras, model, renderer)(batch)
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
-    prediction = (forward or model)(dataclasses.replace(batch, targets=None))
+    prediction = forward(dataclasses.replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
-    return TimedPrediction(batch, prediction, seconds, moved)
+    result = TimedPrediction(batch, prediction, seconds, moved)
+    return _refined(result, Refinement(refine, renderer), forward) if refine else result
+
+
+def _refined(
+    result: TimedPrediction, refinement: Refinement, forward: Callable[[Batch], Prediction]
+) -> TimedPrediction:
+    start, batch, before = time.perf_counter(), dataclasses.replace(result.batch, targets=None), result.gaussians
+    after = refinement(before, batch)
+    seconds = result.seconds | {"refine": time.perf_counter() - start}
+    report = refinement.report(before, after, batch, lambda others: forward(others).gaussians)
+    prediction = dataclasses.replace(result.prediction, gaussians=after)
+    return dataclasses.replace(result, prediction=prediction, seconds=seconds, refined=report)
 
 
 def _crops(
