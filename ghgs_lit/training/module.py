@@ -97,10 +97,10 @@ class GHGSModule(BudgetedModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         prediction, rendering = self(batch)
-        image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
+        image, target = rendering.image.flatten(0, 1).clamp(0, 1), batch.targets.images.flatten(0, 1)
         size, box = len(batch.images), box_of(batch.targets.masks.flatten(0, 1))
-        self.val_psnr.update(psnr(image.clamp(0, 1), target))
-        self.val_psnr_box.update(psnr(image.clamp(0, 1), target, box))
+        self.val_psnr.update(psnr(image, target))
+        self.val_psnr_box.update(psnr(image, target, box))
         self.log("val/psnr", self.val_psnr, prog_bar=True, on_epoch=True, batch_size=size)
         self.log("val/psnr_box", self.val_psnr_box, on_epoch=True, batch_size=size)
         means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}

@@ -1,5 +1,6 @@
 """The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
 
+import dataclasses
 import re
 from datetime import timedelta
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress, StepTime
@@ -285,3 +287,19 @@ def test_impossible_values_name_their_key(values, key):
     """A value that cannot work fails when it is read, with its key."""
     with pytest.raises(InputError, match=key):
         Optimization(**values)
+
+
+def test_validation_measures_clamped_renders(tmp_path):
+    """PSNR and SSIM are of the pictures that are seen, as `ghgs evaluate` measures them."""
+
+    def brighter(gaussians, cameras, by=3.0):
+        drawn = flat_renderer(gaussians, cameras)
+        pattern = torch.linspace(-1, by, drawn.image.shape[-1])
+        return dataclasses.replace(drawn, image=drawn.image + pattern)
+
+    subject, batch = module(brighter), example_batch()
+    run = trainer(tmp_path, steps=1)
+    (found,) = run.validate(subject, DataLoader([batch], batch_size=None, collate_fn=lambda b: b), verbose=False)
+    image, target = subject(batch)[1].image.clamp(0, 1).flatten(0, 1), batch.targets.images.flatten(0, 1)
+    assert found["val/ssim"] == pytest.approx(float(ssim(image, target).mean()), rel=1e-4)
+    assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
