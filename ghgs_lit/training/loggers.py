@@ -135,7 +135,7 @@ def log_hyperparameters(loggers: Sequence[Logger], values: Mapping[str, Value]) 
 
 @rank_zero_only
 def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]], step: int) -> None:
-    """Log the numbers of :func:`final_numbers` of the weights after ``step``; ``summary`` is that of ``metrics.json``."""
+    """Log :func:`final_numbers` of the weights after ``step``; ``summary`` is that of ``metrics.json``."""
     results = final_numbers(summary)
     for logger in loggers:
         if isinstance(logger, TensorBoardLog):

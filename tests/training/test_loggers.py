@@ -97,7 +97,7 @@ def test_tags_are_grouped_by_what_they_are(run):
 
 
 def test_the_numbers_are_those_of_the_steps(run):
-    """Values are logged at the steps taken, as pictures and checkpoints say, and the parts of a step add up to its time."""
+    """Values are logged at the steps taken, and the parts of a step add up to its time."""
     found = events(run[0] / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
     assert sorted(rates) == [2, 4, 6, 8]

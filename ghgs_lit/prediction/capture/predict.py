@@ -129,7 +129,8 @@ def predict_batch(
 def _refined(
     result: TimedPrediction, refinement: Refinement, forward: Callable[[Batch], Prediction]
 ) -> TimedPrediction:
-    start, batch, before = time.perf_counter(), dataclasses.replace(result.batch, targets=None), result.gaussians
+    batch, before = dataclasses.replace(result.batch, targets=None), result.gaussians
+    start = time.perf_counter()
     after = refinement(before, batch)
     seconds = result.seconds | {"refine": time.perf_counter() - start}
     report = refinement.report(before, after, batch, lambda others: forward(others).gaussians)
