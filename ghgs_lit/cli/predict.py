@@ -1,6 +1,7 @@
 """``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
 
 import dataclasses
+import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -30,7 +31,13 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.predict import TimedPrediction, predict, predict_batch, trained_size
+from ghgs_lit.prediction.capture.predict import (
+    TimedPrediction,
+    predict,
+    predict_batch,
+    size_advice,
+    trained_size,
+)
 from ghgs_lit.prediction.export import (
     REPORT,
     OutputOptions,
@@ -41,13 +48,16 @@ from ghgs_lit.prediction.export import (
 )
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
+
+
+#: PSNR in dB, in the box of the subject, below which a photograph does not come back as it should.
+LOW_PSNR = 25.0
 
 
 @torch.no_grad()
@@ -114,12 +124,12 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         diagnosis = diagnose(folder)
         require_consistent(diagnosis)
         print("\n".join(diagnosis.lines), flush=True)
-    size = image_size("size", config["size"] or trained_size(read_checkpoint(config["checkpoint"])["config"]))
+    trained = trained_size(read_checkpoint(config["checkpoint"])["config"])
+    size = image_size("size", config["size"] or trained)
     device = pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
-    multiple = side_multiple(model.options, model.encoder.patch_size)
-    expected = f"sides divisible by the patch size {multiple}"
-    require(not any(side % multiple for side in size), "size", expected, size)
+    if advice := size_advice(size, trained, model):
+        print(advice, flush=True)
     totals: dict[str, float] = {}
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
@@ -132,6 +142,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         if several and "mp4" in options.formats:
             camera = camera or fixed_camera(capture).to(device)
             pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))
+        for line in advice_of(directories[capture.name], config):
+            print(line, flush=True)
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
     if pictures:
@@ -141,6 +153,23 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         count, total = len(folder.instants), time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
+
+
+def advice_of(directory: Path, config: dict[str, Any]) -> list[str]:
+    """Lines that say why a prediction of photographs may be poor, and what may help, by its report."""
+    quality = json.loads((directory / REPORT).read_text())["psnr_box_of_inputs"].values()
+    known, lines = [value for value in quality if value is not None], []
+    if len(quality) < 3:
+        lines.append(f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person")
+    if known and min(known) < LOW_PSNR:
+        helpful = {"refine_cameras": "cameras", "refine_masks": "masks"}
+        left = [f"{name}=4 mends {what}" for name, what in helpful.items() if not config[name]]
+        hint = f" that are off by a pixel or two: {', '.join(left)}" if left else ""
+        lines.append(
+            f"photographs come back at {min(known):.1f} to {max(known):.1f} dB only, sound ones at 30 or"
+            f" more: mostly masks or cameras{hint} (sheet.png shows where)"
+        )
+    return lines
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED, file_of
@@ -78,8 +80,11 @@ def predict(
     """
     if not isinstance(model, GHGS):
         path = file_of(model)
-        size = size or trained_size(read_checkpoint(path)["config"])
+        trained = trained_size(read_checkpoint(path)["config"])
+        size = size or trained
         model = _model(path, path.stat().st_mtime_ns)
+        if advice := size_advice(image_size("size", size), trained, model):
+            warnings.warn(advice, stacklevel=2)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     seconds: dict[str, float] = {}
     batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
@@ -160,6 +165,28 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
     Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
     """
     return config.get("data", {}).get("size") or config["encoder"].get("image_size", 518)
+
+
+def size_advice(size: tuple[int, int], trained: int | tuple[int, int], model: GHGS) -> str | None:
+    """One line where crops are larger than ``trained`` photographs, which makes results worse; else None.
+
+    Raises:
+        InputError: the model cannot take this size; names sizes that it can.
+    """
+    multiple, largest = side_multiple(model.options, model.encoder.patch_size), image_size("size", trained)
+    if any(side % multiple for side in size):
+        lower = max(max(size) // multiple, 1) * multiple
+        expected = f"sides divisible by the patch size {multiple}, such as {lower} or {lower + multiple}"
+        require(False, "size", expected, size)
+    if all(side <= limit for side, limit in zip(size, largest, strict=True)):
+        return None
+    sides, limits = (" x ".join(map(str, pair)) for pair in (size, largest))
+    patch = model.encoder.patch_size
+    below = ", ".join(str(n * patch) for n in range(max(largest) // patch, 0, -3)[:3])
+    return (
+        f"size: {sides} is larger than the {limits} of the training, which makes results worse, not sharper;"
+        f" multiples of {patch} up to that fit, such as {below}"
+    )
 
 
 @functools.lru_cache(maxsize=1)
