@@ -66,7 +66,6 @@ def run(cfg: DictConfig) -> None:
     directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
     is_capture = cfg.images is not None or cfg.cameras is not None
     config = resolve(cfg if is_capture else with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
-    write_config(config, directory)
     (predict_photographs if is_capture else predict_subject)(config, directory)
     announce(directory)
 
@@ -105,6 +104,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     check_size(data, model)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
+    write_config(config, directory)
     result = predict_batch(batch, model, renderer, config["refine_cameras"], config["refine"])
     write_result(directory, result, model, renderer, config, options)
 
@@ -133,6 +133,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     totals: dict[str, float] = {}
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
+    write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     begin = time.perf_counter()
     for capture, waited in captures_of(folder):

@@ -1,6 +1,7 @@
 """A whole evaluation as configured: measures methods, prints means, writes the results of the run."""
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +52,8 @@ def measure_and_write(
     evaluation = config["evaluation"]
     targets = target_protocols(config)
     metrics = build(config["metrics"], "metrics").to(device)
-    for name, reason in metrics.left_out.items():
-        print(f"{name} is left out: {reason}", flush=True)
+    for left_out in metrics.left_out.items():
+        say_left_out(*left_out)
     rows = measure_all(
         methods,
         data,
@@ -84,6 +85,12 @@ def measure_and_write(
     )
     print_summary(rows)
     return write_results(directory, rows, source)
+
+
+@cache
+def say_left_out(name: str, reason: str) -> None:
+    """Print, once in a process, why a metric is left out: all runs of a sweep lack it."""
+    print(f"{name} is left out: {reason}", flush=True)
 
 
 def print_summary(rows: list[Row]) -> None:

@@ -1,14 +1,37 @@
 """Compile kernels with Numba and keep their machine code on disk while their sources stay the same."""
 
 import hashlib
+import multiprocessing
+import sys
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import llvmlite.binding
 import numba
+from numba.core import event
 
 # Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+
+class FirstCompilation(event.Listener):
+    """Prints one line when a process compiles for the first time; its workers print none."""
+
+    def __init__(self):
+        self.is_said = multiprocessing.parent_process() is not None
+
+    def on_start(self, event: Any) -> None:
+        if not self.is_said:
+            said = "compiling kernels for this processor, which takes up to a minute; they are kept for later"
+            print(said, file=sys.stderr, flush=True)
+        self.is_said = True
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", FirstCompilation())
 
 
 @cache

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,9 @@ class CsvLog(_StepsTaken, CSVLogger):
         if path.is_file():
             with open(path, newline="") as file:
                 rows = [row for row in csv.DictReader(file) if _is_kept(row.get("step"), step)]
-        writer = self.experiment  # begins with an empty file
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*will be deleted")  # what is kept is written again
+            writer = self.experiment  # begins with an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()
 
