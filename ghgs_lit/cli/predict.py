@@ -24,20 +24,13 @@ from ghgs_lit.cli.inputs import (
 from ghgs_lit.cli.photographs import capture_folder, fixed_camera, require_consistent
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
-from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.predict import (
-    TimedPrediction,
-    predict,
-    predict_batch,
-    size_advice,
-    trained_size,
-)
+from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, predict, predict_batch
 from ghgs_lit.prediction.export import (
     REPORT,
     OutputOptions,
@@ -124,12 +117,9 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         diagnosis = diagnose(folder)
         require_consistent(diagnosis)
         print("\n".join(diagnosis.lines), flush=True)
-    trained = trained_size(read_checkpoint(config["checkpoint"])["config"])
-    size = image_size("size", config["size"] or trained)
     device = pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
-    if advice := size_advice(size, trained, model):
-        print(advice, flush=True)
+    size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
     totals: dict[str, float] = {}
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
@@ -143,8 +133,9 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         if several and "mp4" in options.formats:
             camera = camera or fixed_camera(capture).to(device)
             pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))
-        for line in advice_of(directories[capture.name], config):
-            print(line, flush=True)
+        if capture.name == folder.instants[0]:
+            for line in advice_of(directories[capture.name], config):
+                print(line, flush=True)
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
     if pictures:
@@ -156,21 +147,19 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
 
 
-def advice_of(directory: Path, config: dict[str, Any]) -> list[str]:
+def advice_of(directory: Path, config: dict[str, Any]) -> Iterator[str]:
     """Lines that say why a prediction of photographs may be poor, and what may help, by its report."""
     quality = json.loads((directory / REPORT).read_text())["psnr_box_of_inputs"].values()
-    known, lines = [value for value in quality if value is not None], []
     if len(quality) < 3:
-        lines.append(f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person")
-    if known and min(known) < LOW_PSNR:
-        helpful = {"refine_cameras": "cameras", "refine_masks": "masks"}
-        left = [f"{name}=4 mends {what}" for name, what in helpful.items() if not config[name]]
-        hint = f" that are off by a pixel or two: {', '.join(left)}" if left else ""
-        lines.append(
-            f"photographs come back at {min(known):.1f} to {max(known):.1f} dB only, sound ones at 30 or"
-            f" more: mostly masks or cameras{hint} (sheet.png shows where)"
+        yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
+    low, high = min(quality), max(quality)
+    if low < LOW_PSNR:
+        left = [key for key in ("refine_cameras", "refine_masks") if not config[key]]
+        hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
+        yield (
+            f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
+            f" cameras or masks are off{hint}; sheet.png shows where"
         )
-    return lines
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:

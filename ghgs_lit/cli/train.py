@@ -48,11 +48,7 @@ def quiet() -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
-    messages += (
-        "The dirpath has changed",
-        "overridden `transfer_batch_to_device`",
-        "exists and is not empty",
-    )
+    messages += ("The dirpath has changed", "overridden `transfer_batch", "exists and is not empty")
     for message in messages:
         warnings.filterwarnings("ignore", f".*{message}.*")
 

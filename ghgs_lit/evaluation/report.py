@@ -16,6 +16,8 @@ from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_results
 
+#: Prints a line unless this process has: what one run of a sweep lacks, all lack.
+print_once = cache(print)
 #: Metrics that are printed, with their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
 #: What readers must know about the subjects of a split.
@@ -52,8 +54,8 @@ def measure_and_write(
     evaluation = config["evaluation"]
     targets = target_protocols(config)
     metrics = build(config["metrics"], "metrics").to(device)
-    for left_out in metrics.left_out.items():
-        say_left_out(*left_out)
+    for name, reason in metrics.left_out.items():
+        print_once(f"{name} is left out: {reason}")
     rows = measure_all(
         methods,
         data,
@@ -85,12 +87,6 @@ def measure_and_write(
     )
     print_summary(rows)
     return write_results(directory, rows, source)
-
-
-@cache
-def say_left_out(name: str, reason: str) -> None:
-    """Print, once in a process, why a metric is left out: all runs of a sweep lack it."""
-    print(f"{name} is left out: {reason}", flush=True)
 
 
 def print_summary(rows: list[Row]) -> None:

@@ -5,7 +5,6 @@ import multiprocessing
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import llvmlite.binding
 import numba
@@ -18,17 +17,15 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 class FirstCompilation(event.Listener):
     """Prints one line when a process compiles for the first time; its workers print none."""
 
-    def __init__(self):
-        self.is_said = multiprocessing.parent_process() is not None
+    is_said = multiprocessing.parent_process() is not None
 
-    def on_start(self, event: Any) -> None:
+    def on_start(self, event):
         if not self.is_said:
-            said = "compiling kernels for this processor, which takes up to a minute; they are kept for later"
-            print(said, file=sys.stderr, flush=True)
+            print("compiling kernels for this processor (up to a minute, once) ...", file=sys.stderr)
         self.is_said = True
 
-    def on_end(self, event: Any) -> None:
-        pass
+    def on_end(self, event):
+        """Nothing to say."""
 
 
 event.register("numba:compile", FirstCompilation())

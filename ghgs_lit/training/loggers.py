@@ -21,10 +21,7 @@ Value = str | int | float | bool
 
 
 class _StepsTaken:
-    """Numbers under the steps that the weights have taken, as checkpoints and pictures are called.
-
-    Lightning gives the number of the last step, counted from 0.
-    """
+    """Counts steps as checkpoints and pictures do: those taken. Lightning's number of the first one is 0."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         super().log_metrics(metrics, None if step is None else step + 1)

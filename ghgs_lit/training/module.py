@@ -63,22 +63,21 @@ class GHGSModule(BudgetedModule):
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> "GHGSModule":
-        """The module of a checkpoint, ready to be trained or validated.
+        """The module of a checkpoint.
 
         Args:
             checkpoint_path: of a run of ``ghgs train``, or of a Trainer of one's own.
-            map_location: the device of the weights; None: the CPU.
             parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the configuration.
 
         Raises:
             InputError: the checkpoint cannot be used, or a part is neither configured nor given.
         """
         config = read_checkpoint(checkpoint_path)["config"]
-        for name, group in (("renderer", "renderer"), ("losses", "loss"), ("optimization", "optimizer")):
-            if name not in parts:
-                place, expected = f"{checkpoint_path}: config.{group}", f"options of it, or {name}=..."
-                require(group in config, place, expected, "nothing")
-                parts[name] = build(config[group], group)
+        groups = {"renderer": "renderer", "losses": "loss", "optimization": "optimizer"}
+        for name in set(groups).difference(parts):
+            group, place = groups[name], f"{checkpoint_path}: config.{groups[name]}"
+            require(group in config, place, f"options of it, or {name}=...", "nothing")
+            parts[name] = build(config[group], group)
         model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
         return cls(model.train(), config=config, **parts)
 

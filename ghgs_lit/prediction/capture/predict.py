@@ -71,8 +71,7 @@ def predict(
             (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
         refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then searched in the
             photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
-        refine: steps that bring the Gaussians nearer to the photographs (:class:`Refinement`), such as 15; 0:
-            none.
+        refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
 
     Raises:
@@ -80,11 +79,8 @@ def predict(
     """
     if not isinstance(model, GHGS):
         path = file_of(model)
-        trained = trained_size(read_checkpoint(path)["config"])
-        size = size or trained
         model = _model(path, path.stat().st_mtime_ns)
-        if advice := size_advice(image_size("size", size), trained, model):
-            warnings.warn(advice, stacklevel=2)
+        size = crop_size(size, read_checkpoint(path)["config"], model)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     seconds: dict[str, float] = {}
     batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
@@ -127,20 +123,14 @@ def predict_batch(
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
-    result = TimedPrediction(batch, prediction, seconds, moved)
-    return _refined(result, Refinement(refine, renderer), forward) if refine else result
-
-
-def _refined(
-    result: TimedPrediction, refinement: Refinement, forward: Callable[[Batch], Prediction]
-) -> TimedPrediction:
-    batch, before = dataclasses.replace(result.batch, targets=None), result.gaussians
-    start = time.perf_counter()
-    after = refinement(before, batch)
-    seconds = result.seconds | {"refine": time.perf_counter() - start}
-    report = refinement.report(before, after, batch, lambda others: forward(others).gaussians)
-    prediction = dataclasses.replace(result.prediction, gaussians=after)
-    return dataclasses.replace(result, prediction=prediction, seconds=seconds, refined=report)
+    refined = None
+    if refine:
+        refinement, before, start = Refinement(refine, renderer), prediction.gaussians, time.perf_counter()
+        prediction = dataclasses.replace(prediction, gaussians=refinement(before, batch))
+        seconds["refine"] = time.perf_counter() - start
+        untold = dataclasses.replace(batch, targets=None)
+        refined = refinement.report(before, prediction.gaussians, untold, lambda b: forward(b).gaussians)
+    return TimedPrediction(batch, prediction, seconds, moved, refined=refined)
 
 
 def _crops(
@@ -167,26 +157,27 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
     return config.get("data", {}).get("size") or config["encoder"].get("image_size", 518)
 
 
-def size_advice(size: tuple[int, int], trained: int | tuple[int, int], model: GHGS) -> str | None:
-    """One line where crops are larger than ``trained`` photographs, which makes results worse; else None.
+def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
+    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained.
+
+    Larger ones give a warning: they make results worse, not sharper.
 
     Raises:
-        InputError: the model cannot take this size; names sizes that it can.
+        InputError: the model cannot take this size.
     """
-    multiple, largest = side_multiple(model.options, model.encoder.patch_size), image_size("size", trained)
-    if any(side % multiple for side in size):
-        lower = max(max(size) // multiple, 1) * multiple
-        expected = f"sides divisible by the patch size {multiple}, such as {lower} or {lower + multiple}"
-        require(False, "size", expected, size)
-    if all(side <= limit for side, limit in zip(size, largest, strict=True)):
-        return None
-    sides, limits = (" x ".join(map(str, pair)) for pair in (size, largest))
-    patch = model.encoder.patch_size
-    below = ", ".join(str(n * patch) for n in range(max(largest) // patch, 0, -3)[:3])
-    return (
-        f"size: {sides} is larger than the {limits} of the training, which makes results worse, not sharper;"
-        f" multiples of {patch} up to that fit, such as {below}"
-    )
+    trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
+    height, width = trained if size is None else image_size("size", size)
+    multiple = side_multiple(model.options, patch)
+    expected = f"sides divisible by the patch size {multiple}"
+    require(height % multiple == width % multiple == 0, "size", expected, (height, width))
+    if height > trained[0] or width > trained[1]:
+        below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
+        warnings.warn(
+            f"size: {height} x {width} is larger than the {trained[0]} x {trained[1]} of the training, which"
+            f" makes results worse, not sharper; multiples of {patch} up to that fit, such as {below}",
+            stacklevel=3,
+        )
+    return height, width
 
 
 @functools.lru_cache(maxsize=1)

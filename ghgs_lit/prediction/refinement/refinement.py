@@ -21,6 +21,7 @@ from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
+Predict = Callable[[Batch], Gaussians]
 
 
 @dataclass(frozen=True)
@@ -126,13 +127,7 @@ class Refinement:
             changed["opacities"] = torch.sigmoid(logit + change["opacities"])
         return dataclasses.replace(gaussians, **changed)
 
-    def report(
-        self,
-        gaussians: Gaussians,
-        refined: Gaussians,
-        batch: Batch,
-        predict: Callable[[Batch], Gaussians],
-    ) -> Report:
+    def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Predict) -> Report:
         """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
 
         Args:
