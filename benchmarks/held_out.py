@@ -39,15 +39,7 @@ def held_out(batch: Batch, given: Batch) -> Iterator[Batch]:
         targets = Targets(
             given.images[:, [i]], given.masks[:, [i]], batch.cameras[:, [i]], name, protocols=("held_out",)
         )
-        yield dataclasses.replace(
-            batch,
-            images=batch.images[:, others],
-            masks=batch.masks[:, others],
-            alpha=None if batch.alpha is None else batch.alpha[:, others],
-            cameras=batch.cameras[:, others],
-            views=(tuple(batch.views[0][j] for j in others),),
-            targets=targets,
-        )
+        yield dataclasses.replace(batch.of_views(others), targets=targets)
 
 
 def main() -> None:

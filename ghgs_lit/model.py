@@ -16,7 +16,7 @@ from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.kernels.precision import PRECISIONS
 from ghgs_lit.rounds import Rounds, State, prediction_of
 from ghgs_lit.skipping import SkipOptions
-from ghgs_lit.stages import HEADS, STAGES
+from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import ModelOptions, computing, surroundings
 from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -50,6 +50,8 @@ class GHGS(nn.Module):
         self.rounds, self.gaussian_head = rounds, gaussian_head
         self.skip, self.options = skip or SkipOptions(), options or ModelOptions()
         self.auto = self.skip.build()
+        #: The nodes that :meth:`from_config` built it of; none where stages were given.
+        self.config: dict[str, Any] = {}
         #: A lookup of a frozen encoder's features; None: they are computed each time.
         self.feature_cache = None
         #: Whether predictions outside of training hold the Gaussians before each round, too.
@@ -107,7 +109,9 @@ class GHGS(nn.Module):
         heads = {name: stage(name, dim_latent=encoder.dim_latent) for name in HEADS}
         rounds = stage("rounds", channels=heads["gaussian_head"].channels) if "rounds" in config else None
         others = {name: stage(name) for name in ("bounds", "unprojection")}
-        return cls(encoder=encoder, **heads, **others, rounds=rounds, skip=skip, options=options)
+        model = cls(encoder=encoder, **heads, **others, rounds=rounds, skip=skip, options=options)
+        model.config = {node: config[node] for node in (*STAGES, *OPTIONS, "compat") if node in config}
+        return model
 
     @classmethod
     def from_checkpoint(

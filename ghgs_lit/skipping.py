@@ -181,6 +181,9 @@ class AutoSkip:
                 times = f" for {len(products)} of {len(decisions)}" if len(decisions) > 1 else ""
                 parts.append(f"{name}{times} ({fmean(products):.0%})")
         why = f"the fewest products in the encoder within skip.budget_db={self.budget_db:g}"
+        unsure = [n for n, products in shares.items() if products and not self.presets[n].is_exact]
+        if unsure:
+            why += f"; what {' and '.join(unsure)} may lose is configured, `ghgs benchmark` measures it"
         left_out = "".join(f"; not {name}: {reason}" for name, reason in self.left_out.items())
         return f"skip=auto: {', '.join(parts)}, {why} (100% is {next(iter(self.presets))}){left_out}"
 

@@ -14,7 +14,7 @@ Shapes are written with ``B`` batch, ``V`` input views, ``T`` target views, ``H 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeVar
@@ -148,6 +148,14 @@ class Batch(_TensorStruct):
     alpha: Float[Tensor, "B V H W"] | None = None
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
+
+    def of_views(self, views: Sequence[int]) -> "Batch":
+        """The batch of some of its photographs, by number, with the same targets."""
+        views = list(views)
+        names = ("images", "masks", "cameras", "depths", "alpha")
+        parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
+        said = tuple(tuple(row[view] for view in views) for row in self.views)
+        return dataclasses.replace(self, **parts, views=said)
 
     def once(self, function: Callable[["Batch"], _T]) -> _T:
         """``function`` of this batch, computed at its first use; several stages need the same."""

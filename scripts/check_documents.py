@@ -176,6 +176,7 @@ BEFORE = {
     "docs/training.md": (
         f"{_RUN} hydra.run.dir=runs/before",
         f"ghgs prepare task=miniature data=thuman2 data.root=thuman2 {FEW}",
+        *_RENDERED,
     ),
 }  # fmt: skip
 # Names that Python blocks of a document take as given.

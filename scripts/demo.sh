@@ -17,7 +17,8 @@ full="$(dirname "$(dirname "$(grep -lx -e '- ablation=full' "$out"/*/.hydra/over
 cat <<TEXT
 
 Person:       $out/person/viewer.html (in a browser), gaussians.ply, sheet.png (inputs, depth, a view half-way)
-Table:        $out/table/table.md
+Table:        $out/table/table.md (its rows are equal but for chance, as expected after so few steps: what the
+              switches do shows in longer trainings, docs/evidence/ablation.md)
 Pictures:     $out/*/pictures
 Splat:        ghgs predict checkpoint=$full/checkpoints/last.ckpt
 TensorBoard:  tensorboard --logdir $out

@@ -5,9 +5,12 @@ import importlib.metadata
 import keyword
 import os
 import re
+import shutil
 import signal
 import sys
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -94,6 +97,13 @@ def usage() -> str:
     return "\n".join(lines)
 
 
+def discard_unused(directory: Path, verb: str, since: float) -> None:
+    """Remove a run's directory that holds only how the run began, all of it written after ``since``."""
+    begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
+    if all(path.name in begun and path.stat().st_mtime >= since for path in directory.iterdir()):
+        shutil.rmtree(directory, ignore_errors=True)
+
+
 @dataclass(frozen=True)
 class Verb:
     """The function of one verb that Hydra calls, here or in the processes of a launcher."""
@@ -101,6 +111,7 @@ class Verb:
     name: str
     argv: tuple[str, ...]
     wants_trace: bool = False
+    started: float = field(default_factory=time.time)
 
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
@@ -112,7 +123,10 @@ class Verb:
             return importlib.import_module(module_of(self.name)).run(cfg)
         except BAD_INPUT as error:
             # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
-            if self.wants_trace or HydraConfig.get().mode == RunMode.MULTIRUN:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            discard_unused(Path(HydraConfig.get().runtime.output_dir), self.name, self.started)
+            if self.wants_trace:
                 raise
             print(f"ghgs {self.name}: {one_line(error, self.name)}", file=sys.stderr)
             raise SystemExit(1) from error

@@ -1,6 +1,7 @@
 """``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
 
 import dataclasses
+import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,14 +24,13 @@ from ghgs_lit.cli.inputs import (
 from ghgs_lit.cli.photographs import capture_folder, fixed_camera, require_consistent
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
-from ghgs_lit.config.settings import image_size
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.predict import TimedPrediction, predict, predict_batch, trained_size
+from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, predict, predict_batch
 from ghgs_lit.prediction.export import (
     REPORT,
     OutputOptions,
@@ -40,9 +40,7 @@ from ghgs_lit.prediction.export import (
     write_prediction,
 )
 from ghgs_lit.prediction.export.video import mp4_bytes
-from ghgs_lit.prediction.refinement import Refinement
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.weights.checkpoint import read_checkpoint
@@ -51,13 +49,16 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 
+#: PSNR in dB, in the box of the subject, below which a photograph does not come back as it should.
+LOW_PSNR = 25.0
+
+
 @torch.no_grad()
 def run(cfg: DictConfig) -> None:
     """The verb; prints the files (not those in folders), and the directory last."""
     directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
     is_capture = cfg.images is not None or cfg.cameras is not None
     config = resolve(cfg if is_capture else with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
-    write_config(config, directory)
     (predict_photographs if is_capture else predict_subject)(config, directory)
     announce(directory)
 
@@ -96,7 +97,8 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     check_size(data, model)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    result = predict_batch(batch, model, renderer, config["refine_cameras"])
+    write_config(config, directory)
+    result = predict_batch(batch, model, renderer, config["refine_cameras"], config["refine"])
     write_result(directory, result, model, renderer, config, options)
 
 
@@ -115,23 +117,25 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         diagnosis = diagnose(folder)
         require_consistent(diagnosis)
         print("\n".join(diagnosis.lines), flush=True)
-    size = image_size("size", config["size"] or trained_size(read_checkpoint(config["checkpoint"])["config"]))
     device = pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
-    multiple = side_multiple(model.options, model.encoder.patch_size)
-    expected = f"sides divisible by the patch size {multiple}"
-    require(not any(side % multiple for side in size), "size", expected, size)
+    size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
     totals: dict[str, float] = {}
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
+    write_config(config, directory)
+    refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     begin = time.perf_counter()
     for capture, waited in captures_of(folder):
-        result = predict(capture, model, size, config["refine_cameras"], config["refine_masks"])
+        result = predict(capture, model, size, **refining, renderer=renderer)
         result.seconds["read"] = waited
         gaussians, seconds = write_result(directories[capture.name], result, model, renderer, config, options)
         if several and "mp4" in options.formats:
             camera = camera or fixed_camera(capture).to(device)
             pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))
+        if capture.name == folder.instants[0]:
+            for line in advice_of(directories[capture.name], config):
+                print(line, flush=True)
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
     if pictures:
@@ -141,6 +145,21 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         count, total = len(folder.instants), time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
+
+
+def advice_of(directory: Path, config: dict[str, Any]) -> Iterator[str]:
+    """Lines that say why a prediction of photographs may be poor, and what may help, by its report."""
+    quality = json.loads((directory / REPORT).read_text())["psnr_box_of_inputs"].values()
+    if len(quality) < 3:
+        yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
+    low, high = min(quality), max(quality)
+    if low < LOW_PSNR:
+        left = [key for key in ("refine_cameras", "refine_masks") if not config[key]]
+        hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
+        yield (
+            f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
+            f" cameras or masks are off{hint}; sheet.png shows where"
+        )
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
@@ -165,7 +184,7 @@ def write_result(
     config: dict[str, Any],
     options: OutputOptions,
 ) -> tuple[Gaussians, dict[str, float]]:
-    """Refine a result where asked, write its files, and print what was done and written.
+    """Write the files of a result, and print what was done and written.
 
     Returns:
         The Gaussians that were written, and the run time of each stage in seconds.
@@ -183,14 +202,9 @@ def write_result(
     if model.auto is not None:
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)
-    if config["refine"]:
-        begin, refinement = time.perf_counter(), Refinement(config["refine"], renderer)
-        gaussians = refinement(prediction.gaussians, result.batch)
-        seconds["refine"] = time.perf_counter() - begin
-        report = refinement.report(prediction.gaussians, gaussians, result.batch)
-        facts["refine"] = dataclasses.asdict(report)
-        print(report, flush=True)
-        prediction = dataclasses.replace(prediction, gaussians=gaussians)
+    if result.refined is not None:
+        facts["refine"] = dataclasses.asdict(result.refined)
+        print(result.refined, flush=True)
     begin = time.perf_counter()
     paths = write_prediction(directory, result.batch, prediction, renderer, options, facts)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)

@@ -47,9 +47,11 @@ from ghgs_lit.training.interruption import StopAtStep
 
 def quiet() -> None:
     """Silence Lightning's own lines, which Hydra would print twice, and warnings that do not apply here."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     messages = ("LeafSpec", "smaller than the logging interval", "num_workers", "dataloader is not resumable")
-    for message in (*messages, "The dirpath has changed", "overridden `transfer_batch_to_device`"):
+    messages += ("The dirpath has changed", "overridden `transfer_batch", "exists and is not empty")
+    for message in messages:
         warnings.filterwarnings("ignore", f".*{message}.*")
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -202,11 +203,14 @@ class PhotographsDataModule(LightningDataModule):
         return targets
 
     def _loader(self, batches: TorchDataset, **options: Any) -> DataLoader:
-        return DataLoader(
-            batches,
-            batch_size=None,
-            num_workers=self.dataset.workers,
-            persistent_workers=self.dataset.workers > 0,
-            pin_memory=torch.cuda.is_available(),
-            **options,
-        )
+        with warnings.catch_warnings():
+            # More workers than cores: they were asked for, and each loader would say it.
+            warnings.filterwarnings("ignore", "This DataLoader will create")
+            return DataLoader(
+                batches,
+                batch_size=None,
+                num_workers=self.dataset.workers,
+                persistent_workers=self.dataset.workers > 0,
+                pin_memory=torch.cuda.is_available(),
+                **options,
+            )

@@ -49,7 +49,10 @@ Method = Callable[[Batch], Estimate]
 
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, the renderer of its Gaussians, and what refines these and the cameras (None: nothing)."""
+    """A model, the renderer of its Gaussians, and what refines these and the cameras (None: nothing).
+
+    Gaussians that were refined are not at the predicted depths: these have no estimate then.
+    """
 
     model: nn.Module
     renderer: Renderer
@@ -60,13 +63,13 @@ class ModelMethod:
         if self.cameras is not None:
             batch = self.cameras(batch)
         prediction = self.model(batch)
-        gaussians = prediction.gaussians
+        gaussians, depth = prediction.gaussians, prediction.depth
         if self.refinement is not None:
-            gaussians = self.refinement(gaussians, batch)
+            gaussians, depth = self.refinement(gaussians, batch), None
         rendering = self.renderer(gaussians, batch.targets.cameras)
         return Estimate(
             rendering.image,
-            prediction.depth,
+            depth,
             prediction.depth_valid,
             prediction.gaussians.splits,
             not_finite(batch, prediction),

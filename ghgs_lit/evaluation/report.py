@@ -1,6 +1,7 @@
 """A whole evaluation as configured: measures methods, prints means, writes the results of the run."""
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.runs.results import METHOD, Row, metric_names, summarize, write_results
 
+#: Prints a line unless this process has: what one run of a sweep lacks, all lack.
+print_once = cache(print)
 #: Metrics that are printed, with their decimals.
 PRINTED = {"psnr": 2, "psnr_box": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "seconds": 2}
 #: What readers must know about the subjects of a split.
@@ -52,7 +55,7 @@ def measure_and_write(
     targets = target_protocols(config)
     metrics = build(config["metrics"], "metrics").to(device)
     for name, reason in metrics.left_out.items():
-        print(f"{name} is left out: {reason}", flush=True)
+        print_once(f"{name} is left out: {reason}")
     rows = measure_all(
         methods,
         data,

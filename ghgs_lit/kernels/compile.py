@@ -2,11 +2,14 @@
 
 import contextlib
 import hashlib
+import multiprocessing
+import sys
 from functools import cache
 from pathlib import Path
 
 import llvmlite.binding
 import numba
+from numba.core import event
 from numba.core.caching import FunctionCache
 
 # Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
@@ -31,6 +34,23 @@ class _Cache(FunctionCache):
     def save_overload(self, sig, data):
         with contextlib.suppress(OSError):  # such as a full disk: the kernel runs without a file
             super().save_overload(sig, data)
+
+
+class FirstCompilation(event.Listener):
+    """Prints one line when a process compiles for the first time; its workers print none."""
+
+    is_said = multiprocessing.parent_process() is not None
+
+    def on_start(self, event):
+        if not self.is_said:
+            print("compiling kernels for this processor (up to a minute, once) ...", file=sys.stderr)
+        self.is_said = True
+
+    def on_end(self, event):
+        """Nothing to say."""
+
+
+event.register("numba:compile", FirstCompilation())
 
 
 @cache

@@ -28,18 +28,19 @@ class BudgetedModule(L.LightningModule):
     Args:
         model: whose parameters learn; checkpoints hold its tensors.
         optimization: optimizer, schedule and gradient clipping.
-        config: the run's full configuration as plain data; every checkpoint contains it.
+        config: the run's full configuration as plain data, of which ``seed`` is read; every checkpoint has
+            it, beside the nodes of a model that was built of them. None: these alone.
 
     Attributes:
         clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
         used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
     """
 
-    def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any]):
+    def __init__(self, model: nn.Module, optimization: Optimization, config: Mapping[str, Any] | None):
         super().__init__()
         self.model = model
         self.optimization = optimization
-        self.config = config
+        self.config = {**getattr(model, "config", {}), **(config or {})}
         self.used_budget = 0.0
         self.clock = StepClock()
 
@@ -109,4 +110,4 @@ class BudgetedModule(L.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
         checkpoint["format_version"] = FORMAT_VERSION
-        checkpoint["config"] = dict(self.config)
+        checkpoint["config"] = self.config

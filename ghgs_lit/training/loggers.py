@@ -1,6 +1,7 @@
 """Loggers that continue after a restart, and the values that a sweep compares its runs by."""
 
 import importlib.util
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,34 +20,43 @@ COMPARED = ("depth_error_mm", "flip", "lpips", "psnr", "psnr_box", "ssim")
 Value = str | int | float | bool
 
 
-class CsvLog(CSVLogger):
+class _StepsTaken:
+    """Counts steps as checkpoints and pictures do: those taken. Lightning's number of the first one is 0."""
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        super().log_metrics(metrics, None if step is None else step + 1)
+
+
+class CsvLog(_StepsTaken, CSVLogger):
     """Lightning's ``metrics.csv``, continued by a run that resumes in the same folder."""
 
     def resume(self, step: int) -> None:
-        """Keep the rows before ``step``; later steps are trained and written again."""
+        """Keep the rows up to ``step``; later steps are trained and written again."""
         path = Path(self.log_dir) / "metrics.csv"
         rows = []
         if path.is_file():
-            rows = [row for row in read_rows(path) if _is_before(row.get("step"), step)]
-        writer = self.experiment  # begins with an empty file
+            rows = [row for row in read_rows(path) if _is_kept(row.get("step"), step)]
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*will be deleted")  # what is kept is written again
+            writer = self.experiment  # begins with an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()
 
 
-def _is_before(written: str | None, step: int) -> bool:
+def _is_kept(written: str | None, step: int) -> bool:
     """False for the incomplete last line of a killed run, too."""
-    return written is not None and written.isdecimal() and int(written) < step
+    return written is not None and written.isdecimal() and int(written) <= step
 
 
-class TensorBoardLog(TensorBoardLogger):
+class TensorBoardLog(_StepsTaken, TensorBoardLogger):
     """TensorBoard's event files, with the run's row in the HParams tab."""
 
     def resume(self, step: int) -> None:
-        """Tell TensorBoard to drop what was logged at ``step`` and later."""
+        """Tell TensorBoard to drop what was logged after ``step``."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         start = SessionLog(status=SessionLog.START)
-        self.experiment.file_writer.add_event(Event(session_log=start), step)
+        self.experiment.file_writer.add_event(Event(session_log=start), step + 1)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log without the epoch that Lightning adds: runs are counted in steps."""
@@ -65,7 +75,7 @@ class TensorBoardLog(TensorBoardLogger):
         """Log the final numbers and end the session with success."""
         from torch.utils.tensorboard.summary import hparams
 
-        self.log_metrics(dict(results), step)
+        self.log_metrics(dict(results), step - 1)
         _, _, end = hparams({}, {})
         self.experiment.file_writer.add_summary(end)
         self.experiment.flush()
@@ -85,6 +95,10 @@ class TensorBoardOptions(Options):
         return TensorBoardLog(save_dir, name="tensorboard", version="")
 
 
+class WandbLog(_StepsTaken, WandbLogger):
+    """Weights & Biases."""
+
+
 class WandbOptions(Options):
     """Weights & Biases (extra ``wandb``)."""
 
@@ -94,12 +108,12 @@ class WandbOptions(Options):
     offline: bool = False
     """Whether only files are written, for `wandb sync` later."""
 
-    def build(self, save_dir: str) -> WandbLogger:
+    def build(self, save_dir: str) -> WandbLog:
         if importlib.util.find_spec("wandb") is None:
             raise InputError(
                 "logger.wandb: expected the package wandb (pip install 'ghgs-lit[wandb]'); found none"
             )
-        return WandbLogger(project=self.project, offline=self.offline, save_dir=save_dir)
+        return WandbLog(project=self.project, offline=self.offline, save_dir=save_dir)
 
 
 @rank_zero_only
@@ -120,13 +134,13 @@ def log_hyperparameters(loggers: Sequence[Logger], values: Mapping[str, Value]) 
 
 @rank_zero_only
 def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]], step: int) -> None:
-    """Log the numbers of :func:`final_numbers` at ``step``; ``summary`` is that of ``metrics.json``."""
+    """Log :func:`final_numbers` of the weights after ``step``; ``summary`` is that of ``metrics.json``."""
     results = final_numbers(summary)
     for logger in loggers:
         if isinstance(logger, TensorBoardLog):
             logger.log_results(results, step)
         else:
-            logger.log_metrics(results, step)
+            logger.log_metrics(results, step - 1)
             logger.save()
 
 

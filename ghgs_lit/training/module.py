@@ -1,20 +1,25 @@
 """The LightningModule of training: steps and logging calls around the model."""
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.config import build
+from ghgs_lit.errors import require
 from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import depth_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
+from ghgs_lit.model import GHGS
 from ghgs_lit.training.base import BudgetedModule, image_mean
 from ghgs_lit.training.budgets import TokenBudgets, token_budget
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
+from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -43,7 +48,7 @@ class GHGSModule(BudgetedModule):
         renderer: Callable[[Gaussians, Cameras], Rendering],
         losses: Losses,
         optimization: Optimization,
-        config: Mapping[str, Any],
+        config: Mapping[str, Any] | None = None,
         token_budgets: TokenBudgets | None = None,
     ):
         super().__init__(model, optimization, config)
@@ -53,6 +58,28 @@ class GHGSModule(BudgetedModule):
         self.guard = Guard(optimization.skip_nonfinite)
         self.val_psnr, self.val_psnr_box = image_mean(), image_mean()
         model.keeps_drafts = True  # validation shows what each round is worth
+
+    @classmethod
+    def load_from_checkpoint(
+        cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
+    ) -> "GHGSModule":
+        """The module of a checkpoint.
+
+        Args:
+            checkpoint_path: of a run of ``ghgs train``, or of a Trainer of one's own.
+            parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the configuration.
+
+        Raises:
+            InputError: the checkpoint cannot be used, or a part is neither configured nor given.
+        """
+        config = read_checkpoint(checkpoint_path)["config"]
+        groups = {"renderer": "renderer", "losses": "loss", "optimization": "optimizer"}
+        for name in set(groups).difference(parts):
+            group, place = groups[name], f"{checkpoint_path}: config.{groups[name]}"
+            require(group in config, place, f"options of it, or {name}=...", "nothing")
+            parts[name] = build(config[group], group)
+        model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
+        return cls(model.train(), config=config, **parts)
 
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         """The prediction for a batch, and its Gaussians as the batch's target cameras see them."""
@@ -97,10 +124,10 @@ class GHGSModule(BudgetedModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         prediction, rendering = self(batch)
-        image, target = rendering.image.flatten(0, 1), batch.targets.images.flatten(0, 1)
+        image, target = rendering.image.flatten(0, 1).clamp(0, 1), batch.targets.images.flatten(0, 1)
         size, box = len(batch.images), box_of(batch.targets.masks.flatten(0, 1))
-        self.val_psnr.update(psnr(image.clamp(0, 1), target))
-        self.val_psnr_box.update(psnr(image.clamp(0, 1), target, box))
+        self.val_psnr.update(psnr(image, target))
+        self.val_psnr_box.update(psnr(image, target, box))
         self.log("val/psnr", self.val_psnr, prog_bar=True, on_epoch=True, batch_size=size)
         self.log("val/psnr_box", self.val_psnr_box, on_epoch=True, batch_size=size)
         means = {"val/ssim": ssim(image, target).mean(), **self._rounds(batch, prediction)}

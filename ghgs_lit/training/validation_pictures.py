@@ -58,21 +58,13 @@ class _FirstSubjects(Callback):
         raise NotImplementedError
 
 
-def _logged_step(trainer: L.Trainer) -> int:
-    """The step that loggers give this validation's numbers: that of the last batch, counted from 0.
-
-    A run that resumes from the checkpoint after that batch keeps all that was logged up to here.
-    """
-    return trainer.global_step - 1
-
-
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
     """Write ``<run>/pictures/step_<step>/<file>.png`` and log it as ``tag`` where loggers take pictures."""
     step = trainer.global_step
     save_png(picture, Path(trainer.default_root_dir) / "pictures" / f"step_{step:06d}" / f"{file}.png")
     for logger in trainer.loggers:
         if isinstance(logger, TensorBoardLogger):
-            logger.experiment.add_image(tag, picture, _logged_step(trainer), dataformats="HWC")
+            logger.experiment.add_image(tag, picture, step, dataformats="HWC")
         elif isinstance(logger, WandbLogger):
             logger.log_image(tag, [picture])
 
@@ -186,5 +178,5 @@ class PointClouds(_FirstSubjects):
                     positions[None],
                     (255 * colors[None]).byte(),
                     config_dict=CLOUD_VIEW,
-                    global_step=_logged_step(trainer),
+                    global_step=trainer.global_step,
                 )

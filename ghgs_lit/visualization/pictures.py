@@ -131,15 +131,20 @@ def sheet(
 
     Args:
         batch: inputs, and targets where there are renders of them.
-        image: renders of the targets [B, T, 3, h, w] (None: no rows of targets).
+        image: renders of the targets [B, T, 3, h, w], or of the inputs where there are none, which then stand
+            below the inputs with their errors (None: no renders).
         element: index of the subject in the batch.
         depth: predicted depths [B, V, H, W], metres (None: no row of them).
         depth_valid: where they are defined [B, V, H, W] (None: in the masks).
     """
     views = batch.views[element] if batch.views else tuple(map(str, range(batch.images.shape[1])))
     rows = [row([to_uint8(i) for i in batch.images[element]], [f"input {name}" for name in views])]
+    if image is not None and batch.targets is None:
+        pairs = list(zip(image[element], batch.images[element], strict=True))
+        rows.append(row([to_uint8(render) for render, _ in pairs], [f"render {name}" for name in views]))
+        rows.append(row([error_map(*pair) for pair in pairs], [f"error x{ERROR_GAIN:g}"] * len(pairs)))
     rows += _depth_rows(batch, element, depth, depth_valid)
-    if image is None:
+    if image is None or batch.targets is None:
         return stack(rows)
     for t, (render, target) in enumerate(zip(image[element], batch.targets.images[element], strict=True)):
         name = batch.targets.names[element][t] if batch.targets.names else str(t)

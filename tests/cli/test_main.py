@@ -1,6 +1,7 @@
 """The command line: verbs, one-line errors, exit codes, completion."""
 
 import importlib
+import os
 import subprocess
 import sys
 
@@ -10,10 +11,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ghgs_lit.cli import main as cli
+from ghgs_lit.cli.main import discard_unused
 from ghgs_lit.cli.messages import flags_first
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import compose, conf_dir
 from tests.helpers.processes import run_python
+from tests.helpers.verbs import ghgs
 
 
 def call(monkeypatch, capsys, *argv: str) -> tuple[int, str, str]:
@@ -197,3 +200,35 @@ def test_random_numbers_of_a_process_are_those_of_the_seed(monkeypatch, capsys, 
     monkeypatch.setattr("lightning.pytorch.seed_everything", ended)
     with pytest.raises(Seeded, match=r"^5$"):
         call(monkeypatch, capsys, verb, "seed=5", f"hydra.run.dir={tmp_path}")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["predict", "images=nowhere", "cameras=nowhere.json", "out=person"],
+        ["evaluate", "baselines=[hull]", "data=scans", "data.root=nowhere"],
+        ["train", "data=scans", "data.root=nowhere"],
+        ["table", "runs=nowhere"],
+    ],
+)
+def test_a_wrong_path_leaves_no_run(monkeypatch, capsys, tmp_path, arguments):
+    """A list of runs is not full of those that never began."""
+    monkeypatch.chdir(tmp_path)
+    assert ghgs(*arguments, "hydra.run.dir=run") == 1
+    assert "nowhere" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_with_anything_else_stays(monkeypatch, tmp_path):
+    """What was there before, or was trained, is not removed by an error."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").touch()
+    assert ghgs("table", "runs=nowhere", "hydra.run.dir=run") == 1
+    assert (tmp_path / "run" / "notes.txt").is_file()
+    file = tmp_path / "old" / "config.yaml"
+    file.parent.mkdir()
+    file.write_text("print_config: false")
+    os.utime(file, (0, 0))
+    discard_unused(file.parent, "table", 1.0)
+    assert file.is_file()

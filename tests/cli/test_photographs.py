@@ -93,6 +93,28 @@ def test_masks_are_refined_where_asked(here, checkpoint, capsys):
     assert "refine_masks: expected 0 without images=..." in capsys.readouterr().err
 
 
+def test_what_makes_a_prediction_poor_is_said(here, checkpoint, capsys):
+    """Crops that training never showed, too few photographs, and inputs that do not come back."""
+    figure = Figure()
+    cameras = figure.write(here / "images")
+    for name in figure.names[1::2]:
+        next((here / "images").glob(f"{name}.*")).unlink()
+    run = (f"checkpoint={checkpoint}", "formats=[ply]", "turntable.frames=0", "device=cpu", "refine_masks=1")
+    larger = "size: 70 x 70 is larger than the 56 x 56 of the training, .* up to that fit, such as 56, 14"
+    with pytest.warns(UserWarning, match=larger):
+        assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", "size=70", *run) == 0
+    out = capsys.readouterr().out
+    assert "2 photographs leave much unseen: 3 to 5 all around show a person" in out
+    report = json.loads((here / "splat" / "report.json").read_text())
+    low, high = sorted(report["psnr_box_of_inputs"].values())
+    said = (
+        f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly cameras"
+    )
+    assert f"{said} or masks are off (refine_cameras=4 may mend them); sheet.png shows where\n" in out
+    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=other", "size=50", *run) == 1
+    assert "size: expected sides divisible by the patch size 14; found" in capsys.readouterr().err
+
+
 def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, capsys):
     cameras = Figure().write(here / "images" / "000")
     shutil.copytree(here / "images" / "000", here / "images" / "001")

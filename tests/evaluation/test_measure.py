@@ -51,6 +51,19 @@ def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["model_v3_midway_p0.png"]
 
 
+def test_refined_gaussians_have_no_depth_error():
+    """They left the predicted depths: the error of these is not theirs."""
+    batch, drawn = example_batch(), []
+
+    def refinement(gaussians, batch):
+        drawn.append(gaussians)
+        return gaussians
+
+    rows = measure(ModelMethod(Standin(), flat_renderer, refinement), "model", [batch], OFF)
+    assert len(drawn) == 1
+    assert rows[0]["depth_error_mm"] is None
+
+
 def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
     """A perfect render has the capped PSNR, and a method without depth has no depth error."""
     batch = example_batch()

@@ -5,10 +5,13 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import numba
 import pytest
+from numba.core import event
 
 import ghgs_lit
 from ghgs_lit.kernels import compile
+from ghgs_lit.kernels.compile import FirstCompilation
 
 PACKAGE = Path(ghgs_lit.__file__).parent
 ROOMS = sorted(
@@ -79,3 +82,17 @@ def test_the_key_covers_all_that_kernels_read(room, monkeypatch):
         compile._digest.cache_clear()
         assert compile._digest(room) != before, file
     compile._digest.cache_clear()
+
+
+def test_the_first_compilation_says_so(capsys, monkeypatch):
+    """A first prediction that compiles for a minute must not look as if it hung; workers say nothing."""
+    numba.njit(lambda x: x)(1)  # the listener of this process has spoken
+    capsys.readouterr()
+    with event.install_listener("numba:compile", FirstCompilation()):
+        for number in range(2):
+            numba.njit(lambda x, y=number: x + y)(1)
+    assert capsys.readouterr().err.count("compiling kernels for this processor") == 1
+    monkeypatch.setattr(FirstCompilation, "is_said", True)  # as in the processes of a pool
+    with event.install_listener("numba:compile", FirstCompilation()):
+        numba.njit(lambda x: x - 1)(1)
+    assert "compiling" not in capsys.readouterr().err

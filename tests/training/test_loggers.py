@@ -97,11 +97,11 @@ def test_tags_are_grouped_by_what_they_are(run):
 
 
 def test_the_numbers_are_those_of_the_steps(run):
-    """Values are logged at their own steps, and the parts of a step add up to its time."""
+    """Values are logged at the steps taken, and the parts of a step add up to its time."""
     found = events(run[0] / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
-    assert sorted(rates) == [1, 3, 5, 7]
-    assert rates[7] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
+    assert sorted(rates) == [2, 4, 6, 8]
+    assert rates[8] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
     assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
     parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("time_ms/") and "step" not in tag]
     for place, whole in enumerate(found.Scalars("time_ms/step")):
@@ -114,7 +114,9 @@ def test_pictures_and_clouds(run):
     folder, _ = run
     found = events(folder / "tensorboard")
     steps = [e.step for e in found.Scalars("val/psnr")]
-    assert [e.step for e in found.Images("sheet/p0")] == steps == [3, 7]
+    assert [e.step for e in found.Images("sheet/p0")] == steps == [4, 8]
+    assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["step_000004", "step_000008"]
+    assert [e.step for e in found.Scalars("hparam/psnr")] == [8]
     clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
     kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
     assert {"points", "body", "points_and_body"} <= {kind.rstrip("_") for kind in kinds}
@@ -162,7 +164,8 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
     assert [float(row["a"]) for row in rows] == expected
     assert [row["b"] for row in rows] == ["", "1", "", "1", "", "1", "", ""]
     scalars = events(tmp_path / "tensorboard").Scalars("a")
-    assert [(e.step, e.value) for e in scalars] == list(enumerate(expected))
+    assert [(e.step, e.value) for e in scalars] == list(enumerate(expected, 1))
+    assert [int(row["step"]) for row in rows] == list(range(1, 9))
 
 
 def test_runs_of_a_sweep_leave_no_threads(tmp_path):

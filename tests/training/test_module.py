@@ -1,5 +1,6 @@
 """The LightningModule, its schedule, checkpoints and callbacks, with a stand-in for the model."""
 
+import dataclasses
 import re
 from datetime import timedelta
 from types import SimpleNamespace
@@ -13,15 +14,21 @@ from lightning.pytorch.plugins.precision import MixedPrecision
 from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
+from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
+from ghgs_lit.metrics.functional import psnr, ssim
+from ghgs_lit.model import GHGS
 from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import RunProgress, StepTime
 from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
 from ghgs_lit.training.trainer import require_whole_parameters
 from ghgs_lit.training.validation_pictures import Pictures
-from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+from ghgs_lit.types import Targets
+from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
 from tests.helpers.losses import losses_of
+from tests.helpers.models import config, make_model
+from tests.helpers.scenes import make_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer, infinitely_steep
 
 RELEASE = Optimization(lr=1e-4, warmup=0.01, end_factor=5e-4)
@@ -320,3 +327,53 @@ def test_two_seeds_of_training_differ_and_one_repeats(tmp_path):
         trainer(tmp_path, 2, [Curve()], limit_val_batches=0).fit(subject, loader())
     assert curves[0] == curves[1]
     assert all(one != other for one, other in zip(curves[1], curves[2], strict=True))
+
+
+def test_validation_measures_clamped_renders(tmp_path):
+    """PSNR and SSIM are of the pictures that are seen, as `ghgs evaluate` measures them."""
+
+    def brighter(gaussians, cameras, by=3.0):
+        drawn = flat_renderer(gaussians, cameras)
+        pattern = torch.linspace(-1, by, drawn.image.shape[-1])
+        return dataclasses.replace(drawn, image=drawn.image + pattern)
+
+    subject, batch = module(brighter), example_batch()
+    run = trainer(tmp_path, steps=1)
+    (found,) = run.validate(
+        subject, DataLoader([batch], batch_size=None, collate_fn=lambda b: b), verbose=False
+    )
+    image, target = subject(batch)[1].image.clamp(0, 1).flatten(0, 1), batch.targets.images.flatten(0, 1)
+    assert found["val/ssim"] == pytest.approx(float(ssim(image, target).mean()), rel=1e-4)
+    assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
+
+
+def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
+    """Its checkpoint rebuilds the model and, with the parts that no configuration describes, the module."""
+    parts = {"losses": losses_of({"render_l1": 1.0}), "optimization": Optimization(lr=1e-3)}
+    subject = GHGSModule(make_model(), flat_renderer, **parts)
+    batch = make_batch(1, 3, 42, 42)
+    photographs = Targets(batch.images[:, :1], batch.masks[:, :1], batch.cameras[:, :1])
+    batches = DataLoader([dataclasses.replace(batch, targets=photographs)], None, collate_fn=lambda b: b)
+    run = trainer(tmp_path, steps=1)
+    run.fit(subject, batches)
+    run.save_checkpoint(tmp_path / "mine.ckpt")
+    with pytest.raises(InputError, match=r"mine\.ckpt: config\.renderer: expected options of it, or"):
+        GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt")
+    again = GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt", renderer=flat_renderer, **parts)
+    assert again.model.training
+    assert again.config == subject.config
+    for model in (again.model, GHGS.from_checkpoint(tmp_path / "mine.ckpt")):
+        for name, value in subject.model.state_dict().items():
+            assert torch.equal(model.state_dict()[name], value), name
+
+
+def test_the_module_of_a_run_is_read_with_its_parts(tmp_path):
+    """Losses, optimizer and renderer are those of the run's configuration."""
+    names = ("renderer", "loss", "optimizer")
+    nodes = resolve(compose("train", ["loss.weights.depth=0.25", "optimizer.lr=0.003"]))
+    whole = {**config(), **{name: nodes[name] for name in names}, "seed": 7}
+    write_checkpoint(tmp_path / "last.ckpt", make_model().state_dict(), whole)
+    module = GHGSModule.load_from_checkpoint(tmp_path / "last.ckpt")
+    assert module.losses.weights.depth == 0.25
+    assert module.optimization.lr == 0.003
+    assert module.config["seed"] == 7

@@ -39,7 +39,7 @@ class TableOptions:
         reported: whether the paper's figures are shown.
         test: the test against the reference row.
         unit: a regular expression whose first group is the person, where subjects are frames of people.
-        illustration: whether a note says that the numbers are no result.
+        illustration: whether a note says that the numbers are no result, of which none is bold.
     """
 
     layout: Layout
@@ -118,8 +118,8 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
     stub = ("3D Unproj.", "Semantic Cons.") if layout.rows == "ablation" else ("Methods",)
     on = reported_table(reported)[0] if reported else None
     table = Table(layout, rows, planned, stub, groups, metrics, lines, reported_on=on)
-    fill(table, figures, options.test, options.unit, sweep.configs)
-    table.caption = write_caption(table)
+    fill(table, figures, options.test, options.unit, sweep.configs, options.illustration)
+    table.caption = write_caption(table, options.illustration)
     table.notes = write_notes(table, options.test, sweep.configs, options.illustration)
     return table
 

@@ -25,6 +25,7 @@ def fill(
     test: PairedTest,
     unit: re.Pattern[str] | None,
     configs: Configs,
+    illustration: bool = False,
 ) -> None:
     """Fill ``table.cells``.
 
@@ -34,6 +35,7 @@ def fill(
         test: the test against the reference row.
         unit: tells persons of subjects, as for :func:`person_of`.
         configs: configurations by file, for messages.
+        illustration: nothing is best: the numbers are no result.
 
     Raises:
         InputError: two runs claim one cell with different numbers.
@@ -58,7 +60,7 @@ def fill(
     table.cells["mean"] = table.cells["mean"].fillna(reported["mean"])
     table.cells["lacking"] = [_lacking(table, cell) for cell in table.cells.itertuples()]
     table.cells["best"] = False
-    for column in product(*_columns(table)):
+    for column in [] if illustration else product(*_columns(table)):
         _mark_best(table, column)
     table.cells["test"], table.cells["marked"] = None, False
     if test.against != "none":
@@ -132,12 +134,20 @@ def _competing(table: Table, column: tuple) -> pd.Series:
 
 
 def _mark_best(table: Table, column: tuple) -> None:
-    """Mark the best means of a column, as printed; none where all are equal or no direction is better."""
+    """Mark the best means of a column, as printed.
+
+    None where all are equal, no direction is better, or the best is ahead of the next by no more than the
+    deviation over seeds of one of both.
+    """
     means = _competing(table, column).round(decimals(column[1]))
-    if means.nunique() > 1 and arrow(column[1]):
-        best = means.min() if arrow(column[1]) == "↓" else means.max()
-        for line in means.index[means == best]:
-            table.cells.loc[(line, *column), "best"] = True
+    if means.nunique() < 2 or not arrow(column[1]):
+        return
+    means = means.sort_values(ascending=arrow(column[1]) == "↓")
+    deviations = table.cells["deviation"].xs(column, level=CELL[1:])[means.index[:2]]
+    if abs(means.iloc[0] - means.iloc[1]) <= deviations.max():  # false where there is none
+        return
+    for line in means.index[means == means.iloc[0]]:
+        table.cells.loc[(line, *column), "best"] = True
 
 
 def _by_person(values: pd.DataFrame, unit: re.Pattern[str] | None) -> pd.DataFrame:

@@ -18,11 +18,14 @@ FOOTNOTE = (
     " points: neighbours are then found on the image plane."
 )
 NO_SEMANTICS = "features carry no semantics: this encoder was never trained for semantics"
-ILLUSTRATION = "This is an illustration of the framework on a small model, not a result."
+ILLUSTRATION = (
+    "This is an illustration of the framework on a small model, not a result: rows of such short trainings"
+    " are equal but for chance, and none is bold."
+)
 MARK = "*"
 
 
-def write_caption(table: Table) -> str:
+def write_caption(table: Table, illustration: bool = False) -> str:
     """Data, protocol, model and number of runs, in one line."""
     first, names = table.rows.iloc[0], dict.fromkeys(table.rows["data"])
     measured = table.measured
@@ -41,7 +44,9 @@ def write_caption(table: Table) -> str:
     if table.layout.heading != "views" and len(views) == 1:
         said.append(f"{views.pop()} input views")
     spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
-    return f"{', '.join(said)}; mean over subjects{spread}, best of the measured methods in bold."
+    clear = " where it leads by more than the deviation" if seeds > 1 else ""
+    best = "" if illustration else f", best of the measured methods in bold{clear}"
+    return f"{', '.join(said)}; mean over subjects{spread}{best}."
 
 
 def write_notes(

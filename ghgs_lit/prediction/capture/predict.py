@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,8 +17,9 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED, file_of
@@ -33,6 +35,7 @@ class TimedPrediction:
         seconds: run time by stage.
         moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
         changed: which share of the subject refining changed in each crop; nothing where masks stay.
+        refined: what refining the Gaussians gained; None where they are as predicted. Depths stay.
     """
 
     batch: Batch
@@ -40,6 +43,7 @@ class TimedPrediction:
     seconds: dict[str, float] = field(default_factory=dict)
     moved: tuple[float, ...] = ()
     changed: tuple[float, ...] = ()
+    refined: Report | None = None
 
     @property
     def gaussians(self) -> Gaussians:
@@ -53,6 +57,8 @@ def predict(
     size: int | tuple[int, int] | None = None,
     refine_cameras: int = 0,
     refine_masks: int = 0,
+    refine: int = 0,
+    renderer: Renderer | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a capture.
 
@@ -66,14 +72,16 @@ def predict(
             (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
         refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then searched in the
             photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
+        refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
+        renderer: what refining draws with; None: that of the device.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
     """
     if not isinstance(model, GHGS):
         path = file_of(model)
-        size = size or trained_size(read_checkpoint(path)["config"])
         model = _model(path, path.stat().st_mtime_ns)
+        size = crop_size(size, read_checkpoint(path)["config"], model)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
     seconds: dict[str, float] = {}
     batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
@@ -84,7 +92,7 @@ def predict(
         frame = Frame.of(batch)
         return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
 
-    result = predict_batch(batch, model, Renderer(), refine_cameras, in_frame)
+    result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, in_frame)
     return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed)
 
 
@@ -93,6 +101,7 @@ def predict_batch(
     model: GHGS,
     renderer: Renderer,
     refine_cameras: int = 0,
+    refine: int = 0,
     forward: Callable[[Batch], Prediction] | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a batch of one subject, which keeps its targets.
@@ -100,21 +109,29 @@ def predict_batch(
     Args:
         batch: photographs, masks and cameras.
         model: on the device of the batch.
-        renderer: draws what :class:`CameraRefinement` compares.
-        refine_cameras: its rounds, at most; 0: none.
+        renderer: draws what :class:`CameraRefinement` and :class:`Refinement` compare.
+        refine_cameras: rounds of the one, at most; 0: none.
+        refine: steps of the other; 0: none.
         forward: the prediction of a batch without targets; None: the model's.
     """
-    moved, seconds, start = (), {}, time.perf_counter()
+    forward, moved, seconds, start = forward or model, (), {}, time.perf_counter()
     if refine_cameras:
         given, batch = batch, CameraRefinement(refine_cameras, model, renderer)(batch)
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
-    prediction = (forward or model)(dataclasses.replace(batch, targets=None))
+    prediction = forward(dataclasses.replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
-    return TimedPrediction(batch, prediction, seconds, moved)
+    refined = None
+    if refine:
+        refinement, before, start = Refinement(refine, renderer), prediction.gaussians, time.perf_counter()
+        prediction = dataclasses.replace(prediction, gaussians=refinement(before, batch))
+        seconds["refine"] = time.perf_counter() - start
+        untold = dataclasses.replace(batch, targets=None)
+        refined = refinement.report(before, prediction.gaussians, untold, lambda b: forward(b).gaussians)
+    return TimedPrediction(batch, prediction, seconds, moved, refined=refined)
 
 
 def _crops(
@@ -139,6 +156,29 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
     Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
     """
     return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
+
+
+def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
+    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained.
+
+    Larger ones give a warning: they make results worse, not sharper.
+
+    Raises:
+        InputError: the model cannot take this size.
+    """
+    trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
+    height, width = trained if size is None else image_size("size", size)
+    multiple = side_multiple(model.options, patch)
+    expected = f"sides divisible by the patch size {multiple}"
+    require(height % multiple == width % multiple == 0, "size", expected, (height, width))
+    if height > trained[0] or width > trained[1]:
+        below = ", ".join(str(n * patch) for n in range(max(trained) // patch, 0, -3)[:3])
+        warnings.warn(
+            f"size: {height} x {width} is larger than the {trained[0]} x {trained[1]} of the training, which"
+            f" makes results worse, not sharper; multiples of {patch} up to that fit, such as {below}",
+            stacklevel=3,
+        )
+    return height, width
 
 
 @functools.lru_cache(maxsize=1)

@@ -35,7 +35,7 @@ _GROUPS = {
 }
 
 
-def write_ply(gaussians: Gaussians, path: Path) -> None:
+def write_ply(gaussians: Gaussians, path: str | Path) -> None:
     """Write the Gaussians of one subject (RGB colours).
 
     Raises:

@@ -179,7 +179,8 @@ def write_prediction(
 
     Args:
         directory: files that an earlier prediction wrote are replaced, others stay.
-        batch: photographs, masks and cameras of the subject; the sheet compares renders with targets, too.
+        batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets,
+            or with the photographs where it has none.
         prediction: of this batch.
         renderer: draws the turntable, and the input views for the report.
         options: the formats and the frame.
@@ -210,7 +211,8 @@ def write_prediction(
         for file, content in zip(names, FORMATS[name].contents(subject), strict=True):
             write(file, content)
         seconds[f"write {name}"] = time.perf_counter() - begin
-    image = None if batch.targets is None else renderer(prediction.gaussians, batch.targets.cameras).image
+    seen = batch.cameras if batch.targets is None else batch.targets.cameras
+    image = renderer(prediction.gaussians, seen).image
     write("sheet.png", png(sheet(batch, image, 0, prediction.depth, prediction.depth_valid)))
     facts = dict(facts or {})
     report = {**_report(subject), **facts, "seconds": {**facts.get("seconds", {}), **seconds}}

@@ -2,8 +2,8 @@
 
 A prediction is near enough that a few steps suffice, and every change is bounded, so that what no photograph
 shows stays as predicted. Photographs that are reproduced say nothing of other views (with wrong geometry they
-are reproduced, too), so :meth:`Refinement.report` holds one out. To stop where that one is best was worse
-than a fixed number of steps: fewer inputs want fewer steps.
+are reproduced, too), so :meth:`Refinement.report` holds one out and predicts again from the others. To stop
+where that one is best was worse than a fixed number of steps: fewer inputs want fewer steps.
 """
 
 import dataclasses
@@ -21,6 +21,7 @@ from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
+Predict = Callable[[Batch], Gaussians]
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ BeforeAfter = tuple[float, float]
 
 @dataclass(frozen=True)
 class Report:
-    """PSNR in dB before and after: of the inputs, and of one that was held out (of three or more)."""
+    """PSNR in dB before and after: of the inputs, and of one that the others predicted (of four or more)."""
 
     steps: int
     inputs: BeforeAfter
@@ -57,7 +58,7 @@ class Report:
         line = f"refine: {self.steps} steps; inputs {{:.2f}} -> {{:.2f}} dB".format(*self.inputs)
         if self.held_out is None:
             return line
-        return line + "; an input held out {:.2f} -> {:.2f} dB".format(*self.held_out)
+        return line + "; an input held out, from the others, {:.2f} -> {:.2f} dB".format(*self.held_out)
 
 
 class Refinement:
@@ -126,21 +127,23 @@ class Refinement:
             changed["opacities"] = torch.sigmoid(logit + change["opacities"])
         return dataclasses.replace(gaussians, **changed)
 
-    def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch) -> Report:
-        """The gain of a refinement; holding out the last input takes as long as the refinement.
+    def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Predict) -> Report:
+        """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
 
         Args:
             gaussians, refined: before and after.
             batch: one element, of which they were predicted.
+            predict: the Gaussians of a batch, here of the inputs without the last: of fewer than four none
+                is held out, since two show too little of a person.
         """
         views = list(range(batch.images.shape[1]))
         inputs = tuple(self._psnr(splats, batch, views) for splats in (gaussians, refined))
         held_out = None
-        if len(views) > 2:
+        if len(views) > 3:
             *seen, hidden = views
-            kept = gaussians.image != hidden
-            others = gaussians.select(kept, (int(kept.sum()),))
-            both = others, self(others, batch, seen)
+            others = batch.of_views(seen)
+            predicted = predict(others)
+            both = predicted, self(predicted, others)
             held_out = tuple(self._psnr(splats, batch, [hidden]) for splats in both)
         return Report(self.steps, inputs, held_out)
 
@@ -153,8 +156,8 @@ class Refinement:
 
 def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
     """Photographs on black, masks and cameras of some views."""
-    views = list(views)
-    return on_black(batch)[:, views], coverage(batch)[:, views, None], batch.cameras[:, views]
+    part = batch.of_views(views)
+    return on_black(part), coverage(part)[:, :, None], part.cameras
 
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:

@@ -43,6 +43,29 @@ def test_several_seeds_give_a_deviation(tmp_path):
     assert "3 seeds" in table.caption
 
 
+@pytest.mark.parametrize(("lead", "is_bold"), [(0.9, False), (1.2, True)])
+def test_only_a_lead_beyond_the_deviation_is_bold(tmp_path, lead, is_bold):
+    """Other seeds would have put the rows in another order."""
+    for seed, shift in ((1, -1.0), (2, 0.0), (3, 1.0)):
+        write_run(tmp_path / f"a{seed}", "full", 20.0 + shift + lead, seed=seed)
+        write_run(tmp_path / f"b{seed}", "neither", 20.0 + shift / 4, seed=seed)
+        write_run(tmp_path / f"c{seed}", "no_semantic", 10.0 + 5 * shift, seed=seed)
+    (table,) = tables_of(tmp_path, views=(4,), metrics=("psnr",))
+    assert [i for (i, *_), best in table.cells["best"].items() if best] == [3] * is_bold
+    assert "in bold where it leads by more than the deviation" in table.caption
+
+
+def test_an_illustration_has_nothing_in_bold(tmp_path):
+    """Its rows are equal but for chance, which one seed cannot show."""
+    for name, psnr in (("full", 20.0), ("neither", 20.05)):
+        write_run(tmp_path / name, name, psnr)
+    shown, result = (tables_of(tmp_path, illustration=which)[0] for which in (True, False))
+    assert not shown.cells["best"].any()
+    assert result.cells["best"].any()
+    assert "bold" not in shown.caption
+    assert "equal but for chance" in shown.notes[0]
+
+
 def test_a_lower_metric_is_better_and_any_metric_can_be_a_column(tmp_path):
     """The best LPIPS is the lowest, and columns can be chosen."""
     write_run(tmp_path / "0", "full", 20.0, lpips=0.05)

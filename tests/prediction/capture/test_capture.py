@@ -10,11 +10,16 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from ghgs_lit import Capture, predict
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.mattes import on_black
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
+from ghgs_lit.metrics.functional import psnr
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.masks import matte_of_file
 from ghgs_lit.prediction.capture.photographs import Pixels
+from ghgs_lit.prediction.refinement import Refinement
+from ghgs_lit.rendering import Renderer
 from tests.helpers.figures import PARTS, Figure
 from tests.helpers.models import make_model
 from tests.helpers.rigs import SIZE, opencv_pixels, rig
@@ -75,6 +80,23 @@ def test_figurines_and_statues_are_predicted_alike(tmp_path, scale, origin):
     assert camera.centers.double().numpy() == pytest.approx(
         _center(other.photographs[0]), rel=1e-4, abs=1e-3 * scale
     )
+
+
+def test_python_refines_as_the_command_line_does(tmp_path):
+    """All that brings a prediction nearer to the photographs can be asked for, and says what it gained."""
+    capture, model = Capture.read(tmp_path, Figure().write(tmp_path)), make_model("model=hull").eval()
+    plain, refined = (predict(capture, model, 28, refine=steps) for steps in (0, 2))
+    assert plain.refined is None
+    expected = Refinement(2, Renderer())(plain.gaussians, plain.batch)
+    assert torch.equal(refined.gaussians.means, expected.means)
+    before, after = refined.refined.inputs
+    assert after > before
+    others = plain.batch.of_views(range(plain.batch.images.shape[1] - 1))
+    frame = Frame.of(others)
+    alone = frame.leave(model(frame.enter(others)), others.cameras.extrinsics.dtype).gaussians
+    hidden = plain.batch.of_views([plain.batch.images.shape[1] - 1])
+    drawn = Renderer()(alone, hidden.cameras).image[0].clamp(0, 1)
+    assert refined.refined.held_out[0] == pytest.approx(float(psnr(drawn, on_black(hidden)[0])), abs=1e-3)
 
 
 def _center(photograph):

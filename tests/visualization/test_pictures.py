@@ -1,0 +1,23 @@
+"""Sheets: what stands in which row."""
+
+import dataclasses
+
+import numpy as np
+
+from ghgs_lit.visualization.pictures import sheet, to_uint8
+from tests.helpers.scenes import make_batch
+
+
+def test_renders_stand_below_the_photographs_where_there_are_no_targets():
+    """Of photographs of one's own, too, the sheet shows what came back of them, and the error."""
+    batch = dataclasses.replace(make_batch(1, 3, 28, 42), depths=None, targets=None)
+    renders = batch.images.flip(-1)
+    alone, picture = sheet(batch, None), sheet(batch, renders)
+    height, gap = len(alone), 2
+    assert picture.shape == (3 * height, alone.shape[1], 3)
+    assert np.array_equal(picture[:height], alone)
+    for view in range(3):
+        tile = picture[2 * height - gap - 28 : 2 * height - gap, view * 44 : view * 44 + 42]
+        assert np.array_equal(tile, to_uint8(renders[0, view]))
+    error = picture[3 * height - gap - 28 : 3 * height - gap, :42].astype(int).sum(-1)
+    assert (error[(renders - batch.images)[0, 0].abs().sum(0) == 0] == error.min()).all()
