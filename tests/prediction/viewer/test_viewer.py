@@ -168,5 +168,5 @@ def test_the_viewer_opens_nothing_outside_its_folder(directory, tmp_path, name):
     if name != "link":  # names of two folders keep them
         cameras["cameras"]["other/outside"] = cameras["cameras"].pop(second)
     (folder / "cameras.json").write_text(json.dumps(cameras))
-    with pytest.raises(InputError, match=r"\.png: expected the photograph of camera .* in this folder"):
+    with pytest.raises(InputError, match=r"\.png: expected the photograph of camera"):
         read_content(folder, None)
