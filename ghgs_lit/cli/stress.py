@@ -9,8 +9,9 @@ from ghgs_lit.cli.inputs import choices
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.diagnostics.output import pivoted, print_tables
 from ghgs_lit.diagnostics.stress import report
-from ghgs_lit.diagnostics.stress.run import processes, run_tasks, tasks_of
+from ghgs_lit.diagnostics.stress.run import run_tasks, tasks_of
 from ghgs_lit.errors import require
+from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.training.replay import replay
 
@@ -23,7 +24,8 @@ def run(cfg: DictConfig) -> None:
         return _replay(config["dump"])
     tasks = tasks_of(config["stages"], config["families"], config["dtypes"], config["quick"])
     require(bool(tasks), "families", "a family that one of the stages has", config["families"])
-    rows = run_tasks(tasks, directory / "cells.jsonl", processes(config["workers"]))
+    workers = allowed_cores() if config["workers"] is None else config["workers"]
+    rows = run_tasks(tasks, directory / "cells.jsonl", workers)
     _print(rows)
     source = provenance(config, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))

@@ -14,7 +14,6 @@ from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.stage import DTYPES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
-from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.progress import track
 
@@ -98,8 +97,3 @@ def _mapping(workers: int) -> Iterator[Callable[..., Iterator]]:
         yield pool.map
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def processes(workers: int | None) -> int:
-    """``workers``, or one for each processor of this process."""
-    return allowed_cores() if workers is None else workers
