@@ -53,13 +53,8 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu", whole: bool = F
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
     _check_content(path, checkpoint)
     if whole and "digest" in checkpoint:
-        written, found = (
-            checkpoint["digest"],
-            content_digest(open_file(path)),
-        )  # closed after it: it is memory
-        require(
-            found == written, f"{path}: digest", f"{str(written)[:12]}..., as written", f"{found[:12]}..."
-        )
+        found, written = content_digest(open_file(path)), str(checkpoint["digest"])
+        require(found == written, f"{path}: digest", f"{written[:12]}..., as written", f"{found[:12]}...")
     elif whole:
         _check_sums(path, tensors=True)
     return dict(checkpoint)
