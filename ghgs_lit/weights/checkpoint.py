@@ -53,7 +53,8 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu", whole: bool = F
         raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
     _check_content(path, checkpoint)
     if whole and "digest" in checkpoint:
-        _check_digest(path, checkpoint["digest"])
+        found, written = content_digest(open_file(path)), str(checkpoint["digest"])
+        require(found == written, f"{path}: digest", f"{written[:12]}..., as written", f"{found[:12]}...")
     elif whole:
         _check_sums(path, tensors=True)
     return dict(checkpoint)
@@ -63,13 +64,8 @@ def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
     """Refuse nodes and tensors of kinds that no checkpoint has; what a node says is checked where it acts."""
     for name, node in checkpoint["config"].items():
         require(isinstance(name, str), f"{path}: config", "keys of text", name)
-        expected = "a mapping of its keys"
-        require(
-            name not in KINDS or node is None or isinstance(node, Mapping),
-            f"{path}: config.{name}",
-            expected,
-            node,
-        )
+        fits = name not in KINDS or node is None or isinstance(node, Mapping)
+        require(fits, f"{path}: config.{name}", "a mapping of its keys", node)
     for name, value in checkpoint["state_dict"].items():
         require(isinstance(name, str), f"{path}: state_dict", "names of tensors", name)
         if isinstance(value, Tensor):
@@ -92,12 +88,6 @@ def _check_sums(path: str | Path, tensors: bool) -> None:
                             pass
     except (zipfile.BadZipFile, EOFError, RuntimeError) as error:
         raise InputError(f"{path}: expected the bytes that were written; found others ({error})") from error
-
-
-def _check_digest(path: str | Path, digest: str) -> None:
-    """Refuse a file whose content, but for the configuration, is not that of its ``digest``."""
-    found = content_digest(open_file(path))  # a mapping of its own: pages that were read count as memory
-    require(found == digest, f"{path}: digest", f"{str(digest)[:12]}..., as written", f"{found[:12]}...")
 
 
 def content_digest(checkpoint: Mapping[str, Any]) -> str:

@@ -3,11 +3,12 @@
 import contextlib
 import logging
 import math
+import re
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -31,22 +32,14 @@ def _require_address(host: str) -> None:
 
 
 @contextlib.contextmanager
-def _own_pages_only() -> Iterator[None]:
-    """Let servers that begin meanwhile refuse pages of other sites: viser takes requests of any origin."""
+def _own_pages_only(host: str) -> Iterator[None]:
+    """Let servers that begin meanwhile refuse pages of other sites; viser would take those of any origin."""
     from websockets.asyncio import server
 
-    serve = server.serve
-
-    def strict(*arguments: Any, process_request: Callable, **options: Any) -> Any:
-        def checked(connection: Any, request: Any) -> Any:
-            origin = request.headers.get("Origin")
-            if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
-                return connection.respond(403, "expected a request of this page\n")
-            return process_request(connection, request)
-
-        return serve(*arguments, process_request=checked, **options)
-
-    server.serve = strict
+    serve, names = server.serve, "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
+    # Who opens it to the network has visitors by any name of this machine.
+    names = ".+" if host in ("0.0.0.0", "::") else names
+    server.serve = partial(serve, origins=[None, re.compile(rf"https?://({names})(:\d+)?")])
     try:
         yield
     finally:
@@ -76,7 +69,7 @@ class Viewer:
         self.content = content
         self._lock = threading.Lock()  # controls are answered by several threads
         logging.getLogger("websockets").setLevel(logging.WARNING)  # a line for each visitor otherwise
-        with _own_pages_only():
+        with _own_pages_only(host):
             self.server = viser.ViserServer(host, port, label="ghgs", verbose=False)
         self.server.scene.set_up_direction(content.up.numpy())
         self._prepare()
