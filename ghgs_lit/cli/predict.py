@@ -95,9 +95,9 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     renderer, model = build_renderer(config, device), load_model(config, device)
     data = build_data(config)
     check_size(data, model)
+    write_config(config, directory)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    write_config(config, directory)
     result = predict_batch(batch, model, renderer, config["refine_cameras"], config["refine"])
     write_result(directory, result, model, renderer, config, options)
 
