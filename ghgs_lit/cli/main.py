@@ -100,7 +100,8 @@ def usage() -> str:
 def discard_unused(directory: Path, verb: str, since: float) -> None:
     """Remove a run's directory that holds only how the run began, all of it written after ``since``."""
     begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
-    if all(path.name in begun and path.stat().st_mtime >= since for path in directory.iterdir()):
+    paths = [] if directory == Path.cwd() else list(directory.glob("*"))
+    if paths and all(path.name in begun and path.stat().st_mtime >= since for path in paths):
         shutil.rmtree(directory, ignore_errors=True)
 
 
