@@ -94,7 +94,8 @@ def test_a_stage_that_is_no_mapping_is_named(composed, tmp_path):
     """A checkpoint of another program must not end in a traceback."""
     path = str(tmp_path / "b.ckpt")
     write_checkpoint(path, {}, {**config(), "encoder": "vggt_nano"})
-    with pytest.raises(InputError, match=r"b\.ckpt: config\.encoder: expected a mapping of its keys; found 'vggt_nano'"):
+    said = r"b\.ckpt: config\.encoder: expected a mapping of its keys; found 'vggt_nano'"
+    with pytest.raises(InputError, match=said):
         inputs.model_of(path, composed("evaluate", f"checkpoint={path}", "encoder.width=3"))
 
 
