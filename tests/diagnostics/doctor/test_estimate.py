@@ -54,8 +54,9 @@ def test_keys_that_save_memory_do():
     """Checkpointing, half precision, fewer tokens and a smaller batch each lower the peak of a step."""
     config = resolve(compose("train", [*TINY, "model=paper", "loss=depth"]))
 
-    def peak(scene=SCENE, precision="float32", **encoder):
+    def peak(scene=SCENE, precision="float32", tokens="all", **encoder):
         changed = {**config, "encoder": {**config["encoder"], **encoder}}
+        changed["skip"] = {**config["skip"], "tokens": tokens}
         return estimate(changed, scene, "cuda", precision, training=True).bytes
 
     whole = peak()
