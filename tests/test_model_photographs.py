@@ -108,6 +108,6 @@ def test_photographs_of_any_size_keep_their_mattes():
 def test_an_impossible_matte_is_refused():
     """More than a half would leave pixels of the mask without Gaussians."""
     with pytest.raises(
-        InputError, match=r"model\.matte: expected null or a share of at most a half; found 0\.7"
+        InputError, match=r"model\.matte: expected a number >= 0 and <= 0\.5 or null; found 0\.7"
     ):
         make_model("model=hull", "model.matte=0.7")

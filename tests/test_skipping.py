@@ -70,8 +70,8 @@ def test_budget_and_margin_count(said, expected):
     assert ("not balanced: may lose" in line) == ("balanced" not in expected)
     # Nobody has measured these weights: what a preset loses is what its file says.
     unsure = [name for name in ("balanced", "fast") if name in expected]
-    said = f"what {' and '.join(unsure)} may lose is configured, `ghgs benchmark` measures it"
-    assert (said in line) == bool(unsure)
+    note = f"what {' and '.join(unsure)} may lose is configured, `ghgs benchmark` measures it"
+    assert (note in line) == bool(unsure)
     for b, name in enumerate(expected):
         own = make_model(f"skip={name}", *(key for key in said if key == "skip.margin=0")).encoder
         assert torch.equal(kept[b], own.keeps(masks)[b])

@@ -72,7 +72,7 @@ def _words(annotation: Any, metadata: Iterable[Any] = ()) -> str:
             return item.text
     origin, args = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
-        return " or ".join(_words(arg) for arg in args)
+        return " or ".join(_words(arg, () if arg is type(None) else metadata) for arg in args)
     if origin is Literal:
         return "one of " * (len(args) > 1) + ", ".join(map(str, args))
     if origin is tuple:

@@ -57,7 +57,7 @@ def _terms(v: Values) -> Tensor:
 
 
 def _metrics(v: Values) -> Values:
-    flip = flip_map(v["image"], v["target"], 8.0).flatten(1).mean(1)
+    flip = flip_map(v["image"], v["target"]).flatten(1).mean(1)
     return {"psnr": psnr(v["image"], v["target"]), "flip": flip}
 
 
