@@ -32,6 +32,7 @@ def release_switches() -> dict[tuple[str, ...], Any]:
         for group, values in node.items()
         if group not in ("defaults", "compat")
         for key, value in values.items()
+        if key != "defaults"
     }
 
 

@@ -357,7 +357,7 @@ def test_a_trainer_of_ones_own_needs_no_configuration(tmp_path):
     run = trainer(tmp_path, steps=1)
     run.fit(subject, batches)
     run.save_checkpoint(tmp_path / "mine.ckpt")
-    with pytest.raises(InputError, match=r"mine\.ckpt: config\.renderer: expected options of it, or"):
+    with pytest.raises(InputError, match=r"mine\.ckpt: config\.loss: expected options of it, or"):
         GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt")
     again = GHGSModule.load_from_checkpoint(tmp_path / "mine.ckpt", renderer=flat_renderer, **parts)
     assert again.model.training
