@@ -38,8 +38,8 @@ KINDS: dict[str, dict[str | None, str]] = {
     "loss": {"weighted": "ghgs_lit.losses.Losses"},
     "metrics": {"images": "ghgs_lit.metrics.MetricsOptions"},
     "optimizer": {"adamw": "ghgs_lit.training.Optimization"},
-    "calibration": {None: "ghgs_lit.config.verbs.Calibration"},
-    "evaluation": {None: "ghgs_lit.config.verbs.EvaluationOptions"},
+    "calibration": {None: "ghgs_lit.config.nodes.Calibration"},
+    "evaluation": {None: "ghgs_lit.config.nodes.EvaluationOptions"},
     "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
         "humman": "ghgs_lit.data.humman.dataset.HuMMan",

@@ -1,10 +1,11 @@
 """How long each part of a training step takes, on the CPU or on the device."""
 
-import time
 from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
+
+from ghgs_lit.kernels.watching import Mark, seconds_between, time_mark
 
 #: Parts of a step in their order.
 PARTS = (
@@ -21,24 +22,6 @@ PARTS = (
     "backward",
     "optimizer",
 )
-
-
-#: A moment: seconds on the CPU, an event on CUDA.
-Mark = float | torch.cuda.Event
-
-
-def time_mark(device: torch.device) -> Mark:
-    """This moment on ``device``: on CUDA, when the work that was given to it so far is done."""
-    if device.type != "cuda":
-        return time.perf_counter()
-    event = torch.cuda.Event(enable_timing=True)
-    event.record()
-    return event
-
-
-def seconds_between(begin: Mark, end: Mark) -> float:
-    """Seconds from one mark to a later one of the same device, which must have been reached."""
-    return end - begin if isinstance(begin, float) else begin.elapsed_time(end) / 1e3
 
 
 class StepClock:

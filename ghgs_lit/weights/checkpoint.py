@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
@@ -66,6 +67,9 @@ def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:
         require(isinstance(name, str), f"{path}: config", "keys of text", name)
         fits = name not in KINDS or node is None or isinstance(node, Mapping)
         require(fits, f"{path}: config.{name}", "a mapping of its keys", node)
+    # Verbs merge parts of it into a configuration of their own, where OmegaConf would evaluate resolvers.
+    for key, value in flatten(checkpoint["config"]).items():
+        require("${" not in repr(value), f"{path}: config.{key}", "a value, no interpolation", value)
     for name, value in checkpoint["state_dict"].items():
         require(isinstance(name, str), f"{path}: state_dict", "names of tensors", name)
         if isinstance(value, Tensor):

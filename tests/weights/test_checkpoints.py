@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from safetensors.torch import save_file
 
+from ghgs_lit.cli.inputs import with_trained_data
+from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
@@ -222,3 +225,20 @@ def test_a_loaded_model_trains_what_its_encoder_says(tmp_path, trainable):
         assert moved == (parameter.grad is not None and bool(parameter.grad.any())), name
     encoder = [n for n, p in model.named_parameters() if n.startswith("encoder.") and p.grad is not None]
     assert bool(encoder) == (trainable != "none")
+
+
+@pytest.mark.parametrize("verb", ["evaluate", "predict"])
+def test_no_resolver_of_a_checkpoint_is_evaluated(tmp_path, verb):
+    """``${sqlite:...}`` in the data of a checkpoint made folders: verbs merge it into their configuration."""
+    path, called = tmp_path / "a.ckpt", []
+    OmegaConf.register_new_resolver("called", called.append, replace=True)
+    for node in (
+        {"kind": "scans", "root": "${called:1}"},
+        {"kind": "scans", "split": {"val": ["${called:1}"]}},
+    ):
+        checkpoint(path, config={**config(), "data": node})
+        with pytest.raises(
+            InputError, match=r"a\.ckpt: config\.data\.\w+(\.val)?: expected a value, no interp"
+        ):
+            resolve(with_trained_data(compose(verb, [f"checkpoint={path}"])))
+    assert called == []

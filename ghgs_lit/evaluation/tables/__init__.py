@@ -1,6 +1,6 @@
 """The paper's tables from directories of runs."""
 
-from ghgs_lit.config.verbs import PairedTest
+from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.assemble import TableOptions, build_tables
 from ghgs_lit.evaluation.tables.latex import PREAMBLE, to_latex
 from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Table, layout_named

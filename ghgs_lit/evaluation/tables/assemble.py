@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import pandas as pd
 
 from ghgs_lit.config.ablation import ABLATIONS
-from ghgs_lit.config.verbs import PairedTest
+from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.evaluation.tables.cells import fill
 from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table

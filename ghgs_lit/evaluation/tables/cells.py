@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from ghgs_lit.config.verbs import PairedTest
+from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.differences import differing, differing_text, telling_apart
 from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, decimals

@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from ghgs_lit.config.verbs import PairedTest
+from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.differences import differing, differing_text
 from ghgs_lit.evaluation.tables.layouts import Table
 from ghgs_lit.evaluation.tables.records import Planned

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from ghgs_lit.config.verbs import PairedTest
+from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import to_markdown
 from ghgs_lit.evaluation.tables.significance import compare, holm, needed_errors

@@ -1,0 +1,161 @@
+"""Nodes of verbs: groups of keys that belong to no stage, such as ``turntable`` or ``calibration``."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ghgs_lit.config.describe import Words
+from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Side, Text
+
+#: One value or several.
+Texts = Text | tuple[Text, ...]
+#: A number of input views.
+Views = Annotated[int, Field(ge=2)]
+
+
+class Calibration(Options):
+    """What the file of the cameras does not say, or says wrongly; null: as its format has it."""
+
+    group = "calibration"
+    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml"] = "auto"
+    """Format of the file."""
+    extrinsics: Literal["world_to_camera", "camera_to_world"] | None = None
+    """What the matrices map."""
+    axes: Literal["opencv", "opengl"] | None = None
+    """Axes of a camera."""
+    intrinsics: Literal["pixels", "normalized", "normalized_principal"] | None = None
+    """Unit of focal lengths and principal point; normalized: shares of width and height."""
+    pixel_centers: Literal["half", "integer"] | None = None
+    """Where the first pixel's centre lies: at 0.5 or at 0."""
+    resized: Positive | None = None
+    """By what the photographs were resized after the calibration."""
+    unit: Positive | None = None
+    """Metres of one unit of length."""
+    exif: Literal["auto", "stored", "shown"] = "auto"
+    """Which pixels of a turned photograph the calibration is for."""
+    names: Annotated[dict | None, Words("a mapping of photographs to cameras or null")] = None
+    """Camera of a photograph with another name: {photograph: camera}."""
+
+
+class Turntable(Options):
+    """Pictures around the subject."""
+
+    frames: int = Field(24, ge=0, le=2000)
+    """Number of pictures (0: none); more than 2000 fill a disk before anybody looks."""
+    fps: Count = 12
+    """Pictures per second of a video."""
+
+
+class PerScene(Options):
+    """3D Gaussian splatting on each subject's inputs."""
+
+    steps: Count = 200
+    """Steps of optimisation."""
+    start: Literal["photo_depth", "hull"] = "photo_depth"
+    """Where it starts."""
+
+
+class Peers(Options):
+    """The methods beside the model with task=peers."""
+
+    baselines: Texts = ("nearest_view", "hull", "photo_depth", "per_scene", "true_depth")
+    """Names as in ``ghgs evaluate baselines=``."""
+    views: tuple[Views, ...] = (3, 4, 5)
+    """Numbers of input views."""
+    targets: tuple[Text, ...] = ("release", "midway")
+    """Names of files of conf/targets."""
+
+
+class Timing(Options):
+    """How times are taken."""
+
+    warmup: Index = 1
+    """Rounds that do not count."""
+    repeats: Count = 9
+    """Rounds that count; each runs all presets, and each begins with another one."""
+    count_flops: bool = True
+    """False: one forward pass less for each batch and preset."""
+
+
+class Base(Options):
+    """Where the other axes stay."""
+
+    share: Share = 0.15
+    """Part of the frame that the subject covers."""
+    views: Views = 4
+    """Number of input views."""
+    size: Side = 140
+    """Side of the photographs, pixels."""
+    batch: Count = 1
+    """Elements of a batch."""
+
+
+class Scaling(Options):
+    """How cost grows: one axis is changed at a time; an empty list leaves it out."""
+
+    share: tuple[Share, ...] = (0.05, 0.1, 0.2, 0.4, 0.6)
+    """Parts of the frame that the subject covers."""
+    views: tuple[Views, ...] = (2, 3, 4, 6, 8)
+    """Numbers of input views."""
+    size: tuple[Side, ...] = (140, 280, 518, 1022)
+    """Sides of the photographs in pixels; multiples of the encoder's patch."""
+    batch: tuple[Count, ...] = (1, 2, 4)
+    """Numbers of elements of a batch."""
+    threads: tuple[Count, ...] = (1, 2)
+    """Threads of PyTorch."""
+    base: Base = Base()
+    """Where the other axes stay."""
+
+
+class Phases(Options):
+    """Numbers of people."""
+
+    train: Index = 4
+    """To train on."""
+    val: Index = 2
+    """To measure on."""
+
+
+class Miniature(Options):
+    """A small data set of built-in people in the published layout of data=..."""
+
+    people: Phases = Phases()
+    """Number of people of each phase."""
+    size: Side = 256
+    """Longer side of the photographs, pixels."""
+
+
+class Check(Options):
+    """What task=check expects of data."""
+
+    min_iou: Share = 0.5
+    """Least IoU of a body's silhouette and its mask; below it a camera counts as wrong."""
+    min_agreement: Share = 0.9
+    """Without bodies: least share of a mask that the subject's other masks and cameras allow."""
+
+
+class PairedTest(Options):
+    """The test between rows, over seeds and subjects together."""
+
+    group = "test"
+    against: Literal["full", "best", "none"] = "full"
+    """full: the row of the whole method | best: the best row of each column | none: no test."""
+    alpha: float = Field(0.05, gt=0, lt=1)
+    """Significance level."""
+    unit: Text | None = None
+    """Where subjects are frames of people: a regular expression whose group is the person's name."""
+
+
+class EvaluationOptions(Options):
+    """Every number of views with every target protocol, after training and in ``ghgs evaluate``."""
+
+    group = "evaluation"
+    views: Views | tuple[Views, ...] | None = None
+    """Numbers of input views (the paper's: 3, 4 and 5); of tables, null: those of the layout."""
+    targets: Texts | None = ("release", "midway")
+    """Names of files in conf/targets, each with its own values (the paper's: release). The one that targets=
+    selects has the values of this configuration. Of tables, null: all that were measured."""
+    split: Text = "val"
+    """val: unseen in training | train | bench: frozen people of data=synthetic."""
+    pictures: Index = 4
+    """Number of subjects of each protocol that are drawn into pictures/."""
