@@ -1,0 +1,109 @@
+"""What is measured of a method: rows, depth errors, seconds, what is not finite."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.evaluation.measure import Estimate, ModelMethod, measure, not_finite
+from ghgs_lit.metrics import MetricsOptions, psnr
+from ghgs_lit.runs.provenance import config_hash
+from tests.helpers.models import make_model
+from tests.helpers.scenes import make_batch
+from tests.helpers.training import Standin, example_batch, flat_renderer
+
+OFF = MetricsOptions(lpips="off").build()
+
+
+def test_rows_say_what_they_are_about_and_hold_the_metrics(tmp_path):
+    """Every number is found under its subject, target and inputs, with the value of the metric."""
+    batch = example_batch(subjects=2, views=3, targets=2)
+    rows = measure(ModelMethod(Standin(), flat_renderer), "model", [batch], OFF, "cpu", tmp_path, 1)
+    assert [(r["subject"], r["target"]) for r in rows] == [
+        ("p0", "000/3"), ("p0", "001/3"), ("p1", "000/3"), ("p1", "001/3"),
+    ]  # fmt: skip
+    assert {(r["method"], r["views"], r["targets"]) for r in rows} == {("model", 3, "midway")}
+    assert rows[0]["inputs"] == ["000/0", "001/0", "002/0"]
+    image = flat_renderer(Standin()(batch).gaussians, batch.targets.cameras).image
+    expected = psnr(image[1, 1][None].clamp(0, 1), batch.targets.images[1, 1][None]).item()
+    assert rows[3]["psnr"] == pytest.approx(expected)
+    # the stand-in says 2.5 m, the truth is 2.1 m
+    assert rows[0]["depth_error_mm"] == pytest.approx(400, abs=1e-2)
+    assert rows[0]["gaussians"] == 144
+    assert [p.name for p in tmp_path.iterdir()] == ["model_v3_midway_p0.png"]
+
+
+def test_refined_gaussians_have_no_depth_error():
+    """They left the predicted depths: the error of these is not theirs."""
+    batch, drawn = example_batch(), []
+
+    def refinement(gaussians, batch):
+        drawn.append(gaussians)
+        return gaussians
+
+    rows = measure(ModelMethod(Standin(), flat_renderer, refinement), "model", [batch], OFF)
+    assert len(drawn) == 1
+    assert rows[0]["depth_error_mm"] is None
+
+
+def test_a_perfect_method_reaches_the_cap_and_has_no_depth():
+    """A perfect render has the capped PSNR, and a method without depth has no depth error."""
+    batch = example_batch()
+    rows = measure(lambda b: Estimate(b.targets.images), "perfect", [batch], OFF)
+    assert rows[0]["psnr"] == pytest.approx(100)
+    assert rows[0]["flip"] == 0
+    assert rows[0]["depth_error_mm"] is None
+
+
+def test_what_is_not_finite_is_counted_and_named():
+    """No renderer draws it, and no depth error counts it."""
+    batch = dataclasses.replace(make_batch(2, 3), subjects=("anna", "ben"))
+    with torch.no_grad():
+        prediction = make_model("model=hull").eval()(batch)
+    assert not_finite(batch, prediction) == (0, 0)
+    prediction.gaussians.scales[-2:, 0] = torch.nan
+    prediction.depth_valid[1][batch.masks[1]] &= torch.arange(int(batch.masks[1].sum())) > 2
+    with pytest.warns(UserWarning, match="not finite: ben: 5"):
+        assert not_finite(batch, prediction) == (0, 5)
+
+
+def test_the_hash_of_a_configuration_ignores_the_order_of_keys():
+    """Runs of a sweep are found again by the hash of their configuration."""
+    assert config_hash({"a": 1, "b": {"c": [1, 2]}}) == config_hash({"b": {"c": [1, 2]}, "a": 1})
+    assert config_hash({"a": 1}) != config_hash({"a": 2})
+
+
+def test_what_refines_takes_part_in_what_is_measured():
+    """Gaussians with the cameras that were corrected: neither is left out without a word."""
+    batch = example_batch()
+    given = flat_renderer(Standin()(batch).gaussians, batch.targets.cameras).image
+
+    def halved(gaussians, batch):
+        return dataclasses.replace(gaussians, colors=gaussians.colors / 2)
+
+    def darker(batch):
+        return dataclasses.replace(batch, images=batch.images / 4)
+
+    for refinement, cameras, share in ((halved, None, 2), (None, darker, 4), (halved, darker, 8)):
+        method = ModelMethod(Standin(), flat_renderer, refinement, cameras)
+        with torch.no_grad():
+            torch.testing.assert_close(method(batch).image, given / share)
+
+
+def test_depth_errors_are_those_of_the_subject():
+    """Depths beside it are anything."""
+    batch = example_batch(subjects=2)
+    depth = torch.where(batch.masks, 2.1, 9.0)
+    batch = dataclasses.replace(batch, depths=torch.full_like(depth, 2.1))
+    valid = torch.ones_like(batch.masks)
+    estimate = Estimate(batch.targets.images, depth + 0.02, valid)
+    rows = measure(lambda b: estimate, "model", [batch], OFF)
+    assert [row["depth_error_mm"] for row in rows] == pytest.approx([20, 20], abs=1e-2)
+
+
+def test_seconds_are_those_of_a_subject(monkeypatch):
+    """A batch of two that takes six seconds takes three for each."""
+    ticks = iter([10.0, 16.0])
+    monkeypatch.setattr("ghgs_lit.evaluation.measure.time.perf_counter", lambda: next(ticks))
+    rows = measure(lambda b: Estimate(b.targets.images), "model", [example_batch(subjects=2)], OFF)
+    assert [row["seconds"] for row in rows] == [3, 3]
