@@ -1,7 +1,7 @@
 """``ghgs <verb> --help [group]``: keys with their meaning, default and range, from the options themselves."""
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -11,67 +11,68 @@ from pydantic_core import PydanticUndefined
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.config.describe import expected, meanings, options_of
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.registry import KINDS, class_of
+from ghgs_lit.config.registry import KINDS, class_of, kinds_of
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
 _WIDTH = 100
 
 
-def groups_of(verb: str) -> dict[str, list[str]]:
-    """The config groups that a verb composes and their options."""
+#: Groups whose options a model chooses.
+_OF_MODELS = ("bounds", "depth_head", "unprojection", "recalibration", "gaussian_head")
+
+
+def defaults_of(verb: str) -> dict[str, str | None]:
+    """The config groups that a verb composes, and the option of each, None where there is none."""
     shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
-    names: dict[str, list[str]] = {}
+    chosen: dict[str, str | None] = {}
     for entry in shipped["defaults"]:
         if isinstance(entry, str) and entry != "_self_":  # the configuration of another verb
-            names |= groups_of(entry)
+            chosen |= defaults_of(entry)
         elif isinstance(entry, dict):
-            group = str(next(iter(entry)))
-            if not group.startswith("override"):
-                names[group] = sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
-    if "model" in names:  # which chooses the options of these
-        for group in ("bounds", "depth_head", "unprojection", "recalibration", "gaussian_head"):
-            names[group] = sorted(path.stem for path in (conf_dir() / group).glob("*.yaml"))
-    return names
+            chosen |= {group: name for group, name in entry.items() if not group.startswith("override")}
+    return chosen | (dict.fromkeys(_OF_MODELS) if "model" in chosen else {})
 
 
-def print_verb(verb: str, summary: str, example: str) -> None:
-    """What a verb does, its groups, and its keys."""
+def _files(group: str, folders: Sequence[Path]) -> list[Path]:
+    """The files of a group's options, also in folders of the user's own."""
+    return [path for folder in (conf_dir(), *folders) for path in sorted((folder / group).glob("*.yaml"))]
+
+
+def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = ()) -> None:
+    """What a verb does, its groups, and its keys; ``folders`` are those of ``--config-dir``."""
     print(f"ghgs {verb} [key=value ...] [group=option ...] [-m for a sweep over comma-separated values]\n")
     print(f"{summary[0].upper()}{summary[1:]}: {example}\n")
-    composed = compose(verb)
-    chosen = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))["defaults"]
-    chosen = {k: v for entry in chosen if isinstance(entry, dict) for k, v in entry.items()}
-    print("== Groups (group=option; the first is the default) ==")
-    for group, options in groups_of(verb).items():
-        first = [chosen[group]] if chosen.get(group) else []
-        print(_filled(f"{group}: {' | '.join(first + [name for name in options if name not in first])}"))
+    print("== Groups (group=option; * is the default) ==")
+    for group, default in defaults_of(verb).items():
+        names = [f"{path.stem}{'*' * (path.stem == default)}" for path in _files(group, folders)]
+        print(_filled(f"{group}: {' | '.join(names)}"))
     print(f"\nghgs {verb} --help <group> explains the keys of a group.\n\n== Keys (key=value) ==")
-    for line in _fields(VERBS[verb], composed):
+    for line in _fields(VERBS[verb]):
         print(line)
     print("\n--cfg job prints the composed configuration, --info defaults says where each part comes from.")
     print('Tab completion for bash: eval "$(ghgs -sc install=bash)"')
 
 
-def print_group(verb: str, group: str) -> None:
+def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
     """The keys of a group: meaning, default and range of each.
 
     Raises:
         InputError: the verb has no such group.
     """
-    known = [*groups_of(verb), *(name for name in compose(verb) if name in KINDS)]
+    known = [*defaults_of(verb), *(name for name in compose(verb) if name in KINDS)]
     known = list(dict.fromkeys([*known, *(["rounds"] if "model" in known else [])]))
     if group not in known:
         hint = did_you_mean(group, known)
         raise InputError(
             f"--help: expected a group of ghgs {verb}, one of {', '.join(known)}; found {group!r}{hint}"
         )
-    for kind in KINDS.get(group, {}):
+    for kind in kinds_of(group):
         print(f"== {group}" + (f": {{kind: {kind}, ...}}" if kind else "") + " ==")
-        for line in _fields(class_of(group, kind, group), None):
+        for line in _fields(class_of(group, kind, group)):
             print(line)
         print()
-    for path in sorted((conf_dir() / group).glob("*.yaml")):
+    for path in _files(group, folders):
         print(f"{group}={path.stem}: {_purpose(path)}")
 
 
@@ -85,7 +86,7 @@ def _purpose(path: Path) -> str:
     return " ".join(lines)
 
 
-def _fields(cls: type[BaseModel], values: object, indent: str = "") -> Iterator[str]:
+def _fields(cls: type[BaseModel], indent: str = "") -> Iterator[str]:
     """The fields of options and of those below them, as lines."""
     texts = meanings(cls)
     for name, field in cls.model_fields.items():
@@ -93,7 +94,7 @@ def _fields(cls: type[BaseModel], values: object, indent: str = "") -> Iterator[
         default = field.get_default(call_default_factory=True)
         if nested is not None:
             yield f"{indent}{name}: {' '.join(texts.get(name, '').split())}"
-            yield from _fields(nested, None, indent + "  ")
+            yield from _fields(nested, indent + "  ")
             continue
         shown = "must be given" if default is PydanticUndefined else f"default {_yaml(default)}"
         yield f"{indent}{name} ({shown}; {expected(field)})"

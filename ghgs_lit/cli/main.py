@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import hydra
@@ -24,6 +25,7 @@ from ghgs_lit.cli.messages import (
     flags_first,
     one_line,
     raised_by_hydra,
+    takes_value,
 )
 from ghgs_lit.config import check_groups, conf_dir, resolve
 from ghgs_lit.config.options import did_you_mean
@@ -165,14 +167,17 @@ def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
 
 
 def _help(verb: str, arguments: list[str]) -> int:
-    """``ghgs <verb> --help [group]``."""
+    """``ghgs <verb> --help [group]``; of other arguments only ``--config-dir`` has a say."""
     from ghgs_lit.cli.help import print_group, print_verb
 
-    names = [argument for argument in arguments if argument not in ("-h", "--help")]
-    for name in names:
-        print_group(verb, name)
-    if not names:
-        print_verb(verb, *VERBS[verb])
+    words = flags_first(arguments)
+    folders = [Path(folder) for flag, folder in pairwise(words) if flag in ("-cd", "--config-dir")]
+    values = {word for flag, word in pairwise(words) if takes_value(flag)}
+    groups = [word for word in words if not word.startswith("-") and "=" not in word and word not in values]
+    for group in groups:
+        print_group(verb, group, folders)
+    if not groups:
+        print_verb(verb, *VERBS[verb], folders)
     return 0
 
 

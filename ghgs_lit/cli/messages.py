@@ -115,6 +115,11 @@ class BadUsage(Exception):
     """A flag that Hydra does not have."""
 
 
+def takes_value(flag: str) -> bool:
+    """Whether a value follows one of Hydra's flags."""
+    return _FLAGS.get(flag, False)
+
+
 def flags_first(arguments: Sequence[str]) -> list[str]:
     """``arguments`` with Hydra's flags before all overrides, between which Hydra allows none.
 

@@ -98,6 +98,12 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
     return keep
 
 
+def kinds_of(group: str) -> list[str | None]:
+    """All kinds of a group, those of the user's own code included."""
+    load_plugins()
+    return [*KINDS.get(group, ()), *(kind for of, kind in _REGISTERED if of == group)]
+
+
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
     """The options of a kind.
 
@@ -115,7 +121,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
         if (group, kind) in _REGISTERED:
             return _REGISTERED[group, kind]
     if not (kind is None or isinstance(kind, str)) or kind not in known:
-        names = sorted(name for name in known if name) + [k for g, k in _REGISTERED if g == group]
+        names = sorted(name for name in kinds_of(group) if name)
         expected = "one of " * (len(names) > 1) + ", ".join(names)
         raise InputError(
             f"{key}.kind: expected {expected}; found {kind!r}{did_you_mean(kind, names)}"
@@ -166,15 +172,12 @@ def check(config: Mapping[str, Any]) -> None:
         InputError: names the key of the first wrong value, what was expected and what was found.
     """
     for group, node in config.items():
-        # Verbs whose data is that of a checkpoint have none of their own, or change keys of it; a model may
-        # change keys of an optimizer that a verb lacks.
-        partial = isinstance(node, Mapping) and "kind" not in node and None not in KINDS.get(group, ())
-        if group not in KINDS or (group in ("data", "targets") and node is None):
-            continue
-        if partial and group not in NAMED:
+        # A verb whose data is that of a checkpoint has no protocols and data of its own.
+        if group not in KINDS or (node is None and group in ("data", "targets")):
             continue
         if group in NAMED and isinstance(node, Mapping):
             for name, part in node.items():
                 read_node(part, f"{group}.{name}")
-        else:
+        # Without a kind: keys that change the data of a checkpoint, or an optimizer that the verb lacks.
+        elif not isinstance(node, Mapping) or "kind" in node or None in KINDS[group]:
             read_node(node, group)

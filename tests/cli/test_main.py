@@ -99,11 +99,30 @@ def test_a_bad_value_is_refused_before_the_verb_is_imported(monkeypatch, capsys,
     assert "data.size: expected an integer >= 1 and <= 8192" in err
 
 
-def test_verb_help_and_cfg_are_hydras(monkeypatch, capsys):
-    """Hydra's own flags must reach it: they list the groups and the composed configuration."""
-    code, out, _ = call(monkeypatch, capsys, "train", "--help")
+def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
+    """Groups with their default, keys with meaning and range; options of one's own folder, too."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "my_people.yaml").write_text("# Mine.\nkind: scans\n")
+    flags = ("model=paper", "--config-dir", str(tmp_path))
+    code, out, _ = call(monkeypatch, capsys, "train", *flags, "--help")
     assert code == 0
-    assert "ablation:" in out
+    assert "model=hull; the paper's method: model=paper" in out
+    assert "ablation: full*" in out
+    assert "| my_people" in out
+    assert "seed (default 1; an integer >= 0 and <= 4294967295)\n    Of weights" in out
+    code, out, _ = call(monkeypatch, capsys, "train", "--help", "depth_head")
+    assert code == 0
+    assert "== depth_head: {kind: dpt, ...} ==" in out
+    assert "start (default 0.5; a number > 0 and < 1)" in out
+    code, out, _ = call(monkeypatch, capsys, "train", *flags, "--help", "data")
+    assert "data=my_people: Mine." in out
+    code, _, err = call(monkeypatch, capsys, "train", "--help", "depth_heat")
+    assert code == 1
+    assert "found 'depth_heat' (did you mean depth_head?)" in err
+
+
+def test_cfg_is_hydras(monkeypatch, capsys):
+    """Hydra's own flags must reach it, such as that for the composed configuration."""
     code, out, _ = call(monkeypatch, capsys, "train", "--cfg", "job", "seed=7")
     assert code == 0
     assert "seed: 7" in out
