@@ -73,9 +73,10 @@ class GHGSModule(BudgetedModule):
             InputError: the checkpoint cannot be used, or a part is neither configured nor given.
         """
         config = read_checkpoint(checkpoint_path)["config"]
-        groups = {"renderer": "renderer", "losses": "loss", "optimization": "optimizer"}
-        for name in set(groups).difference(parts):
-            group, place = groups[name], f"{checkpoint_path}: config.{groups[name]}"
+        for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():
+            if name in parts:
+                continue
+            place = f"{checkpoint_path}: config.{group}"
             require(group in config, place, f"options of it, or {name}=...", "nothing")
             parts[name] = build(config[group], group)
         model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
