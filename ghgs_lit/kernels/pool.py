@@ -4,6 +4,7 @@ import os
 import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -39,6 +40,14 @@ def _workers(count: int) -> ThreadPoolExecutor:
 def is_supported(*tensors: Tensor) -> bool:
     """Whether kernels in single precision, which see tensors as NumPy arrays, can work on these."""
     return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+
+
+@cache
+def features() -> set[str]:
+    """LLVM's names of the processor features that kernels may use; see ``processor_features``."""
+    from ghgs_lit.kernels.compile import processor_features  # here: it loads a compiler
+
+    return processor_features()
 
 
 def run(tasks: list, work: int) -> None:

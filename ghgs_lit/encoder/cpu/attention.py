@@ -1,6 +1,6 @@
 """Attention of all heads, distributed over threads."""
 
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -26,14 +26,7 @@ def is_supported(q: Tensor, v: Tensor) -> bool:
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURES:
         return False
     n, a, t, d = q.shape
-    return d % WIDTH == 0 and n * a * t * v.shape[2] * d >= _LARGE and _features() >= _FEATURES[v.dtype]
-
-
-@cache
-def _features() -> set[str]:
-    from ghgs_lit.kernels.compile import processor_features  # here, like the kernel: it loads a compiler
-
-    return processor_features()
+    return d % WIDTH == 0 and n * a * t * v.shape[2] * d >= _LARGE and pool.features() >= _FEATURES[v.dtype]
 
 
 def attend(
