@@ -4,19 +4,16 @@ Values are stored by channel: one line of ``PANEL`` floats, a lane for each row.
 next one's input as it is, and its activation needs no other layout.
 """
 
-import math
-
 import numpy as np
 from torch import nn
 
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper
 from ghgs_lit.kernels.products import product
-from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
+from ghgs_lit.kernels.simd import LANES
 from ghgs_lit.kernels.tile import PANEL, ROWS
 
-ZERO, ONE = np.float32(0), np.float32(1)
-_TWICE = np.float32(2 * math.log2(math.e))
+ZERO = np.float32(0)
 
 
 def room(channels: int) -> int:
@@ -66,12 +63,3 @@ def rectify(layers, at, outputs, inputs, values):
     for channel in range(outputs):
         for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
             memory.store(values, i, simd.maximum(ZERO, memory.load(values, i) + layers[biases + channel]))
-
-
-@helper
-def tanh(x):
-    """The hyperbolic tangent of vectors, within 1e-7; NaN stays."""
-    distance = simd.maximum(x, ZERO - x)
-    shrunk = simd.exp2_minus(simd.minimum(simd.full(EXP2_LIMIT), distance * _TWICE))
-    found = (ONE - shrunk) / (ONE + shrunk)
-    return simd.select(x < ZERO, ZERO - found, found)

@@ -1,5 +1,6 @@
-"""The network of the rounds for CPUs: all its layers for a few Gaussians, then for the next."""
+"""Rounds for CPUs: all that is done with a few Gaussians, then with the next."""
 
 from ghgs_lit.rounds.cpu.network import is_supported, remembered
+from ghgs_lit.rounds.cpu.observation import compare
 
-__all__ = ["is_supported", "remembered"]
+__all__ = ["compare", "is_supported", "remembered"]
