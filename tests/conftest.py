@@ -8,9 +8,9 @@ from pathlib import Path
 from jaxtyping import install_import_hook
 
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
-_CHECKED = ["types", "heads", "losses", "metrics"]
+_CHECKED = ["types", "losses", "metrics"]
 # Without their folders of kernels: a wrapped function cannot be compiled.
-for name in ("bounds", "encoder", "geometry", "pretext", "recalibration"):
+for name in ("bounds", "encoder", "geometry", "heads", "pretext", "recalibration"):
     _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]
 install_import_hook([f"ghgs_lit.{name}" for name in _CHECKED], "beartype.beartype")
 
