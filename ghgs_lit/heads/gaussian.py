@@ -28,6 +28,7 @@ from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.kernels.precision import without_float16
 from ghgs_lit.types import (
     Batch,
@@ -377,7 +378,11 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.options.color_limit > 0:
             headers.append(self.color_header)
-        offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
+        if multiplies(descriptors, self.offset_header[0].weight):
+            found = cpu.attributes(headers, descriptors)
+        else:
+            found = (float32_last(header, descriptors) for header in headers)
+        offset, scale, rotation, opacity, *color = found
         return offset, scale, rotation, opacity[..., 0], *color
 
 

@@ -50,6 +50,12 @@ def features() -> set[str]:
     return processor_features()
 
 
+def multiplies(*tensors: Tensor) -> bool:
+    """Whether kernels compute products of these, and as fast as PyTorch: no gradient, no half precision."""
+    plain = not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
+    return plain and is_supported(*tensors) and features() >= {"avx2", "fma"}
+
+
 def run(tasks: list, work: int) -> None:
     """Call every task, on at most ``torch.get_num_threads()`` threads including the caller's.
 

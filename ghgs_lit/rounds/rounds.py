@@ -25,6 +25,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
@@ -188,7 +189,7 @@ class Rounds(nn.Module):
         each = observe(gaussians, batch)
         search = self._search(state, batch, rays, size * self.options.reach)
         rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
-        if cpu.is_supported(*rows, self.memory.weight):
+        if multiplies(*rows, self.memory.weight):
             memory = cpu.remembered(self.view, self.update, self.memory, *rows)
         else:
             memory = self._remembered_in_parts(*rows)

@@ -14,12 +14,6 @@ from ghgs_lit.kernels.parts import even_parts
 _TASK, _WORK = 512, 8
 
 
-def is_supported(*tensors: Tensor) -> bool:
-    """Whether the kernel can compute with these, and as fast as PyTorch: no gradient, no half precision."""
-    plain = not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
-    return plain and pool.is_supported(*tensors) and pool.features() >= {"avx2", "fma"}
-
-
 def remembered(
     view: nn.Sequential,
     update: nn.Sequential,
