@@ -1,4 +1,4 @@
-"""``ghgs benchmark``: run time against error of every preset and of other methods, and how cost grows."""
+"""``ghgs benchmark``: run time against error of every preset and of other methods."""
 
 import itertools
 import math
@@ -16,11 +16,11 @@ from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, wit
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
-from ghgs_lit.diagnostics.benchmark import report, scaling
+from ghgs_lit.diagnostics.benchmark import report
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
 from ghgs_lit.diagnostics.benchmark.peers import tables_of as tables_of_peers
-from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling
+from ghgs_lit.diagnostics.benchmark.plot import draw_presets
 from ghgs_lit.diagnostics.benchmark.presets import (
     KNOBS,
     YARDSTICK,
@@ -36,7 +36,7 @@ from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.reading import SHIPPED
 
-TASKS = ("presets", "peers", "scaling")
+TASKS = ("presets", "peers")
 
 
 def run(cfg: DictConfig) -> None:
@@ -45,7 +45,7 @@ def run(cfg: DictConfig) -> None:
     choice("task", cfg.task, TASKS)
     if cfg.task == "peers" and cfg.checkpoint is None:
         cfg.checkpoint = SHIPPED
-    cfg = cfg if cfg.task == "scaling" else with_trained_data(cfg)
+    cfg = with_trained_data(cfg)
     config = save_config(cfg, directory)
     check_options(config, overrides())
     L.seed_everything(config["seed"], workers=True, verbose=False)
@@ -54,9 +54,7 @@ def run(cfg: DictConfig) -> None:
         if cfg.task == "peers":
             content = peers(cfg, config, directory, device)
         else:
-            cases = configured_cases(config, device)
-            measured = _presets if cfg.task == "presets" else _scaling
-            content = measured(cases, config, device)
+            content = _presets(configured_cases(config, device), config, device)
         content = {"task": config["task"], "machine": machine_facts(device), **content}
     path = _write(directory, content, config)
     announce(path)
@@ -93,7 +91,7 @@ _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """Every source in every preset; for errors the yardstick is always among them.
+    """Every source in every preset, the yardstick always among them.
 
     Args:
         config: of ``ghgs benchmark``, resolved.
@@ -102,10 +100,8 @@ def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Ca
     Raises:
         FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.
     """
-    names = config["presets"]
-    if config["task"] == "presets":
-        names = list(dict.fromkeys([YARDSTICK, *names]))
-    presets = presets_of(names, config["skip"])
+    names = dict.fromkeys([YARDSTICK, *config["presets"]])
+    presets = presets_of(list(names), config["skip"])
     if config["checkpoint"] is None:
         sources = [Source("model", config, None)]
     else:
@@ -145,15 +141,6 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     }
 
 
-def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
-    """Measure how cost grows, on analytic scenes."""
-    rows, fits = scaling.study(cases, config["scaling"], device, **config["timing"])
-    base = ", ".join(f"{name} {value:g}" for name, value in config["scaling"]["base"].items())
-    about = f"{_weights(config, cases)}; an ellipsoid, elsewhere {base}"
-    random_weights = config["checkpoint"] is None
-    return {"about": about, "random_weights": random_weights, "rows": rows, "fits": fits, "broken": []}
-
-
 def _weights(config: dict[str, Any], cases: list[Case]) -> str:
     """The models in words."""
     number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
@@ -167,12 +154,9 @@ def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> 
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
     if content["task"] == "peers":
         tables = tables_of_peers(rows)
-    elif content["task"] == "presets":
+    else:
         tables = report.tables_of(rows)
         save_figure(draw_presets(rows, *words), directory / "benchmark.png")
-    else:
-        tables = scaling.tables_of(rows, content["fits"])
-        save_figure(draw_scaling(rows, content["fits"], *words), directory / "benchmark.png")
     print_tables(tables)
     print(*content.get("decisions", []), sep="\n", flush=True)
     source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())

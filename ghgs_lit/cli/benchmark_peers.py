@@ -20,7 +20,7 @@ from ghgs_lit.weights.hub import sha256
 from ghgs_lit.weights.reading import file_of
 
 #: What the rows of a subject do not depend on: a second run may ask for more of these.
-_ASKED = ("peers", "subjects", "timing", "presets", "scaling")
+_ASKED = ("peers", "subjects", "timing", "presets")
 
 
 def peers(cfg: DictConfig, config: dict[str, Any], directory: Path, device: torch.device) -> dict[str, Any]:

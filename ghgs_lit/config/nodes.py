@@ -77,36 +77,6 @@ class Timing(Options):
     """False: one forward pass less for each batch and preset."""
 
 
-class Base(Options):
-    """Where the other axes stay."""
-
-    share: Share = 0.15
-    """Part of the frame that the subject covers."""
-    views: Views = 4
-    """Number of input views."""
-    size: Side = 140
-    """Side of the photographs, pixels."""
-    batch: Count = 1
-    """Elements of a batch."""
-
-
-class Scaling(Options):
-    """How cost grows: one axis is changed at a time; an empty list leaves it out."""
-
-    share: tuple[Share, ...] = (0.05, 0.1, 0.2, 0.4, 0.6)
-    """Parts of the frame that the subject covers."""
-    views: tuple[Views, ...] = (2, 3, 4, 6, 8)
-    """Numbers of input views."""
-    size: tuple[Side, ...] = (140, 280, 518, 1022)
-    """Sides of the photographs in pixels; multiples of the encoder's patch."""
-    batch: tuple[Count, ...] = (1, 2, 4)
-    """Numbers of elements of a batch."""
-    threads: tuple[Count, ...] = (1, 2)
-    """Threads of PyTorch."""
-    base: Base = Base()
-    """Where the other axes stay."""
-
-
 class Phases(Options):
     """Numbers of people."""
 

@@ -11,7 +11,6 @@ from ghgs_lit.config.nodes import (
     PairedTest,
     Peers,
     PerScene,
-    Scaling,
     Texts,
     Timing,
     Turntable,
@@ -184,8 +183,8 @@ class Evaluate(Measured):
 class Benchmark(Measured):
     """Run time against error."""
 
-    task: Literal["presets", "peers", "scaling"] = "presets"
-    """presets: every preset of conf/skip. peers: the model beside other methods. scaling: how cost grows."""
+    task: Literal["presets", "peers"] = "presets"
+    """presets: every preset of conf/skip. peers: the model beside other methods."""
     checkpoint: Path | None = None
     """null: random weights, of which only run times and differences mean something; with task=peers those
     that come with the package."""
@@ -207,8 +206,6 @@ class Benchmark(Measured):
     """3D Gaussian splatting on each subject's inputs."""
     timing: Timing = Timing()
     """How times are taken."""
-    scaling: Scaling = Scaling()
-    """How cost grows."""
     threads: Count | None = None
     """Threads of PyTorch; null: as many as it chooses."""
 

@@ -37,15 +37,6 @@ class Times:
         return cls(median, low, high)
 
 
-@dataclass(frozen=True)
-class Job:
-    """What is timed as one: a case on batches, by a number of threads (None: those there are)."""
-
-    case: Case
-    batches: Sequence[Batch]
-    threads: int | None = None
-
-
 @dataclass
 class Work:
     """What a forward pass of a batch needs: FLOPs (None: not counted) and peak bytes by stage, and numbers
@@ -79,32 +70,28 @@ class Record:
 
 
 def order(turn: int, count: int) -> list[int]:
-    """The order of ``count`` jobs in a round: each round begins one job later, so that every job has every
+    """The order of ``count`` cases in a round: each round begins one case later, so that every case has every
     neighbour and drift of the machine hits all alike."""
     return [(turn + number) % count for number in range(count)]
 
 
-def time_jobs(jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device) -> list[dict[str, Times]]:
-    """Time jobs in interleaved rounds.
+def time_cases(
+    cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
+) -> list[dict[str, Times]]:
+    """The seconds of each stage of each case, means over the batches, in interleaved rounds.
 
     Args:
-        jobs: what is timed.
         warmup: rounds that do not count.
         repeats: rounds that count, at least 1.
-        device: where the models are.
-
-    Returns:
-        For each job the seconds of each stage, means over its batches.
     """
-    seconds: list[dict[str, list[float]]] = [{} for _ in jobs]
+    seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
-        for number in order(turn, len(jobs)):
-            job, probe = jobs[number], SecondsProbe(device)
-            with threads(job.threads):
-                for batch in job.batches:
-                    forward(job.case.model, job.case.renderer, batch, probe)
+        for number in order(turn, len(cases)):
+            case, probe = cases[number], SecondsProbe(device)
+            for batch in batches:
+                forward(case.model, case.renderer, batch, probe)
             for stage, value in probe.seconds().items() if turn >= 0 else ():
-                seconds[number].setdefault(stage, []).append(value / len(job.batches))
+                seconds[number].setdefault(stage, []).append(value / len(batches))
     return [{stage: Times.of(values) for stage, values in stages.items()} for stages in seconds]
 
 
@@ -164,7 +151,7 @@ def record_cases(
         batches: on the device, with targets.
         metrics: of the renders.
         device: where the models are.
-        warmup, repeats: as for :func:`time_jobs`.
+        warmup, repeats: as for :func:`time_cases`.
         count_flops: whether FLOPs are counted, which takes one more forward pass.
     """
     works: list[list[Work]] = [[] for _ in cases]
@@ -179,7 +166,7 @@ def record_cases(
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
             record.metrics += _metrics(record.case, batch, *result, metrics, device)
-    times = time_jobs([Job(case, batches) for case in cases], warmup, repeats, device)
+    times = time_cases(cases, batches, warmup, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work, record.times = Work.of(mine), seconds
     return records

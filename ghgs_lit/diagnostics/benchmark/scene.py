@@ -1,4 +1,4 @@
-"""A subject of a given size in the frame: an ellipsoid before a ring of cameras, for the scaling study."""
+"""A subject of a given size in the frame: an ellipsoid before a ring of cameras."""
 
 import math
 
