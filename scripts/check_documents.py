@@ -85,7 +85,7 @@ SMALL = [
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1", "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
-    (r"^(ghgs prepare task=miniature.*)", rf"\1 {FEW}", "few people"),
+    (r"^(.*(?:task=miniature|miniature\.py).*)", rf"\1 {FEW}", "few people"),
     (r"^(python benchmarks/loading\.py.*)", r"\1 --seconds 1 --size 128 --workers 0,1", "one second"),
     (r"^(python benchmarks/captures\.py.*)", r"\1 --people 1", "one person"),
     (r"^(python scripts/check_resume\.py)(?: --steps 40 --kill-at 20)?(.*)",
@@ -153,7 +153,7 @@ BEFORE = {
     "docs/add_a_data_set.md": (*_RENDERED, _PHOTOGRAPHS),
     "docs/benchmark.md": _CHECKPOINTS,
     "docs/data.md": (
-        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
+        f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW}",
         _SCANS.format("THuman2.0_Release"),
     ),
     "docs/encoder.md": _CHECKPOINTS,
@@ -164,7 +164,7 @@ BEFORE = {
     "docs/outputs.md": _CHECKPOINTS,
     "docs/photographs.md": (
         f"{_RUN} hydra.run.dir=runs/mine",
-        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW} miniature.size=112",
+        f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW} miniature.size=112",
         _CAPTURE,
     ),
     "docs/rounds.md": _RENDERED,
@@ -172,7 +172,7 @@ BEFORE = {
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (
         f"{_RUN} hydra.run.dir=runs/before",
-        f"ghgs prepare task=miniature data=thuman2 data.root=thuman2 {FEW}",
+        f"python scripts/miniature.py data=thuman2 data.root=thuman2 {FEW}",
         *_RENDERED,
     ),
 }  # fmt: skip

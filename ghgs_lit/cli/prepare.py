@@ -1,4 +1,4 @@
-"""``ghgs prepare``: render people or scans into training data, make a miniature, or check a data set."""
+"""``ghgs prepare``: render people or scans into training data, make a few scans, or check a data set."""
 
 import logging
 from pathlib import Path
@@ -27,8 +27,7 @@ def run(cfg: DictConfig) -> None:
         announce(root)
     elif cfg.task == "miniature":
         miniature = cfg.miniature
-        for folder in make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed):
-            announce(folder)
+        announce(make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed))
     else:
         check(data, output_dir(), **cfg.check)
 

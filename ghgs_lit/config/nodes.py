@@ -87,12 +87,12 @@ class Phases(Options):
 
 
 class Miniature(Options):
-    """A small data set of built-in people in the published layout of data=..."""
+    """A small data set of built-in people."""
 
     people: Phases = Phases()
     """Number of people of each phase."""
     size: Side = 256
-    """Longer side of the photographs, pixels."""
+    """Longer side of the photographs, half that of the textures of scans; pixels."""
 
 
 class Check(Options):

@@ -247,9 +247,9 @@ class Prepare(Verb):
 
     task: Literal["render", "miniature", "check"] = "render"
     """render: render what is missing. check: read every photograph and camera once, with tables and a
-    contact sheet. miniature: write a small data set of built-in people in the published layout."""
+    contact sheet. miniature: write built-in people as scans of THuman2.0."""
     miniature: Miniature = Miniature()
-    """A small data set of built-in people."""
+    """Of task=miniature, and of ``scripts/miniature.py``."""
     check: Check = Check()
     """What task=check expects of data."""
     seed: Seed = 0

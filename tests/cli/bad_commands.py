@@ -105,7 +105,7 @@ MISSING = [
     ("prepare data=scans", 1, "data.source: expected", "found null"),
     ("prepare data=scans data.root={tmp}/out data.source={tmp}/none", 1, "{tmp}/none"),
     ("prepare data=thuman2 data.source={empty} data.root={tmp}/out", 1, "{empty}"),
-    ("prepare task=miniature data=zju_mocap", 1, "data.root: expected", "found null"),
+    ("prepare task=miniature data=zju_mocap", 1, "task=miniature: expected", "found zju_mocap"),
     ("import", 1, "out: expected a value (out=...); found none"),
     ("import out={tmp}/x.ckpt encoder=vggt_nano compat=none", 1, "vggt: expected a file"),
     ("import out={tmp}/x.ckpt vggt={tmp}/none.pt encoder=vggt_nano compat=none", 1, "{tmp}/none.pt"),

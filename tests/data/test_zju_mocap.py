@@ -19,7 +19,7 @@ from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
 from ghgs_lit.data.zju_mocap.reader import Frames, ZJUMoCapReader
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
-from ghgs_lit.synthesis.miniatures import zju_mocap
+from scripts.miniatures import zju_mocap
 from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
 
 OPENCV = np.load(Path(__file__).parents[1] / "fixtures" / "opencv_camera.npz")
