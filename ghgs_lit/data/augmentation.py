@@ -73,7 +73,6 @@ class Augmentation(Options):
 
         Args:
             size, target: where none are drawn; the drawn inputs' targets keep this proportion.
-            seed, step: of the run.
         """
         rng = np.random.default_rng([seed, _SIZES, step])
         chosen, share = rng.uniform(size=2)
@@ -91,8 +90,6 @@ class Augmentation(Options):
         """The batch of a training step, as imperfect captures show it in a share ``chance`` of the steps.
 
         Args:
-            batch: its samples.
-            seed, step: of the run.
             indices: numbers of the samples in the run.
         """
         if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:

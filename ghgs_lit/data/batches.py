@@ -35,7 +35,6 @@ class BatchBuilder:
         """Samples with equal numbers of inputs and equal protocols of targets, which may be none.
 
         Args:
-            specs: the samples.
             size, target_size: (height, width) of inputs and targets (None: those of the photographs).
         """
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]

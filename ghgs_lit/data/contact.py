@@ -48,7 +48,6 @@ def save_sheet(rows: Mapping[str, Sequence[tuple[str, Tile]]], path: Path) -> No
 
     Args:
         rows: (label, tile) pairs by name of the subject; labels are camera and IoU.
-        path: the picture.
     """
     width = max(sum(tile.shape[1] + 2 for _, tile in tiles) for tiles in rows.values())
     step = _HEIGHT + 2 * _LINE

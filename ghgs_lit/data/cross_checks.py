@@ -13,8 +13,6 @@ def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
     """``seen`` with the agreement of those masks that no body checked; at most one problem for each subject.
 
     Args:
-        seen: photographs of a phase.
-        reader: gives their places.
         least: share of a mask that the other masks of its subject must allow.
     """
     by_subject: dict[str, list[int]] = {}

@@ -55,10 +55,8 @@ class PhotographsDataModule(LightningDataModule):
     """Batches of a data set.
 
     Args:
-        dataset: which photographs, and how they become batches.
         views: :class:`ViewProtocol` or its mapping.
         targets: :class:`TargetProtocol` or its mapping.
-        seed: seed of all samples.
         augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
 
     Raises:
@@ -170,8 +168,6 @@ class PhotographsDataModule(LightningDataModule):
         """The sample of one subject; nothing of others is read. Arguments as for :meth:`evaluation_loader`.
 
         Args:
-            subject: its name.
-            split, views: whose inputs.
             targets: a protocol or its mapping, or several; None: the batch has no targets.
         """
         protocols = [] if targets is None else _protocols(targets)

@@ -112,11 +112,8 @@ class DataOptions(Options):
 
     @property
     def folder(self) -> Path:
-        """The folder of the data, which a subclass names as ``root``.
-
-        Raises:
-            InputError: ``data.root`` is null or no folder.
-        """
+        """The folder of the data, which a subclass names as ``root``. InputError: ``data.root`` is null or no
+        folder."""
         folder = required_folder("data.root", "the folder of the data set", self.root)
         if not folder.is_dir():
             raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
@@ -142,11 +139,7 @@ class DataSet(DataOptions):
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:
-    """The path configured at ``key``, which need not exist.
-
-    Raises:
-        InputError: it is null.
-    """
+    """The path configured at ``key``, which need not exist. InputError: it is null."""
     if value is None:
         raise InputError(f"{key}: expected {expected}; found null")
     return Path(value).expanduser()

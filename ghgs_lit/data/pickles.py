@@ -81,7 +81,6 @@ def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> A
     """Read the arrays, scalars and plain containers of a pickle.
 
     Args:
-        path: the file.
         also: further names that are admitted, (module, name), with harmless replacements for them.
 
     Raises:
@@ -97,9 +96,7 @@ def load_npy(path: Path) -> Any:
     """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`.
 
     A pickled object in an array without dimensions (``np.save`` of a dictionary) is returned itself.
-
-    Raises:
-        InputError: it is missing, broken, or names anything but arrays and plain containers.
+    InputError: it is missing, broken, or names anything but arrays and plain containers.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected an .npy file; found no such file")

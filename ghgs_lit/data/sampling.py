@@ -148,14 +148,7 @@ class TargetProtocol(Options):
     def evaluation(
         self, available: Sequence[int], inputs: Sequence[int], ring: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """The targets of an evaluation sample.
-
-        Args:
-            available: positions of the subject.
-            inputs: positions of the sample's inputs.
-            ring: number of positions on a full ring.
-            rng: random numbers of the subject.
-        """
+        """The targets of an evaluation sample."""
         if self.kind == "cameras":
             return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
@@ -187,9 +180,6 @@ class TrainingSampler:
     """The endless sequence of training samples.
 
     Attributes:
-        subjects: available positions by name.
-        views, targets: the protocols.
-        ring: number of positions on a full ring.
         batch_size: samples of one step in each process.
         seed: together with the step and the index in the batch, it determines a sample.
     """
@@ -246,11 +236,7 @@ def evaluation_samples(
     """One sample for each subject, always the same ones.
 
     Args:
-        subjects: available positions by name.
-        count: number of inputs.
         protocols: whose targets a sample has, one after another; none: samples without targets.
-        ring: number of positions on a full ring.
-        seed: of random targets.
         positions: input positions by number of inputs; evenly spaced where they are not listed.
 
     Raises:

@@ -24,7 +24,6 @@ def texts(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.Dat
     """The columns of ``frame`` that a table shows.
 
     Args:
-        frame: with one line for each of the table.
         columns: by heading, the name of a column and its format; those that ``frame`` has not are left out.
     """
     return pd.DataFrame(

@@ -15,7 +15,6 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
 
     Args:
         config: the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used).
-        data: the photographs.
 
     Raises:
         InputError: a value is impossible, a metric cannot be computed, the split has no subjects, or a

@@ -149,11 +149,7 @@ def measure(
     """Measure one method; the targets of all protocols come from one prediction.
 
     Args:
-        method: what is measured.
-        name: its name in the rows.
         loader: batches with targets and their protocols.
-        metrics: what is computed of the renders.
-        device: where the method runs.
         pictures: folder for pictures (None: none are written).
         picture_count: the number of subjects, the first ones, that are drawn.
 
@@ -196,12 +192,7 @@ def measure_all(
     """Measure all methods on the same subjects and photographs.
 
     Args:
-        methods: what is measured, by name.
         data: gives the photographs (``evaluation_loader``).
-        views: numbers of input views.
-        targets: target protocols by name.
-        split: subjects of ``train`` or ``val``.
-        metrics, device, pictures, picture_count: as for :func:`measure`.
 
     Returns:
         The rows of every number of views, protocol and method, in this order.

@@ -46,7 +46,6 @@ def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n 
     """The bounding box of each mask, as a mask; empty where the mask is empty.
 
     Args:
-        mask: one mask for each image.
         margin: part of the box's height and width that is added on each side, inside the image.
     """
 
@@ -156,7 +155,6 @@ def depth_error_mm(
 
     Args:
         depth, truth: metres; a truth of 0 is unknown.
-        region: the pixels that count.
     """
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))

@@ -106,10 +106,7 @@ class ImageMetrics:
 
     @torch.no_grad()
     def __call__(
-        self,
-        image: Float[Tensor, "n 3 h w"],
-        target: Float[Tensor, "n 3 h w"],
-        mask: Bool[Tensor, "n h w"],
+        self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Bool[Tensor, "n h w"]
     ) -> dict[str, Tensor]:
         """One value per image for each metric; nan where a region is empty."""
         options = self.options

@@ -126,11 +126,8 @@ class Synthetic(_Renderable):
         return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people of ``splits`` that the cache lacks.
-
-        Raises:
-            InputError: the people of ``bench`` are not those of its definition (:mod:`.bench`).
-        """
+        """Render the people of ``splits`` that the cache lacks. InputError: the people of ``bench`` are not
+        those of its definition (:mod:`.bench`)."""
         if bench.SPLIT in splits:
             made_with = everything(self.rig.build(), self.render)
             bench.check_settings({"people_seed": self.people_seed, **made_with})
@@ -174,11 +171,7 @@ class Scans(DataSet, _Renderable):
 
     @property
     def source_folder(self) -> Path:
-        """The folder of the scans.
-
-        Raises:
-            InputError: ``source`` is null.
-        """
+        """The folder of the scans. InputError: ``source`` is null."""
         return required_folder("data.source", "a folder of scans", self.source)
 
     def scans(self) -> PersonSource:

@@ -163,12 +163,7 @@ def render_people(
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
 
     Args:
-        root: folder of the rendered data set.
         names: names of the subjects of each phase.
-        source: loads them.
-        rig: the cameras, and how subjects are placed.
-        settings: what is rendered.
-        seed: seed of heights, yaws and lights.
         workers: number of processes (None: one for each core; 0: this one).
 
     Returns:

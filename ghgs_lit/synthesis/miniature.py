@@ -42,10 +42,8 @@ def make_miniature(dataset: DataSet, people_of: Mapping[str, int], size: int, se
     """Write scans below ``data.source``, their fits into a folder beside it, and the split files.
 
     Args:
-        dataset: says where.
         people_of: how many, ``{train: n, val: n}``.
         size: textures are scaled down to at most twice as many pixels a side.
-        seed: of people and their placement.
 
     Returns:
         The folder of the scans.
@@ -63,11 +61,8 @@ def make_miniature(dataset: DataSet, people_of: Mapping[str, int], size: int, se
 
 @contextlib.contextmanager
 def writing(*folders: Path) -> Iterator[None]:
-    """Mark as a miniature's what is written into folders.
-
-    Raises:
-        InputError: a folder holds anything but a miniature.
-    """
+    """Mark as a miniature's what is written into folders. InputError: a folder holds anything but a
+    miniature."""
     for folder in folders:
         _check_own(folder)
     for folder in folders:

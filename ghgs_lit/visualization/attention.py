@@ -20,9 +20,6 @@ def chosen_token(
     """Index of a packed token that has a point.
 
     Args:
-        tokens: packed tokens of a batch.
-        points: their points.
-        element: index of the subject in the batch.
         at: ``(view, row, column)`` on the grid of tokens (None: the middle of the subject in its first view).
 
     Returns:
@@ -54,8 +51,6 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 
     Args:
         batch: gives the photographs, padded to whole patches.
-        tokens: packed tokens of the batch.
-        attention: the query, its neighbours and their weights.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views

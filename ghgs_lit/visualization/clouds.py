@@ -15,9 +15,6 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
     """Point clouds of one subject.
 
     Args:
-        batch: colours, masks and bodies.
-        prediction: the predicted points.
-        element: index of the subject in the batch.
         limit: maximum number of points and of vertices.
 
     Returns:

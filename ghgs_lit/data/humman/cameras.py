@@ -36,7 +36,6 @@ def read_calibration(path: Path, kind: str) -> Calibration:
     """Read the cameras of a sequence.
 
     Args:
-        path: its ``cameras.json``.
         kind: ``color`` or ``depth``.
 
     Raises:

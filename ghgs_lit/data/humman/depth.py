@@ -20,9 +20,6 @@ def surface_points(
     """What the depth cameras see inside all masks.
 
     Args:
-        sequence: folder of the sequence.
-        frame: number of the frame.
-        depth_cameras, cameras: calibrations of the depth and of the colour cameras.
         masks: [h, w] bool by number of the colour camera.
 
     Returns:

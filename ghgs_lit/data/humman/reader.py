@@ -36,15 +36,12 @@ class HuMManReader(FrameReader):
     """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
 
     Args:
-        folder: root of the data set.
         sequences: names of folders; missing ones are left out.
         frames: numbers of frames; those that a sequence lacks are left out, and of a frame the cameras.
         masks: folder of masks, ``kinect_mask`` or ``kinect_mask_manual``.
         body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
             cameras inside all masks; ``none``.
-        smpl_model: the model's file, or a folder that has it.
         limit: number of frames in all, the first ones (None: all).
-        strict: as for :class:`Reader`.
 
     Raises:
         InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.

@@ -18,7 +18,6 @@ def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf)
     is 0 and ``found`` is not; 0 where there are no values.
 
     Args:
-        found, expected: of one shape.
         norm: of the difference: the largest of all values, or 2 for their root mean square.
     """
     if found.numel() == 0:
@@ -52,8 +51,6 @@ def differences(
     """What a preset changes.
 
     Args:
-        found: of the preset.
-        expected: of the yardstick.
         masks: of the inputs [B, V, H, W].
 
     Returns:

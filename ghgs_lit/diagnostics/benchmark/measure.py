@@ -149,9 +149,6 @@ def record_cases(
     Args:
         cases: of each source the yardstick first.
         batches: on the device, with targets.
-        metrics: of the renders.
-        device: where the models are.
-        warmup, repeats: as for :func:`time_cases`.
         count_flops: whether FLOPs are counted, which takes one more forward pass.
     """
     works: list[list[Work]] = [[] for _ in cases]

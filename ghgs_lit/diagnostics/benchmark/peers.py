@@ -44,12 +44,7 @@ def measure_peers(
     """Measure every method on each subject alone.
 
     Args:
-        methods: what is measured, by name.
-        data: gives the photographs.
-        views: numbers of input views.
-        targets: target protocols by name.
         split, subjects: whose subjects, and how many, the first ones; None: all.
-        metrics, device: as for :func:`ghgs_lit.evaluation.measure.measure`.
         journal: has what an earlier run measured, and gets the rest.
         identity: of all that numbers depend on beside method, views and subject.
 

@@ -32,11 +32,6 @@ def draw_presets(rows: Sequence[Row], machine: str, about: str) -> Figure:
 
     The error is the loss of PSNR against ``none``; of weights that nobody trained, the largest relative
     difference.
-
-    Args:
-        rows: of a benchmark.
-        machine: what the times were measured on, in words.
-        about: what was measured, in words.
     """
     whole = totals(rows)
     is_trained = all(row["trained"] for row in whole)

@@ -31,10 +31,7 @@ def ellipsoid_batch(
 
     Args:
         share: part of the frame that the subject covers.
-        views: number of input views, at even angles.
         size: side, or height and width, of the photographs in pixels.
-        batch: number of elements.
-        seed: of the noise.
 
     Returns:
         The batch; its target is the first input view.

@@ -44,11 +44,7 @@ def tasks_of(
     dtypes: Sequence[str] | None = None,
     quick: bool = False,
 ) -> list[Task]:
-    """Everything to run; None: all stages, families or dtypes.
-
-    Raises:
-        InputError: a name that is not known.
-    """
+    """Everything to run; None: all stages, families or dtypes. InputError: a name that is not known."""
     stages = _chosen("stages", stages, tuple(STAGES))
     families = _chosen("families", families, tuple(FAMILIES))
     dtypes = _chosen("dtypes", dtypes, DTYPES)
@@ -70,7 +66,6 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
     """The rows of all tasks; those that ``journal`` has already are read from it.
 
     Args:
-        tasks: what to run.
         journal: a file of one line for each task, which is written as the tasks end.
         workers: processes; 0: this one.
     """

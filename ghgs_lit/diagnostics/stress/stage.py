@@ -26,20 +26,16 @@ class Stage:
     is rounded at random, in units of eps.
 
     Args:
-        name: of the row.
         ingredients: what the inputs contain; families of others do not apply.
         make: the inputs of one case in float64, from a family and a generator.
         run: outputs [n, ...] of n cases, whose inputs are stacked; in the dtype of the inputs.
         factor: at most :data:`LARGEST`.
-        reason: why this factor.
         reference: the same in float64 by other means; None: ``run`` itself in float64.
         gradients: inputs whose gradients are compared, too.
         steady: inputs that are not rounded for kappa.
         seeds: cases of each family and dtype in the full run.
         quick: the same in a quick run, which says nothing of rare failures.
         network: computes in autocast's dtype; all others stay in float32 or wider.
-        dtypes: those that the stage has.
-        no_dtype: why it has no others.
         kappa: a least condition number, where the stage's definition subtracts large numbers.
         excluded: families that do not apply although their ingredient does, with the reason.
         sizes: size of the numbers [n] whose differences gradients are, where those cancel by definition.

@@ -34,10 +34,7 @@ class TableOptions:
     """What is shown.
 
     Args:
-        layout: rows and columns.
         views, targets, metrics: a selection; None: those of the layout and of the runs.
-        reported: whether the paper's figures are shown.
-        test: the test against the reference row.
         unit: a regular expression whose first group is the person, where subjects are frames of people.
         illustration: whether a note says that the numbers are no result, of which none is bold.
     """
@@ -56,9 +53,7 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
     """One table for each setting that occurs (and each model, where rows are ablations).
 
     Args:
-        sweep: our runs.
         others: results of other methods, of each file.
-        options: what is shown.
 
     Raises:
         InputError: nothing was measured on these targets; two runs claim one cell; the results of other

@@ -26,10 +26,8 @@ class Layout:
     """Rows (``ablation``: all four combinations, or ``methods``) and groups of columns.
 
     Args:
-        name: the layout's name.
         rows: ``ablation`` or ``methods``.
         columns: ``views`` or ``data``, one group for each.
-        views: numbers of input views.
         heading: above each group of columns: its ``views``, its ``data`` or ``none``.
         reported: the paper's table whose figures are shown beside the measured ones.
     """
@@ -121,12 +119,10 @@ class Table:
     """One table: everything that a writer of a format needs.
 
     Args:
-        layout: its layout.
         rows: what was measured, as in :class:`Sweep`.
         planned: the training runs of the sweep, finished or not, that belong to it.
         stub: headings of the first columns.
         groups, metrics: the columns.
-        lines: the rows.
         cells: by ``CELL``, every line and column in order: ``mean`` over subjects and seeds (nan: no number),
             ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as
             tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best``: whether it is the best of its

@@ -64,7 +64,6 @@ class StoredCamera:
     """One camera as a file stores it.
 
     Attributes:
-        name: that of its photographs.
         origin: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
@@ -120,8 +119,6 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
     """The camera of a photograph that a stored camera means.
 
     Args:
-        camera: as stored.
-        convention: what its numbers mean.
         photograph: (height, width) in pixels; intrinsics of another size with the same ratio of the sides are
             scaled.
 

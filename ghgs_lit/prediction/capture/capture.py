@@ -18,7 +18,6 @@ class Capture:
     """Photographs of one instant. :meth:`read` makes it from files.
 
     Attributes:
-        name: of the instant.
         photographs: two or more.
     """
 
@@ -30,7 +29,6 @@ class Capture:
         """The photographs of a folder with their cameras.
 
         Args:
-            images: the folder.
             cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`.
             options: as for :class:`ghgs_lit.prediction.capture.folder.CaptureFolder`, such as ``masks``.
 

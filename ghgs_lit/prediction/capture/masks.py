@@ -28,10 +28,8 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
 
     An alpha channel counts unless it is the same everywhere. Of labels any but 0 is the subject, and the
-    largest number beside them, void, is not.
-
-    Raises:
-        InputError: it cannot be decoded, or fits the photograph neither as shown nor as stored.
+    largest number beside them, void, is not. InputError: it cannot be decoded, or fits the photograph neither
+    as shown nor as stored.
     """
     image = read_image(path)
     values = np.asarray(image)
@@ -54,11 +52,8 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask: where a photograph differs from one without the subject, without specks and holes.
-
-    Raises:
-        InputError: the background's photograph has another size, or nothing differs.
-    """
+    """A mask: where a photograph differs from one without the subject, without specks and holes. InputError:
+    the background's photograph has another size, or nothing differs."""
     background = read_pixels(path)
     fits = background.size == pixels.size
     require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)

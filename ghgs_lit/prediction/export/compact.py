@@ -24,7 +24,6 @@ def converted(ply: bytes, name: str) -> bytes:
     """The content of a file of another format.
 
     Args:
-        ply: of a file of :func:`ghgs_lit.prediction.export.ply.write_ply`.
         name: one of ``CONVERTED``.
 
     Raises:

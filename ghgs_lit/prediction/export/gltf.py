@@ -26,7 +26,6 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
     """The content of a file of the Gaussians of one subject (RGB colours).
 
     Args:
-        gaussians: in the world of the files.
         up: the unit vector [3] of that world that points up.
 
     Raises:

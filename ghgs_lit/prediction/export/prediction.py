@@ -38,7 +38,6 @@ class Format:
     Attributes:
         files: their names below the directory of the prediction; one with ``{view}`` or ``{frame}`` stands
             for a file of each view, or of each picture of the turntable.
-        contents: of these files, in their order.
         package: that it needs.
         extra: of this package, which installs it.
     """
@@ -125,16 +124,8 @@ def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace an input, or a file that :func:`write_prediction` did not write.
-
-    Args:
-        directory: of the outputs.
-        names: of these, below it.
-        inputs: files that are read.
-
-    Raises:
-        InputError: names the first such file.
-    """
+    """Refuse to replace an input, or a file that :func:`write_prediction` did not write. InputError: names
+    the first such file."""
     read = {path.resolve() for path in inputs}
     written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
     for name in names:
@@ -181,9 +172,7 @@ def write_prediction(
         directory: files that an earlier prediction wrote are replaced, others stay.
         batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets,
             or with the photographs where it has none.
-        prediction: of this batch.
         renderer: draws the turntable, and the input views for the report.
-        options: the formats and the frame.
         facts: further plain data for the report, such as the seconds of each stage.
 
     Returns:

@@ -17,7 +17,6 @@ def mp4_bytes(pictures: Sequence[np.ndarray], fps: int) -> bytes:
 
     Args:
         pictures: at least one.
-        fps: pictures per second.
     """
     import imageio_ffmpeg
 

@@ -88,7 +88,6 @@ def read_content(path: str | Path, up: str | None) -> Content:
     """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``), or a PLY.
 
     Args:
-        path: the directory or the file.
         up: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y`` for a PLY.
 
     Raises:

@@ -77,11 +77,8 @@ class _Splats:
 
 
 def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differentiable: bool) -> _Splats:
-    """Project all Gaussians into their views and list the splats of each tile.
-
-    Raises:
-        InputError: the lists, with their gradients where they are needed, would exceed :data:`_MEMORY`.
-    """
+    """Project all Gaussians into their views and list the splats of each tile. InputError: the lists, with
+    their gradients where they are needed, would exceed :data:`_MEMORY`."""
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)

@@ -30,11 +30,8 @@ def model_folder(path: Path) -> Path | None:
 
 
 def read_colmap(path: Path) -> CameraFile:
-    """Registered photographs of a sparse model.
-
-    Raises:
-        InputError: it cannot be read, pycolmap is not installed, or a camera model is not known.
-    """
+    """Registered photographs of a sparse model. InputError: it cannot be read, pycolmap is not installed, or
+    a camera model is not known."""
     folder = model_folder(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
     try:
