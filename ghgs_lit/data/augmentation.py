@@ -69,11 +69,8 @@ class Augmentation(Options):
         return self
 
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
-        """Sizes of the inputs and of the targets of a step.
-
-        Args:
-            size, target: where none are drawn; the drawn inputs' targets keep this proportion.
-        """
+        """Sizes of the inputs and of the targets of a step. ``size``, ``target``: where none are drawn; the
+        drawn inputs' targets keep this proportion."""
         rng = np.random.default_rng([seed, _SIZES, step])
         chosen, share = rng.uniform(size=2)
         drawn = size if self.sizes is None else self.sizes[int(chosen * len(self.sizes))]
@@ -88,10 +85,7 @@ class Augmentation(Options):
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """The batch of a training step, as imperfect captures show it in a share ``chance`` of the steps.
-
-        Args:
-            indices: numbers of the samples in the run.
-        """
+        ``indices``: numbers of the samples in the run."""
         if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
             return batch
         return self.imperfections(

@@ -11,10 +11,7 @@ from ghgs_lit.data.silhouettes import height, supports, twins
 
 def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
     """``seen`` with the agreement of those masks that no body checked; at most one problem for each subject.
-
-    Args:
-        least: share of a mask that the other masks of its subject must allow.
-    """
+    ``least``: share of a mask that the other masks of its subject must allow."""
     by_subject: dict[str, list[int]] = {}
     for i, one in enumerate(seen):
         if one.silhouette is not None:

@@ -166,10 +166,7 @@ class PhotographsDataModule(LightningDataModule):
         targets: Targets | Sequence[Targets] | None = None,
     ) -> Batch:
         """The sample of one subject; nothing of others is read. Arguments as for :meth:`evaluation_loader`.
-
-        Args:
-            targets: a protocol or its mapping, or several; None: the batch has no targets.
-        """
+        ``targets``: a protocol or its mapping, or several; None: the batch has no targets."""
         protocols = [] if targets is None else _protocols(targets)
         available = {subject: self.subjects(split)[subject]}
         return self.builder(split).batch(self._evaluation_samples(available, protocols, views))

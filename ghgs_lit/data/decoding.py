@@ -53,14 +53,8 @@ def read_photograph(path: Path) -> np.ndarray:
 
 
 def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read channel 0 of a mask or depth map.
-
-    Args:
-        size: (height, width) of its photograph, which it must have too.
-
-    Raises:
-        InputError: it is missing, cannot be decoded, has another size, or is no map of whole numbers.
-    """
+    """Read channel 0 of a mask or depth map. ``size``: (height, width) of its photograph, which it must have
+    too. InputError: it is missing, cannot be decoded, has another size, or is no map of whole numbers."""
     array = np.asarray(read_image(path))
     if array.dtype.kind not in "bui":
         raise InputError(f"{path}: expected whole numbers; found {array.dtype}")
@@ -93,14 +87,8 @@ def check_extent(place: Path | str, vertices: np.ndarray) -> None:
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
-    """Convert to a finite float64 array.
-
-    Args:
-        shapes: the shapes that are accepted; None is any length.
-
-    Raises:
-        InputError: it is not an array of numbers, has another shape, or is not finite.
-    """
+    """Convert to a finite float64 array. ``shapes``: the shapes that are accepted; None is any length.
+    InputError: it is not an array of numbers, has another shape, or is not finite."""
     try:
         array = np.asarray(array)
         if array.dtype.kind in "cmM":

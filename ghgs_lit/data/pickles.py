@@ -78,14 +78,9 @@ def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], 
 
 
 def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """Read the arrays, scalars and plain containers of a pickle.
-
-    Args:
-        also: further names that are admitted, (module, name), with harmless replacements for them.
-
-    Raises:
-        InputError: it is missing, broken, or names anything else, which is then not called.
-    """
+    """Read the arrays, scalars and plain containers of a pickle. ``also``: further names that are admitted,
+    (module, name), with harmless replacements for them. InputError: it is missing, broken, or names anything
+    else, which is then not called."""
     if not path.is_file():
         raise InputError(f"{path}: expected a pickle; found no such file")
     with path.open("rb") as stream:

@@ -134,15 +134,9 @@ class Photographs:
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: tuple[int, int] | None = None
     ) -> View:
-        """One photograph, resized together with its intrinsics.
-
-        Args:
-            size: (height, width) in pixels; None: that of all.
-
-        Raises:
-            InputError: a file is missing or bad, the reader gives something else than a :class:`View` has, or
-                the mask is empty.
-        """
+        """One photograph, resized together with its intrinsics. ``size``: (height, width) in pixels; None:
+        that of all. InputError: a file is missing or bad, the reader gives something else than a
+        :class:`View` has, or the mask is empty."""
         size = size or self.size
 
         def read() -> View:

@@ -11,15 +11,10 @@ from ghgs_lit.evaluation.protocols import target_protocols
 
 
 def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
-    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read.
-
-    Args:
-        config: the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used).
-
-    Raises:
-        InputError: a value is impossible, a metric cannot be computed, the split has no subjects, or a
-            subject lacks an input or a target.
-    """
+    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read. ``config``:
+    the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used). InputError: a value is
+    impossible, a metric cannot be computed, the split has no subjects, or a subject lacks an input or a
+    target."""
     evaluation = config["evaluation"]
     for key in ("views", "targets"):
         found = evaluation[key]

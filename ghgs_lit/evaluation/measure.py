@@ -189,14 +189,9 @@ def measure_all(
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Measure all methods on the same subjects and photographs.
-
-    Args:
-        data: gives the photographs (``evaluation_loader``).
-
-    Returns:
-        The rows of every number of views, protocol and method, in this order.
-    """
+    """Measure all methods on the same subjects and photographs. ``data``: gives the photographs
+    (``evaluation_loader``). Returns: The rows of every number of views, protocol and method, in this
+    order."""
     rows: list[Row] = []
     for count in views:
         loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)

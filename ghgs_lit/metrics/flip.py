@@ -132,11 +132,7 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
 
 
 def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
-    """FLIP of each pixel, in [0, 1].
-
-    Args:
-        image, target: values outside [0, 1] are clamped first.
-    """
+    """FLIP of each pixel, in [0, 1]. ``image``, ``target``: values outside [0, 1] are clamped first."""
     # Each image separately: rounding can depend on the position in memory, and equal images must give 0.
     with torch.autocast(image.device.type, enabled=False):
         image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)

@@ -72,14 +72,9 @@ def read_fit(path: Path) -> SmplxFit:
 
 
 def find_fits(source: Path, fits: str | None) -> Path | None:
-    """The folder of the fits, None if there is none; each scan's own folder is looked into as well.
-
-    Args:
-        fits: the configured folder (None: one of :data:`FIT_FOLDERS` in or beside ``source``).
-
-    Raises:
-        InputError: the configured folder does not exist.
-    """
+    """The folder of the fits, None if there is none; each scan's own folder is looked into as well. ``fits``:
+    the configured folder (None: one of :data:`FIT_FOLDERS` in or beside ``source``). InputError: the
+    configured folder does not exist."""
     if fits is not None:
         folder = Path(fits).expanduser()
         if not folder.is_dir():
@@ -198,14 +193,8 @@ def _smplx_model(folder: Path) -> Any:
 
 
 def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Vertices [10475, 3] of the male SMPL-X model, before scale and translation.
-
-    Args:
-        parameters: by name, [1, n].
-
-    Raises:
-        InputError: the package or the model files are missing.
-    """
+    """Vertices [10475, 3] of the male SMPL-X model, before scale and translation. ``parameters``: by name,
+    [1, n]. InputError: the package or the model files are missing."""
     import torch
 
     model = _smplx_model(folder)

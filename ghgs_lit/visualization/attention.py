@@ -17,17 +17,9 @@ _QUERY = (255, 60, 220)
 def chosen_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
-    """Index of a packed token that has a point.
-
-    Args:
-        at: ``(view, row, column)`` on the grid of tokens (None: the middle of the subject in its first view).
-
-    Returns:
-        The token of that view that is nearest to the place; None where no token of the view has a point.
-
-    Raises:
-        InputError: ``at`` is outside the grid.
-    """
+    """Index of a packed token that has a point. ``at``: ``(view, row, column)`` on the grid of tokens (None:
+    the middle of the subject in its first view). Returns: The token of that view that is nearest to the
+    place; None where no token of the view has a point. InputError: ``at`` is outside the grid."""
     views, height, width = tokens.grid[1:]
     if at is not None:
         expected = f"view, row, column below {(views, height, width)}"

@@ -111,14 +111,8 @@ def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 def case_config(
     source: Source, skip: Mapping[str, Any], knobs: Mapping[str, Any], shared: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The configuration of a case as plain data.
-
-    Args:
-        shared: nodes that all cases have (``renderer``, ``precision``).
-
-    Raises:
-        InputError: a knob that the configuration does not have.
-    """
+    """The configuration of a case as plain data. ``shared``: nodes that all cases have (``renderer``,
+    ``precision``). InputError: a knob that the configuration does not have."""
     own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
     node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
     for key, value in knobs.items():

@@ -41,11 +41,8 @@ _COLUMNS = {
 
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
-    """One row for each case and stage; the row ``total`` has the errors and the budgets, too.
-
-    Args:
-        records: of each source the yardstick first.
-    """
+    """One row for each case and stage; the row ``total`` has the errors and the budgets, too. ``records``: of
+    each source the yardstick first."""
     rows: list[Row] = []
     for record in records:
         (means,) = summarize(record.metrics)

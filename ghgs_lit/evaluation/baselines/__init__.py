@@ -24,11 +24,8 @@ BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 def baseline(
     name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: Mapping[str, Any]
 ) -> Method:
-    """The baseline called ``name``, one of ``BASELINES``.
-
-    Args:
-        untrained: builds a model with random weights, for the baseline ``untrained``.
-    """
+    """The baseline called ``name``, one of ``BASELINES``. ``untrained``: builds a model with random weights,
+    for the baseline ``untrained``."""
     choice("baselines", name, BASELINES)
     if name in DEPTHS:
         return partial(splatted, depth_of=DEPTHS[name], renderer=renderer)

@@ -88,10 +88,7 @@ def true_depth(batch: Batch) -> Tensor:
 
 def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
     """Discs at a depth that is not learned, of pixels at the rim, too, where the data have mattes.
-
-    Args:
-        depth_of: gives depths of the inputs [B, V, H, W], metres.
-    """
+    ``depth_of``: gives depths of the inputs [B, V, H, W], metres."""
     batch = with_matte(batch, _MATTE)
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)

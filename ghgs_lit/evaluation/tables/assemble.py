@@ -50,15 +50,9 @@ class TableOptions:
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """One table for each setting that occurs (and each model, where rows are ablations).
-
-    Args:
-        others: results of other methods, of each file.
-
-    Raises:
-        InputError: nothing was measured on these targets; two runs claim one cell; the results of other
-            methods fit no table.
-    """
+    """One table for each setting that occurs (and each model, where rows are ablations). ``others``: results
+    of other methods, of each file. InputError: nothing was measured on these targets; two runs claim one
+    cell; the results of other methods fit no table."""
     layout = options.layout
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")

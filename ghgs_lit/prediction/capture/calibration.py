@@ -116,15 +116,9 @@ class Calibration:
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
-    """The camera of a photograph that a stored camera means.
-
-    Args:
-        photograph: (height, width) in pixels; intrinsics of another size with the same ratio of the sides are
-            scaled.
-
-    Raises:
-        InputError: the ratio of the sides differs.
-    """
+    """The camera of a photograph that a stored camera means. ``photograph``: (height, width) in pixels;
+    intrinsics of another size with the same ratio of the sides are scaled. InputError: the ratio of the sides
+    differs."""
     size = camera.size or photograph
     if not same_ratio(size, photograph):
         shown = tuple(_SHOWN if side == _CODED else side for side in size)

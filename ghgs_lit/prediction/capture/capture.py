@@ -15,11 +15,7 @@ from ghgs_lit.types import Batch, Cameras
 
 @dataclass(frozen=True)
 class Capture:
-    """Photographs of one instant. :meth:`read` makes it from files.
-
-    Attributes:
-        photographs: two or more.
-    """
+    """Photographs of one instant. :meth:`read` makes it from files. ``photographs``: two or more."""
 
     name: str
     photographs: tuple[Photograph, ...]

@@ -72,14 +72,8 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from a photograph to its matte.
-
-    Args:
-        name: one of :data:`SEGMENTERS`.
-
-    Raises:
-        InputError: its package is not installed.
-    """
+    """A function from a photograph to its matte. ``name``: one of :data:`SEGMENTERS`. InputError: its package
+    is not installed."""
     choice("segment", name, SEGMENTERS)
     try:
         import rembg

@@ -94,15 +94,9 @@ FORMATS: dict[str, Format] = {
 
 
 def output_options(config: Mapping[str, Any]) -> OutputOptions:
-    """The options of a verb's configuration, checked before any work.
-
-    Args:
-        config: plain data with ``formats`` (``all`` stands for all of them), ``up``, ``smooth`` and
-            ``turntable``.
-
-    Raises:
-        InputError: an unknown format, a value out of range, or a package that is not installed.
-    """
+    """The options of a verb's configuration, checked before any work. ``config``: plain data with ``formats``
+    (``all`` stands for all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a
+    value out of range, or a package that is not installed."""
     formats = config["formats"]
     formats = [formats] if isinstance(formats, str) else formats
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))

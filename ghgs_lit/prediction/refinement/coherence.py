@@ -210,13 +210,8 @@ def _best_points(
     pixels: Float[Tensor, "R 2"],
 ) -> tuple[Float[Tensor, "R 3"], Int[Tensor, " R"], Float[Tensor, " R"]]:
     """Points deepest in the other silhouettes, one of each ray, with the silhouette that it is least deep in.
-
-    Returns:
-        The points, the numbers of these silhouettes, and the signed depths in them in pixels.
-
-    Args:
-        view: the silhouette of each ray, in ascending order.
-    """
+    Returns: The points, the numbers of these silhouettes, and the signed depths in them in pixels. ``view``:
+    the silhouette of each ray, in ascending order."""
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
     views, points = range(len(pose)), []

@@ -89,14 +89,8 @@ def _bends(value: Any) -> bool:
 
 
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
-    """The mapping that a file of text holds.
-
-    Args:
-        kind, content: of such files, for messages.
-
-    Raises:
-        InputError: the file cannot be read or parsed, or holds something else.
-    """
+    """The mapping that a file of text holds. ``kind``, ``content``: of such files, for messages. InputError:
+    the file cannot be read or parsed, or holds something else."""
     try:
         # Editors of Windows mark UTF-8.
         value = parse(path.read_text(encoding="utf-8-sig"))

@@ -150,14 +150,8 @@ def has_intrinsics(fields: Any) -> bool:
 
 
 def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> StoredCamera:
-    """The camera that ``fields`` describe.
-
-    Args:
-        fields: matrices, lists and numbers by any of their names.
-
-    Raises:
-        InputError: a matrix is missing, or is none.
-    """
+    """The camera that ``fields`` describe. ``fields``: matrices, lists and numbers by any of their names.
+    InputError: a matrix is missing, or is none."""
 
     def array(what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
         value, names = find(fields, what), " or ".join(_NAMES[what])
