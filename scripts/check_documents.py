@@ -49,7 +49,7 @@ NOT_RUN = [
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"(ghgs table|python benchmarks/when_recalibration\.py) .*runs/ablation", "needs twelve runs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
-    (r"ghgs benchmark task=peers data=scans", "fits Gaussians to each person, for minutes"),
+    (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python benchmarks/half_precision", "takes an hour"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
@@ -68,7 +68,7 @@ TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a comma
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
     (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
-    (r"^(ghgs benchmark (?!.*(?:-help|task=)).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
+    (r"^(ghgs benchmark (?!.*-help).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),

@@ -1,4 +1,4 @@
-"""``ghgs benchmark``: run time against error of every preset and of other methods."""
+"""``ghgs benchmark``: run time against error of every preset."""
 
 import itertools
 import math
@@ -11,7 +11,6 @@ import lightning.pytorch as L
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.benchmark_peers import peers
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
@@ -19,7 +18,6 @@ from ghgs_lit.config.keys import is_below
 from ghgs_lit.diagnostics.benchmark import report
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
-from ghgs_lit.diagnostics.benchmark.peers import tables_of as tables_of_peers
 from ghgs_lit.diagnostics.benchmark.plot import draw_presets
 from ghgs_lit.diagnostics.benchmark.presets import (
     KNOBS,
@@ -30,32 +28,22 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     presets_of,
 )
 from ghgs_lit.diagnostics.output import print_tables, save_figure
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
-from ghgs_lit.weights.reading import SHIPPED
-
-TASKS = ("presets", "peers")
 
 
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the results last. Exit code 1 where a preset breaks its budget."""
     directory = output_dir()
-    choice("task", cfg.task, TASKS)
-    if cfg.task == "peers" and cfg.checkpoint is None:
-        cfg.checkpoint = SHIPPED
-    cfg = with_trained_data(cfg)
-    config = save_config(cfg, directory)
+    config = save_config(with_trained_data(cfg), directory)
     check_options(config, overrides())
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     with threads(config["threads"]):
-        if cfg.task == "peers":
-            content = peers(cfg, config, directory, device)
-        else:
-            content = _presets(configured_cases(config, device), config, device)
-        content = {"task": config["task"], "machine": machine_facts(device), **content}
+        content = _presets(configured_cases(config, device), config, device)
+        content = {"machine": machine_facts(device), **content}
     path = _write(directory, content, config)
     announce(path)
     if content["broken"]:
@@ -75,8 +63,6 @@ def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
         InputError: an option that has no effect beside the others.
     """
     require(bool(config["presets"]), "presets", "a list with a name", config["presets"])
-    for key in ("vs", "knobs") if config["task"] == "peers" else ():
-        require(config[key] is None, key, "null with task=peers", config[key])
     if config["checkpoint"] is None:
         require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
         return
@@ -152,11 +138,8 @@ def _weights(config: dict[str, Any], cases: list[Case]) -> str:
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
     """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
-    if content["task"] == "peers":
-        tables = tables_of_peers(rows)
-    else:
-        tables = report.tables_of(rows)
-        save_figure(draw_presets(rows, *words), directory / "benchmark.png")
+    tables = report.tables_of(rows)
+    save_figure(draw_presets(rows, *words), directory / "benchmark.png")
     print_tables(tables)
     print(*content.get("decisions", []), sep="\n", flush=True)
     source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())

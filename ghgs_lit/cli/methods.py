@@ -1,4 +1,4 @@
-"""The methods that `ghgs evaluate` and `ghgs benchmark task=peers` measure, as configured."""
+"""The methods that `ghgs evaluate` measures, as configured."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

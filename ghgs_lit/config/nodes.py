@@ -55,17 +55,6 @@ class PerScene(Options):
     """Where it starts."""
 
 
-class Peers(Options):
-    """The methods beside the model with task=peers."""
-
-    baselines: Texts = ("nearest_view", "hull", "photo_depth", "per_scene", "true_depth")
-    """Names as in ``ghgs evaluate baselines=``."""
-    views: tuple[Views, ...] = (3, 4, 5)
-    """Numbers of input views."""
-    targets: tuple[Text, ...] = ("release", "midway")
-    """Names of files of conf/targets."""
-
-
 class Timing(Options):
     """How times are taken."""
 

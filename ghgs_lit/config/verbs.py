@@ -9,7 +9,6 @@ from ghgs_lit.config.nodes import (
     Check,
     Miniature,
     PairedTest,
-    Peers,
     PerScene,
     Texts,
     Timing,
@@ -183,16 +182,12 @@ class Evaluate(Measured):
 class Benchmark(Measured):
     """Run time against error."""
 
-    task: Literal["presets", "peers"] = "presets"
-    """presets: every preset of conf/skip. peers: the model beside other methods."""
     checkpoint: Path | None = None
-    """null: random weights, of which only run times and differences mean something; with task=peers those
-    that come with the package."""
+    """null: random weights, of which only run times and differences mean something."""
     vs: Path | None = None
     """A second checkpoint, measured in the same rounds."""
     presets: tuple[Text, ...] = ("none", "exact", "balanced", "fast")
-    """Names of files of conf/skip; task=presets always measures none, too, which the others are compared
-    with."""
+    """Names of files of conf/skip; none, which the others are compared with, is always measured, too."""
     knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
     """Lists of values by key, such as {recalibration.k: [4, 8]}: each preset is measured with every
     combination."""
@@ -200,10 +195,6 @@ class Benchmark(Measured):
     """bench: frozen people of data=synthetic."""
     subjects: Count | None = 4
     """Number of subjects, the first of the split; null: all."""
-    peers: Peers = Peers()
-    """The methods beside the model with task=peers."""
-    per_scene: PerScene = PerScene()
-    """3D Gaussian splatting on each subject's inputs."""
     timing: Timing = Timing()
     """How times are taken."""
     threads: Count | None = None

@@ -1,1 +1,1 @@
-"""Measuring run time against error: presets and knobs, and a model beside other methods."""
+"""Measuring run time against error: presets and knobs."""

@@ -179,7 +179,6 @@ def test_impossible_settings_are_named(data, tmp_path, capsys):
         "presets=[]": "presets",
         "presets=exact": "presets",
         "vs=other.ckpt": "vs",
-        "task=speed": "task",
         "subjects=0": "subjects",
         "knobs={recalibration.colour:[1]}": "knobs.recalibration.colour",
     }.items():
