@@ -25,7 +25,6 @@ def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
 
 
 def _compared(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
-    """The photographs of one subject, compared."""
 
     def broken(one: Seen, line: str) -> Seen:
         return replace(one, problem=f"{reader.place(one.name, one.position, one.view)}: {line}")

@@ -35,7 +35,6 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
 
 
 def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol: TargetProtocol) -> None:
-    """Refuse a protocol that asks for photographs that a subject does not have."""
     reader = data.builder(split).targets.reader
     for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.specs:
         for spec in batch:

@@ -127,7 +127,6 @@ def decisions_of(rows: Iterable[Row]) -> list[Decision]:
 
 
 def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
-    """A picture of one subject for each protocol."""
     for protocol in dict.fromkeys(batch.targets.protocols):
         chosen = [p == protocol for p in batch.targets.protocols]
         part = dataclasses.replace(batch, targets=batch.targets.of_protocol(protocol))

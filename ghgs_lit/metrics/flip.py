@@ -32,7 +32,6 @@ _RGB_TO_XYZ = (
 
 
 def _transform_colors(image: Tensor, matrix: Tensor) -> Tensor:
-    """``matrix`` times the colour of every pixel."""
     return torch.einsum("ij,njhw->nihw", matrix, image)
 
 
@@ -44,7 +43,6 @@ def _xyz_matrices(like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _linear_rgb(image: Tensor) -> Tensor:
-    """sRGB to linear RGB."""
     steep = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(image > 0.04045, steep, image / 12.92)
 
@@ -56,7 +54,6 @@ def _opponent(xyz: Tensor) -> Tensor:
 
 
 def _from_opponent(ycc: Tensor) -> Tensor:
-    """The inverse of :func:`_opponent`."""
     y = (ycc[:, :1] + 16) / 116
     return torch.cat((y + ycc[:, 1:2] / 500, y, y - ycc[:, 2:] / 200), dim=1)
 

@@ -208,7 +208,6 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor | float:
-    """The background as a number or a tensor that broadcasts with ``color``."""
     if isinstance(background, (int, float)):
         return background
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)

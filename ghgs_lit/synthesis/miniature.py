@@ -84,7 +84,6 @@ def _mark(folder: Path, files: list[str] | None) -> None:
 
 
 def _check_own(folder: Path) -> None:
-    """Refuse a folder with files that no miniature wrote."""
     marker = folder / MARKER
     found = _files(folder) if folder.is_dir() else []
     if marker.is_file():

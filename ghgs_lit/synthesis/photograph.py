@@ -257,7 +257,6 @@ class Studio:
         return solid
 
     def _textured(self, part: int, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Texture values [n, c] at hits on one part."""
         uv = np.einsum("nk,nkc->nc", weights, self._uv[self._faces[face]])
         return sample_texture(self._textures[part], uv)
 

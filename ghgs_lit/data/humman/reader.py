@@ -70,7 +70,6 @@ class HuMManReader(FrameReader):
         self.subjects = dict(list(self.subjects.items())[:limit])
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
-        """Add the frames of one sequence that exist, with the cameras that have them."""
         cameras = read_calibration(path / "cameras.json", "color")
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
         found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
@@ -137,7 +136,6 @@ def _file(folder: Path, kind: str, kinect: int, number: int) -> Path:
 
 
 def _frames_of(folder: Path) -> set[int]:
-    """Numbers of the photographs in a folder; none if the folder is missing."""
     if not folder.is_dir():
         return set()
     return {int(p.stem) for p in folder.iterdir() if p.suffix == ".png" and p.stem.isdecimal()}

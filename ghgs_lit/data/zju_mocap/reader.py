@@ -93,7 +93,6 @@ class ZJUMoCapReader(FrameReader):
         self.subjects = dict(list(self.subjects.items())[:limit])
 
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
-        """Add the chosen frames of one sequence."""
         annotations = read_annotations(path / "annots.npy")
         count = len(annotations.intrinsics)
         if cameras is not None and cameras > count:

@@ -124,7 +124,6 @@ def tables_of(rows: Sequence[Row]) -> Tables:
 
 
 def _kept(row: Row) -> str:
-    """What became of the promises of a case."""
     promises = row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
     return "broken" if _broken(row) else "kept" if promises else "-"
 

@@ -139,7 +139,6 @@ def _rendered(
     device: torch.device,
     dtype: torch.dtype,
 ) -> dict[str, Tensor]:
-    """Image, alpha, depth, and the gradients of a score of them."""
     leaves = {n: getattr(splats, n).to(device, dtype, copy=True).requires_grad_() for n in ATTRIBUTES}
     found = render(Gaussians(**leaves, splits=splats.splits), cameras.to(device), backend, settings=settings)
     parts = {name: getattr(found, name) for name in ("image", "alpha", "depth")}

@@ -80,7 +80,6 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
 
 
 def _measured(rows: pd.DataFrame) -> list[str]:
-    """The metrics of some rows."""
     facts = {*SETTING, "variant", "views", "seed", "source", "run", "git", "subject", "count", "said"}
     return [name for name in rows if name not in facts and rows[name].notna().any()]
 

@@ -161,8 +161,6 @@ class _Training(_Strict):
 
 
 class _Provenance(_Strict):
-    """What tables read of the provenance of results."""
-
     config: dict[str, Any]
     config_hash: str | None = None
     # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint

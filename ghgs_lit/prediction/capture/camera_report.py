@@ -152,7 +152,6 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
 
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Other meanings of all cameras."""
     given = views[0].convention
     for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, _likely_resize(views))):
         inner = replace(given, intrinsics=intrinsics, resized=resized)
@@ -186,7 +185,6 @@ def _likely_resize(views: Sequence[StoredView]) -> float:
 
 
 def _plausible(view: StoredView) -> bool:
-    """Whether the principal point lies near the middle."""
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]
@@ -253,7 +251,6 @@ def _contrast(view: StoredView, mask: np.ndarray) -> float:
 
 
 def _twins(views: Sequence[StoredView]) -> tuple[str, ...]:
-    """The first two cameras with the same pose."""
     for one, other in itertools.combinations(views, 2):
         if np.allclose(one.camera.pose, other.camera.pose, rtol=1e-6, atol=1e-9):
             return one.name, other.name
@@ -274,7 +271,6 @@ def _size_line(size: float) -> str:
 def _explained(
     folder: CaptureFolder, given: Hypothesis, best: Hypothesis, tried: list[Hypothesis]
 ) -> Diagnosis:
-    """The diagnosis where another meaning fits."""
     size = best.size(folder)
     lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}", _size_line(size)]
     if best.option:

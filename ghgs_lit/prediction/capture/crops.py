@@ -86,7 +86,6 @@ def _refined(
 
 
 def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """The image multiplied by its matte."""
     return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
 
 

@@ -143,7 +143,6 @@ def _report_before(directory: Path) -> dict[str, Any]:
 
 
 def _written_before(directory: Path) -> list[str]:
-    """The files that earlier predictions wrote into a directory."""
     report = _report_before(directory)
     earlier = report.get("earlier_files")
     return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]

@@ -153,7 +153,6 @@ class Refinement:
 
 
 def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
-    """Photographs on black, masks and cameras of some views."""
     part = batch.of_views(views)
     return on_black(part), coverage(part)[:, :, None], part.cameras
 

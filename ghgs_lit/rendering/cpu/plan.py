@@ -82,7 +82,6 @@ def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
-    """The cameras as rows of ``layout.VIEW`` doubles."""
     intrinsics = cameras.intrinsics.detach().double().flatten(0, -3).numpy()
     extrinsics = cameras.extrinsics.detach().double().flatten(0, -3).numpy()
     rows = np.zeros((len(intrinsics), layout.VIEW))

@@ -72,7 +72,6 @@ def _rays_inputs(family: str, g: Generator) -> Values:
 
 
 def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
-    """Which rays hit a box."""
     directions, centers = ray_directions(cameras), cameras.centers[:, None, None]
     faces = [(middle + sign * half - centers) / directions for sign in (-1, 1)]
     return torch.minimum(*faces).amax(-1) < torch.maximum(*faces).amin(-1)

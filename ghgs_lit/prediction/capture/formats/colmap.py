@@ -67,7 +67,6 @@ def _names(folder: Path) -> dict[int, str]:
 
 
 def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
-    """The camera of a registered photograph."""
     origin, model = f"{folder}: {name}", camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))

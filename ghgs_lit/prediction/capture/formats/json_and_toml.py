@@ -73,7 +73,6 @@ def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) ->
 
 
 def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
-    """A camera of this package's JSON."""
     unknown = sorted(set(camera) - set(_KEYS))
     require(not unknown, origin, f"keys among {', '.join(_KEYS)}", unknown)
     require("intrinsics" in camera, origin, "intrinsics", sorted(camera))

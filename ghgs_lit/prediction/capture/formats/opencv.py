@@ -103,7 +103,6 @@ def read_easymocap(path: Path) -> CameraFile:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping of a YAML file of ``cv2.FileStorage``."""
 
     def parse(text: str) -> Any:
         try:
