@@ -62,8 +62,6 @@ class Timing(Options):
     """Rounds that do not count."""
     repeats: Count = 9
     """Rounds that count; each runs all presets, and each begins with another one."""
-    count_flops: bool = True
-    """False: one forward pass less for each batch and preset."""
 
 
 class Phases(Options):

@@ -256,8 +256,6 @@ class Stress(Verb):
     """Names of stages, as a run prints them; null: all."""
     families: tuple[Text, ...] | None = None
     """Names of families of inputs, as stress.md lists them; null: all."""
-    dtypes: tuple[Literal["float64", "float32", "bfloat16", "float16"], ...] | None = None
-    """null: all."""
     dump: Path | None = None
     """A training step that was not finite, <run>/faults/step_<n>.pt: run it again, and nothing else."""
     workers: Workers | None = None

@@ -39,17 +39,17 @@ class Times:
 
 @dataclass
 class Work:
-    """What a forward pass of a batch needs: FLOPs (None: not counted) and peak bytes by stage, and numbers
+    """What a forward pass of a batch needs: FLOPs and peak bytes by stage, and numbers
     of tokens, points, Gaussians and bytes of the PLY."""
 
-    flops: dict[str, float] | None
+    flops: dict[str, float]
     peaks: dict[str, int]
     counts: dict[str, float]
 
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
         """Of several batches: the mean, and the largest peak."""
-        flops = None if works[0].flops is None else _merged([work.flops for work in works], statistics.fmean)
+        flops = _merged([work.flops for work in works], statistics.fmean)
         peaks = _merged([work.peaks for work in works], max)
         return cls(flops, peaks, _merged([work.counts for work in works], statistics.fmean))
 
@@ -106,18 +106,13 @@ def threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def inspect(
-    case: Case, batch: Batch, device: torch.device, count_flops: bool
-) -> tuple[Work, Prediction, Rendering]:
-    """Predict a batch once for its FLOPs, where they are counted, and once for its memory."""
-    flops = None
-    if count_flops:
-        with FlopsProbe() as counted:
-            forward(case.model, case.renderer, batch, counted)
-        flops = counted.flops
+def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Prediction, Rendering]:
+    """Predict a batch once for its FLOPs and once for its memory."""
+    with FlopsProbe() as counted:
+        forward(case.model, case.renderer, batch, counted)
     memory = PeakProbe(device)
     prediction, rendering = forward(case.model, case.renderer, batch, memory)
-    return Work(flops, memory.peaks, _counts(prediction)), prediction, rendering
+    return Work(counted.flops, memory.peaks, _counts(prediction)), prediction, rendering
 
 
 def _counts(prediction: Prediction) -> dict[str, float]:
@@ -142,20 +137,18 @@ def record_cases(
     device: torch.device,
     warmup: int,
     repeats: int,
-    count_flops: bool,
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times.
 
     Args:
         cases: of each source the yardstick first.
         batches: on the device, with targets.
-        count_flops: whether FLOPs are counted, which takes one more forward pass.
     """
     works: list[list[Work]] = [[] for _ in cases]
-    records = [Record(case, Work(None, {}, {})) for case in cases]
+    records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):
         for record, mine in zip(records, works, strict=True):
-            work, *result = inspect(record.case, batch, device, count_flops)
+            work, *result = inspect(record.case, batch, device)
             if record.case.is_yardstick:
                 yardstick = result
             mine.append(work)

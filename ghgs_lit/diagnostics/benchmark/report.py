@@ -59,25 +59,22 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
             **record.work.counts,
             "differences": record.differences,
         }
-        rows += [stage_row(record, stage, total if stage == TOTAL else {}) for stage in record.times]
+        for stage, times in record.times.items():
+            rows.append(
+                {
+                    "model": record.case.source,
+                    "preset": record.case.label,
+                    "stage": stage,
+                    "seconds": times.median,
+                    "seconds_low": times.low,
+                    "seconds_high": times.high,
+                    "peak_bytes": record.work.peaks.get(stage),
+                    "flops": record.work.flops.get(stage),
+                    **dict.fromkeys(("max_rel_diff", "psnr", "psnr_loss_db", "budget_db")),
+                    **(total if stage == TOTAL else {}),
+                }
+            )
     return rows
-
-
-def stage_row(record: Record, stage: str, about: Mapping[str, Any]) -> Row:
-    """The row of one stage, with what else is known ``about`` it."""
-    times, work = record.times[stage], record.work
-    return {
-        "model": record.case.source,
-        "preset": record.case.label,
-        "stage": stage,
-        "seconds": times.median,
-        "seconds_low": times.low,
-        "seconds_high": times.high,
-        "peak_bytes": work.peaks.get(stage),
-        "flops": None if work.flops is None else work.flops.get(stage),
-        **dict.fromkeys(("max_rel_diff", "psnr", "psnr_loss_db", "budget_db")),
-        **about,
-    }
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
