@@ -12,6 +12,8 @@ Values = dict[str, Tensor]
 
 #: Names of the dtypes: the last two are those of autocast, with inputs in float32.
 DTYPES = ("float64", "float32", "bfloat16", "float16")
+#: Those of kernels and of photographs, which are never in float64.
+FLOAT32_ONLY = DTYPES[1:]
 
 #: The largest factor of a budget: more than this many roundings of its inputs no stage may lose.
 LARGEST = 100.0
@@ -57,7 +59,6 @@ class Stage:
     quick: int = 3
     network: bool = False
     dtypes: tuple[str, ...] = DTYPES
-    no_dtype: str = ""
     kappa: Callable[[Values], Tensor] | None = None
     excluded: Mapping[str, str] = field(default_factory=dict)
     sizes: Callable[[Values], Tensor] | None = None
@@ -68,8 +69,6 @@ class Stage:
     def __post_init__(self) -> None:
         if not (0 < self.factor <= LARGEST and self.reason):
             raise ValueError(f"{self.name}: a budget needs a factor up to {LARGEST} and a reason")
-        if (self.dtypes != DTYPES) != bool(self.no_dtype):
-            raise ValueError(f"{self.name}: dtypes that are left out need a reason")
 
     def missing(self, family: str) -> str | None:
         """Why there are no cases of a family; None where there are."""
