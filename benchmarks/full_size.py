@@ -67,7 +67,7 @@ def main() -> None:
     device = torch.device("cpu")
     batch = person(resolve(cfg), options.share)
     cases = variants(cfg, options.presets.split(","), device)
-    works = [inspect(case, batch, device, count_flops=True)[0] for case in cases]
+    works = [inspect(case, batch, device)[0] for case in cases]
     times = time_jobs([Job(case, [batch]) for case in cases], 0, options.repeats, device)
     report(cases, works, times, batch, options)
 

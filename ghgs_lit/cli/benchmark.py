@@ -30,19 +30,16 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     presets_of,
 )
 from ghgs_lit.diagnostics.output import print_tables, save_figure
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.reading import SHIPPED
 
-TASKS = ("presets", "peers", "scaling")
-
 
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the results last. Exit code 1 where a preset breaks its budget."""
     directory = output_dir()
-    choice("task", cfg.task, TASKS)
     if cfg.task == "peers" and cfg.checkpoint is None:
         cfg.checkpoint = SHIPPED
     cfg = cfg if cfg.task == "scaling" else with_trained_data(cfg)
@@ -67,16 +64,7 @@ def run(cfg: DictConfig) -> None:
 
 
 def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
-    """Refuse what cannot be measured.
-
-    Args:
-        config: of ``ghgs benchmark``, resolved.
-        given: overrides that were asked for.
-
-    Raises:
-        InputError: an option that has no effect beside the others.
-    """
-    require(bool(config["presets"]), "presets", "a list with a name", config["presets"])
+    """Refuse an option, or one of the overrides that were ``given``, that has no effect beside others."""
     for key in ("vs", "knobs") if config["task"] == "peers" else ():
         require(config[key] is None, key, "null with task=peers", config[key])
     if config["checkpoint"] is None:
@@ -94,10 +82,6 @@ _APPLIED = ("skip", "renderer", "precision")
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
     """Every source in every preset; for errors the yardstick is always among them.
-
-    Args:
-        config: of ``ghgs benchmark``, resolved.
-        device: of the models.
 
     Raises:
         FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.
@@ -148,7 +132,7 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
 def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
     """Measure how cost grows, on analytic scenes."""
     rows, fits = scaling.study(cases, config["scaling"], device, **config["timing"])
-    base = ", ".join(f"{name} {value:g}" for name, value in config["scaling"]["base"].items())
+    base = ", ".join(f"{name} {value:g}" for name, value in scaling.base_of(config["scaling"]).items())
     about = f"{_weights(config, cases)}; an ellipsoid, elsewhere {base}"
     random_weights = config["checkpoint"] is None
     return {"about": about, "random_weights": random_weights, "rows": rows, "fits": fits, "broken": []}

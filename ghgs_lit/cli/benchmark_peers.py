@@ -20,22 +20,21 @@ from ghgs_lit.weights.hub import sha256
 from ghgs_lit.weights.reading import file_of
 
 #: What the rows of a subject do not depend on: a second run may ask for more of these.
-_ASKED = ("peers", "subjects", "timing", "presets", "scaling")
+_ASKED = ("baselines", "subjects", "timing", "presets", "scaling")
 
 
 def peers(cfg: DictConfig, config: dict[str, Any], directory: Path, device: torch.device) -> dict[str, Any]:
     """Measure, or go on where an earlier run in ``directory`` stopped; returns the content of the results."""
-    asked = config["peers"]
-    evaluation = {"views": asked["views"], "targets": asked["targets"], "split": config["split"]}
+    evaluation = {**config["evaluation"], "split": config["split"]}
     config = {**config, **model_of(config["checkpoint"], cfg), "evaluation": evaluation}
     data, (model, _) = build_data(config), trained_method(config, device)
     check_size(data, model.model)
-    methods = {METHOD: model, **baselines_of(asked["baselines"], config, device)}
+    methods = {METHOD: model, **baselines_of(config["baselines"], config, device)}
     check_evaluation(config, data)
     rows = measure_peers(
         methods,
         data,
-        asked["views"],
+        evaluation["views"],
         target_protocols(config),
         config["split"],
         config["subjects"],

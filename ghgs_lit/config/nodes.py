@@ -55,17 +55,6 @@ class PerScene(Options):
     """Where it starts."""
 
 
-class Peers(Options):
-    """The methods beside the model with task=peers."""
-
-    baselines: Texts = ("nearest_view", "hull", "photo_depth", "per_scene", "true_depth")
-    """Names as in ``ghgs evaluate baselines=``."""
-    views: tuple[Views, ...] = (3, 4, 5)
-    """Numbers of input views."""
-    targets: tuple[Text, ...] = ("release", "midway")
-    """Names of files of conf/targets."""
-
-
 class Timing(Options):
     """How times are taken."""
 
@@ -73,21 +62,6 @@ class Timing(Options):
     """Rounds that do not count."""
     repeats: Count = 9
     """Rounds that count; each runs all presets, and each begins with another one."""
-    count_flops: bool = True
-    """False: one forward pass less for each batch and preset."""
-
-
-class Base(Options):
-    """Where the other axes stay."""
-
-    share: Share = 0.15
-    """Part of the frame that the subject covers."""
-    views: Views = 4
-    """Number of input views."""
-    size: Side = 140
-    """Side of the photographs, pixels."""
-    batch: Count = 1
-    """Elements of a batch."""
 
 
 class Scaling(Options):
@@ -98,13 +72,11 @@ class Scaling(Options):
     views: tuple[Views, ...] = (2, 3, 4, 6, 8)
     """Numbers of input views."""
     size: tuple[Side, ...] = (140, 280, 518, 1022)
-    """Sides of the photographs in pixels; multiples of the encoder's patch."""
+    """Sides of the photographs in pixels, multiples of the encoder's patch; the first one with other axes."""
     batch: tuple[Count, ...] = (1, 2, 4)
     """Numbers of elements of a batch."""
     threads: tuple[Count, ...] = (1, 2)
     """Threads of PyTorch."""
-    base: Base = Base()
-    """Where the other axes stay."""
 
 
 class Phases(Options):

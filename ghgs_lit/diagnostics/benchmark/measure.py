@@ -119,18 +119,13 @@ def threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def inspect(
-    case: Case, batch: Batch, device: torch.device, count_flops: bool
-) -> tuple[Work, Prediction, Rendering]:
-    """Predict a batch once for its FLOPs, where they are counted, and once for its memory."""
-    flops = None
-    if count_flops:
-        with FlopsProbe() as counted:
-            forward(case.model, case.renderer, batch, counted)
-        flops = counted.flops
+def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Prediction, Rendering]:
+    """Predict a batch once for its FLOPs and once for its memory."""
+    with FlopsProbe() as counted:
+        forward(case.model, case.renderer, batch, counted)
     memory = PeakProbe(device)
     prediction, rendering = forward(case.model, case.renderer, batch, memory)
-    return Work(flops, memory.peaks, _counts(prediction)), prediction, rendering
+    return Work(counted.flops, memory.peaks, _counts(prediction)), prediction, rendering
 
 
 def _counts(prediction: Prediction) -> dict[str, float]:
@@ -155,7 +150,6 @@ def record_cases(
     device: torch.device,
     warmup: int,
     repeats: int,
-    count_flops: bool,
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times.
 
@@ -165,13 +159,12 @@ def record_cases(
         metrics: of the renders.
         device: where the models are.
         warmup, repeats: as for :func:`time_jobs`.
-        count_flops: whether FLOPs are counted, which takes one more forward pass.
     """
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work(None, {}, {})) for case in cases]
     for batch in track(batches, "errors"):
         for record, mine in zip(records, works, strict=True):
-            work, *result = inspect(record.case, batch, device, count_flops)
+            work, *result = inspect(record.case, batch, device)
             if record.case.is_yardstick:
                 yardstick = result
             mine.append(work)

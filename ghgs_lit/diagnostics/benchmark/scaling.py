@@ -17,6 +17,8 @@ from ghgs_lit.errors import require
 from ghgs_lit.runs.results import Row
 
 AXES = ("share", "views", "size", "batch", "threads")
+#: Where the other axes stay beside the first size: a subject of a sixth of the frame, the usual four views.
+BASE = {"share": 0.15, "views": 4, "batch": 1}
 #: The exponent of threads that share all work evenly; those of other axes are the FLOPs'.
 _IDEAL_THREADS = -1.0
 
@@ -31,23 +33,25 @@ def exponent(values: Sequence[float], costs: Sequence[float | None]) -> float | 
     return float(np.polyfit(np.log(values), np.log(costs), 1)[0])
 
 
+def base_of(axes: Mapping[str, Any]) -> dict[str, Any]:
+    """Where the other axes stay."""
+    return {**BASE, "size": (*axes["size"], 140)[0]}
+
+
 def study(
     cases: Sequence[Case],
     axes: Mapping[str, Any],
     device: torch.device,
     warmup: int,
     repeats: int,
-    count_flops: bool,
 ) -> tuple[list[Row], list[dict[str, Any]]]:
     """Measure cases along all axes.
 
     Args:
         cases: what is measured.
-        axes: by the names of :data:`AXES` the values along each; ``base`` has one of each but the threads,
-            for the other axes.
+        axes: by the names of :data:`AXES` the values along each.
         device: where the models are.
         warmup, repeats: rounds of each axis, in which all its values and cases are interleaved.
-        count_flops: whether FLOPs are counted.
 
     Returns:
         Rows as of presets with ``axis`` and ``value``, and the exponents of :func:`fits_of`.
@@ -57,11 +61,11 @@ def study(
     for axis in AXES:
         jobs, records, values = [], [], []
         for value in axes[axis]:
-            setting = {**axes["base"], axis: value}
+            setting = {**base_of(axes), axis: value}
             count = setting.pop("threads", None)
             batch = ellipsoid_batch(**setting).to(device)
             for case in cases:
-                work, *_ = inspect(case, batch, device, count_flops)
+                work, *_ = inspect(case, batch, device)
                 jobs.append(Job(case, [batch], count))
                 records.append(Record(case, work))
                 values.append(value)

@@ -23,7 +23,7 @@ def command(tmp_path_factory):
     return [
         "benchmark", "task=peers", f"checkpoint={folder / 'tiny.ckpt'}", "data=scans",
         f"data.root={folder / 'rendered'}", "data.size=42", "metrics.lpips=off", "threads=1",
-        "peers.baselines=[nearest_view,hull,per_scene]", "peers.views=[2,3]", "per_scene.steps=2",
+        "baselines=[nearest_view,hull,per_scene]", "evaluation.views=[2,3]", "per_scene.steps=2",
     ]  # fmt: skip
 
 
@@ -72,12 +72,12 @@ def test_a_run_that_was_interrupted_goes_on_where_it_stopped(command, measured, 
 
 def test_a_further_question_measures_what_is_missing_and_a_setting_everything(command, measured, tmp_path):
     """A further method or subject is measured alone; numbers of other settings are not taken over."""
-    run = [*command, f"hydra.run.dir={tmp_path / 'run'}", "peers.views=[2]"]
-    assert ghgs(*run, "peers.baselines=hull", "subjects=1") == 0
+    run = [*command, f"hydra.run.dir={tmp_path / 'run'}", "evaluation.views=[2]"]
+    assert ghgs(*run, "baselines=hull", "subjects=1") == 0
     assert [name for name, *_ in measured] == ["model", "hull"]
-    assert ghgs(*run, "peers.baselines=[hull,nearest_view]", "subjects=1") == 0
+    assert ghgs(*run, "baselines=[hull,nearest_view]", "subjects=1") == 0
     assert [name for name, *_ in measured][2:] == ["nearest_view"]
-    assert ghgs(*run, "peers.baselines=hull", "subjects=1", "per_scene.steps=3") == 0
+    assert ghgs(*run, "baselines=hull", "subjects=1", "per_scene.steps=3") == 0
     assert [name for name, *_ in measured][3:] == ["model", "hull"]
 
 
@@ -94,7 +94,7 @@ def test_seconds_are_the_median_of_the_subjects():
 def test_what_cannot_be_combined_is_refused(command, tmp_path, capsys):
     """In one line with the key."""
     run = [*command, f"hydra.run.dir={tmp_path / 'run'}"]
-    assert ghgs(*run, "peers.baselines=[white]") == 1
+    assert ghgs(*run, "baselines=[white]") == 1
     assert "baselines: expected" in capsys.readouterr().err
     assert ghgs(*run, "knobs={recalibration.k:[2]}") == 1
     assert "knobs: expected null with task=peers" in capsys.readouterr().err

@@ -177,7 +177,7 @@ def test_the_scaling_study_writes_rows_and_exponents(tmp_path):
     code = ghgs(
         "benchmark", "task=scaling", *TINY, *QUICK, "presets=[balanced]", "scaling.share=[0.1,0.4]",
         "scaling.views=[2,4]", "scaling.size=[28,56]", "scaling.batch=[1]", "scaling.threads=[]",
-        "scaling.base.size=28", f"hydra.run.dir={tmp_path}",
+        f"hydra.run.dir={tmp_path}",
     )  # fmt: skip
     assert code == 0
     content = json.loads((tmp_path / "benchmark.json").read_text())
