@@ -1,7 +1,6 @@
 """What a sweep will run, and what it has run, as tables on the terminal."""
 
 import datetime
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,10 +35,7 @@ def time_budget(config: Mapping[str, Any]) -> float | None:
         return None
     if isinstance(value, Mapping):
         return datetime.timedelta(**value).total_seconds()
-    parts = re.fullmatch(r"(\d+):(\d+):(\d+):(\d+)", str(value))
-    if parts is None:
-        raise InputError(f"trainer.max_time: expected days:hours:minutes:seconds; found {value!r}")
-    days, hours, minutes, seconds = map(int, parts.groups())
+    days, hours, minutes, seconds = map(int, value.split(":"))
     return datetime.timedelta(days, seconds, hours=hours, minutes=minutes).total_seconds()
 
 
