@@ -90,12 +90,6 @@ class GHGSModule(BudgetedModule):
         self.clock.mark("render")
         return prediction, rendering
 
-    def draw_budget(self, batch_idx: int) -> str | int | None:
-        """The token budget of this step: the same in all processes, so that none waits for a larger one."""
-        part = batch_idx % self.trainer.accumulate_grad_batches
-        numbers = [self.config.get("seed", 0), self.global_step, part]
-        return None if self.token_budgets is None else drawn_budget(self.token_budgets, numbers)
-
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
         """The prediction of a step, its loss and the terms of it; random numbers are those of its seed."""
         torch.manual_seed(step.seed)
@@ -108,7 +102,12 @@ class GHGSModule(BudgetedModule):
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         device = self.device.type
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
-        return Step(batch, self.step_seed(batch_idx), self.draw_budget(batch_idx), autocast)
+        budget = None
+        if self.token_budgets is not None:  # the same in all processes, so that none waits for a larger one
+            part = batch_idx % self.trainer.accumulate_grad_batches
+            numbers = [self.config.get("seed", 0), self.global_step, part]
+            budget = drawn_budget(self.token_budgets, numbers)
+        return Step(batch, self.step_seed(batch_idx), budget, autocast)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         step = self._step(batch, batch_idx)

@@ -9,9 +9,9 @@ from ghgs_lit.training.pretext.parts import PARTS
 from tests.helpers.bodies import body_batch
 
 
-def branch(parts=16):
+def branch():
     torch.manual_seed(0)
-    return SemanticOptions(width=32, depth=1, heads=2, channels=8, parts=parts).build(14)
+    return SemanticOptions(width=32, depth=1, heads=2, channels=8).build(14)
 
 
 def test_patches_without_a_part_do_not_count():
