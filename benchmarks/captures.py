@@ -47,7 +47,7 @@ _PIXELS = ("mask_offset", "mask_ragged", "calibration")
 _HELD = {"camera_pitch": 6.0, "camera_roll": 8.0, "camera_look_at": 0.08}
 _COLORS = {"exposure": 0.5, "white_balance": 0.25}
 _OUTLINES = {"mask_offset": 1.5, "mask_ragged": 2.0}
-_PIECES = {"mask_hole": 0.12, "mask_hole_chance": 1.0}
+_PIECES = {"mask_hole_chance": 1.0}
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def data_of(capture: Imperfection, people: int, size: list[int]) -> PhotographsD
         f"data.size={size}",
         f"data.render.positions={positions}",
         "data.render.views=[0,3]",
-        f"data.evaluation_positions={{{_VIEWS}: {capture.positions}}}",
+        f"data.evaluation_positions=[{list(capture.positions)}]",
         *(f"data.rig.variation.{name}={value}" for name, value in capture.rig.items()),
     ]
     data = build_data(resolve(compose("prepare", overrides)))

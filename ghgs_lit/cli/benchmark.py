@@ -53,16 +53,7 @@ def run(cfg: DictConfig) -> None:
 
 
 def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
-    """Refuse what cannot be measured.
-
-    Args:
-        config: of ``ghgs benchmark``, resolved.
-        given: overrides that were asked for.
-
-    Raises:
-        InputError: an option that has no effect beside the others.
-    """
-    require(bool(config["presets"]), "presets", "a list with a name", config["presets"])
+    """Refuse an option, or one of the overrides that were ``given``, that has no effect beside others."""
     if config["checkpoint"] is None:
         require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
         return
@@ -78,10 +69,6 @@ _APPLIED = ("skip", "renderer", "precision")
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
     """Every source in every preset, the yardstick always among them.
-
-    Args:
-        config: of ``ghgs benchmark``, resolved.
-        device: of the models.
 
     Raises:
         FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.

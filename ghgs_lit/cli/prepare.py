@@ -10,7 +10,7 @@ from ghgs_lit.config import build
 from ghgs_lit.data.check import inspect, show, write
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.datasets import Scans
 from ghgs_lit.synthesis.miniature import make_miniature
 
@@ -19,7 +19,6 @@ log = logging.getLogger(__name__)
 
 def run(cfg: DictConfig) -> None:
     """Run the task and print the folder of its result last."""
-    choice("task", cfg.task, ("render", "miniature", "check"))
     data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
     root = Path(data.dataset.root or ".").expanduser().resolve()
     if cfg.task == "render":

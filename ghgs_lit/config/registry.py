@@ -52,13 +52,10 @@ KINDS: dict[str, dict[str | None, str]] = {
     "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},
     "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
     "callbacks": {
-        "attention": "ghgs_lit.training.validation_pictures.AttentionOptions",
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
-        "memory": "ghgs_lit.training.callbacks.MemoryOptions",
+        "costs": "ghgs_lit.training.callbacks.CostsOptions",
         "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
-        "point_clouds": "ghgs_lit.training.validation_pictures.PointCloudOptions",
         "progress": "ghgs_lit.training.callbacks.ProgressOptions",
-        "step_time": "ghgs_lit.training.callbacks.StepTimeOptions",
     },
     "logger": {
         "csv": "ghgs_lit.training.loggers.CsvOptions",
@@ -76,10 +73,6 @@ _REGISTERED: dict[tuple[str, str], type[Options]] = {}
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
     """Class decorator: configurations may say ``<group>: {kind: <kind>, ...}`` for these options.
-
-    Args:
-        group: a key of :data:`KINDS`.
-        kind: a name that no kind of the group has.
 
     Raises:
         InputError: there is no such group, or the kind is taken.
@@ -105,12 +98,7 @@ def kinds_of(group: str) -> list[str | None]:
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
-    """The options of a kind.
-
-    Args:
-        group: a key of :data:`KINDS`.
-        kind: a kind of the group, None where its nodes have none.
-        key: dotted key of the node, for messages.
+    """The options of a kind of a group (None where its nodes have none); ``key`` is the node's, for messages.
 
     Raises:
         InputError: there is no such kind; names those that there are.
@@ -136,7 +124,7 @@ def read_node(node: Any, key: str) -> Options:
 
     Args:
         node: a mapping of plain data, with ``kind`` where its group has kinds.
-        key: its dotted key in the configuration, such as ``bounds`` or ``callbacks.best``.
+        key: its dotted key, such as ``bounds`` or ``callbacks.best``.
 
     Raises:
         InputError: names the key of the first wrong value, what was expected and what was found.
@@ -150,23 +138,12 @@ def read_node(node: Any, key: str) -> Options:
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
-    """The object that a node describes.
-
-    Args:
-        node, key: as for :func:`read_node`.
-        extra: what the options need beside themselves.
-
-    Raises:
-        InputError: as :func:`read_node`; other errors keep their type.
-    """
+    """The object that a node describes, as for :func:`read_node`; ``extra`` is what its ``build`` takes."""
     return read_node(node, key).build(**extra)
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Refuse wrong values of all groups of a configuration.
-
-    Args:
-        config: plain data, interpolations resolved. A node that lacks its kind is refused where it is built.
+    """Refuse wrong values of all groups; a node that lacks its kind is refused where it is built.
 
     Raises:
         InputError: names the key of the first wrong value, what was expected and what was found.

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning import LightningDataModule, Trainer
@@ -13,7 +13,6 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
-from ghgs_lit.data.dataset import DataOptions
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
@@ -25,6 +24,9 @@ from ghgs_lit.data.sampling import (
 )
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.types import Batch
+
+if TYPE_CHECKING:  # its options build this class
+    from ghgs_lit.data.dataset import DataOptions
 
 Targets = TargetProtocol | Mapping[str, Any]
 
@@ -65,7 +67,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def __init__(
         self,
-        dataset: DataOptions,
+        dataset: "DataOptions",
         views: ViewProtocol | Mapping[str, Any],
         targets: Targets,
         seed: int = 0,

@@ -3,9 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
-
-from pydantic import BeforeValidator
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Amount, Count, Index, Options, Size, Text, Workers
@@ -16,11 +14,6 @@ from ghgs_lit.errors import InputError
 
 if TYPE_CHECKING:  # it imports Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
-
-
-def _number(key: Any) -> Any:
-    """A key of a mapping as a number: the command line and JSON make texts of them."""
-    return int(key) if isinstance(key, str) and key.isdecimal() else key
 
 
 class Limit(Options):
@@ -65,8 +58,8 @@ class DataOptions(Options):
     """Training steps of an epoch; null: one pass over the subjects."""
     cache_images_mb: Amount = 512
     """MiB of decoded photographs kept in memory by each process."""
-    evaluation_positions: dict[Annotated[int, BeforeValidator(_number)], tuple[Index, ...]] | None = None
-    """Input positions by number of views, such as {3: [0, 6, 11]}; null, or another number: evenly spaced."""
+    evaluation_positions: tuple[tuple[Index, ...], ...] = ()
+    """Lists of input positions, such as [[0, 6, 11]] for 3 views; other numbers of views: evenly spaced."""
     workers: Workers = 0
     """Loading processes; 0: none."""
 

@@ -82,10 +82,6 @@ def _require_useful_cache(config: Mapping[str, Any]) -> None:
 def check_directory(directory: Path, config: Mapping[str, Any]) -> None:
     """Refuse to train where an earlier run would be lost; with ``overwrite`` remove it.
 
-    Args:
-        directory: that of the run.
-        config: ``resume`` and ``overwrite`` are read.
-
     Raises:
         InputError: there is a run, and this one does not go on from it.
     """

@@ -1,6 +1,6 @@
 """The LightningModule of training: steps and logging calls around the model."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from ghgs_lit.metrics import depth_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.budgets import TokenBudgets, token_budget
+from ghgs_lit.training.budgets import drawn_budget, token_budget
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
@@ -49,7 +49,7 @@ class GHGSModule(BudgetedModule):
         losses: Losses,
         optimization: Optimization,
         config: Mapping[str, Any] | None = None,
-        token_budgets: TokenBudgets | None = None,
+        token_budgets: Sequence[str | int] | None = None,
     ):
         super().__init__(model, optimization, config)
         self.renderer = renderer
@@ -90,12 +90,6 @@ class GHGSModule(BudgetedModule):
         self.clock.mark("render")
         return prediction, rendering
 
-    def draw_budget(self, batch_idx: int) -> str | int | None:
-        """The token budget of this step: the same in all processes, so that none waits for a larger one."""
-        part = batch_idx % self.trainer.accumulate_grad_batches
-        numbers = [self.config.get("seed", 0), self.global_step, part]
-        return None if self.token_budgets is None else self.token_budgets.draw(numbers)
-
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
         """The prediction of a step, its loss and the terms of it; random numbers are those of its seed."""
         torch.manual_seed(step.seed)
@@ -108,7 +102,12 @@ class GHGSModule(BudgetedModule):
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         device = self.device.type
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
-        return Step(batch, self.step_seed(batch_idx), self.draw_budget(batch_idx), autocast)
+        budget = None
+        if self.token_budgets is not None:  # the same in all processes, so that none waits for a larger one
+            part = batch_idx % self.trainer.accumulate_grad_batches
+            numbers = [self.config.get("seed", 0), self.global_step, part]
+            budget = drawn_budget(self.token_budgets, numbers)
+        return Step(batch, self.step_seed(batch_idx), budget, autocast)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         step = self._step(batch, batch_idx)

@@ -25,15 +25,10 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
 
 
 def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """Check that a run can resume from a checkpoint.
-
-    Args:
-        path: the checkpoint.
-        model: the model of this run; it gets the weights of the checkpoint.
-        config: the configuration of this run.
+    """Check that a run can resume from a checkpoint, whose weights ``model`` gets.
 
     Returns:
-        The step of the checkpoint, and one line for each setting that this run changes.
+        The step of the checkpoint, and one line for each setting that ``config`` changes.
 
     Raises:
         InputError: not a checkpoint of a training run, of another model (names the tensor), or changed
@@ -77,8 +72,6 @@ def initialize(
     """Load the weights at ``path`` that fit into ``model``.
 
     Args:
-        model: gets the weights.
-        path: a checkpoint of this project.
         strict: every tensor must fit.
         random_frozen: parameters that do not learn may stay as initialised.
 
@@ -141,13 +134,7 @@ def switched(config: Mapping[str, Any]) -> list[str]:
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """A text of at most 22 lines: the number of loaded tensors and the lines of the others.
-
-    Args:
-        lines: what :func:`initialize` returned.
-        path: where the weights are from.
-        written: file that gets all lines.
-    """
+    """At most 22 of the ``lines`` of :func:`initialize`, those of loaded tensors counted; a file gets all."""
     written.write_text("\n".join(lines) + "\n")
     others = [line for line in lines if not line.startswith("loaded")]
     loaded = len(lines) - len(others)

@@ -24,7 +24,7 @@ def chosen_token(
     if at is not None:
         expected = f"view, row, column below {(views, height, width)}"
         inside = all(0 <= n < end for n, end in zip(at, (views, height, width), strict=True))
-        require(inside, "callbacks.attention.token", expected, list(at))
+        require(inside, "callbacks.pictures.token", expected, list(at))
     view = 0 if at is None else at[0]
     candidates = ((tokens.image == element * views + view) & points.tokens_valid).nonzero()[:, 0]
     if not len(candidates):

@@ -176,9 +176,9 @@ NUMBERS = [
     ("prepare miniature.people.train=-1", 1, "miniature.people.train: expected", "found -1"),
     ("train data=thuman2 data.limit.val=0", 1, "data.limit.val: expected an integer >= 1 or null; found 0"),
     (
-        "train 'data.evaluation_positions={{4: [a]}}'",
+        "train 'data.evaluation_positions=[[a]]'",
         1,
-        "data.evaluation_positions: expected a mapping (each a list",
+        "data.evaluation_positions: expected a list (each a list",
         "['a']",
     ),
     ("train data=zju_mocap data.undistorted=2", 1, "data.undistorted: expected true or false; found 2"),
@@ -205,8 +205,8 @@ NUMBERS = [
     ("evaluate evaluation.views=[0] data=synthetic", 1, "evaluation.views: expected", "found [0]"),
     ("train evaluation.pictures=-1", 1, "evaluation.pictures: expected an integer >= 0; found -1"),
     ("train callbacks.pictures.subjects=-1", 1, "callbacks.pictures.subjects: expected", "found -1"),
-    ("train callbacks.last_by_time.minutes=0", 1, "callbacks.last_by_time.minutes: expected", "found 0"),
-    ("train callbacks.attention.token=[1]", 1, "callbacks.attention.token: expected a list of 3 values"),
+    ("train callbacks.last.minutes=0", 1, "callbacks.last.minutes: expected", "found 0"),
+    ("train callbacks.pictures.token=[1]", 1, "callbacks.pictures.token: expected a list of 3 values"),
     ("train callbacks.best.mode=best", 1, "callbacks.best.mode: expected one of max, min; found 'best'"),
     ("train metrics.box_margin=-1", 1, "metrics.box_margin: expected a number >= 0; found -1"),
     (

@@ -31,10 +31,10 @@ def everything_callable():
                 yield f"{info.name}.{name}"
 
 
-EXTRA = {"data": {"views": {"name": "v3"}, "targets": {"name": "cameras"}}, "logger": {"save_dir": "."}}
+EXTRA = {"data": {"views": {}, "targets": {"name": "cameras"}}, "logger": {"save_dir": "."}}
 
 #: What nodes without kinds must have.
-NAMES = {"views": {"name": "v3"}, "targets": {"name": "release"}}
+NAMES = {"views": {}, "targets": {"name": "release"}}
 
 
 def key_of(group):

@@ -117,7 +117,7 @@ def estimate(
     """
     shapes, flops = Shapes(), FlopsProbe()
     model = filled_model(config, lambda _, parameter: shapes.of(parameter.shape))
-    model.train(training).options = model.options.replace(check_inputs=False)
+    model.train(training).checks_values = False
     batch, needs = _batch(scene, shapes), _Needs(shapes, flops)
     half = precision != "float32"
     # Tensors without values are on the CPU, whatever the device.
