@@ -5,7 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 #: Makes processes by forking one that runs no threads and has imported what takes seconds.
@@ -24,6 +24,14 @@ def run_python(code: str, **variables: str) -> subprocess.CompletedProcess:
     )
     assert done.returncode == 0, done.stderr
     return done
+
+
+def run_prepared(function: Callable, *arguments: object) -> None:
+    """Call a function of a module, which must succeed, in a process of :data:`PREPARED`."""
+    process = PREPARED.Process(target=function, args=arguments)
+    process.start()
+    process.join()
+    assert process.exitcode == 0
 
 
 def run_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:

@@ -13,7 +13,7 @@ import torch
 from ghgs_lit.kernels import pool
 from ghgs_lit.rendering import render
 from ghgs_lit.rendering.cpu import backend
-from tests.helpers.processes import run_python
+from tests.helpers.processes import run_prepared, run_python
 from tests.helpers.splats import FIELDS, body, camera_ring, with_gradients
 
 
@@ -93,7 +93,7 @@ class _Renderings(torch.utils.data.Dataset):
 def test_training_in_four_workers_of_a_data_loader():
     """Rendering with gradients works in worker processes."""
     # In a process of its own: where a backward pass ran on another device, PyTorch refuses one after a fork.
-    run_python("from tests.rendering.test_processes import train_in_workers; train_in_workers()")
+    run_prepared(train_in_workers)
 
 
 def train_in_workers():
