@@ -8,6 +8,9 @@ from pathlib import Path
 
 from tests.helpers.shapes import begin_test, check_shapes
 
+# Modules and tests are no garbage: looking through them takes half a second each time.
+gc.disable()
+
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
 _CHECKED = ["types", "heads", "losses", "metrics"]
 # Without their folders of kernels: a wrapped function cannot be compiled.
@@ -48,7 +51,8 @@ if threading.current_thread() is threading.main_thread():
 
 
 def pytest_collection_finish() -> None:
-    gc.freeze()  # modules and tests are no garbage: looking through them takes half a second each time
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_runtest_setup() -> None:
