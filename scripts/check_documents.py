@@ -60,7 +60,7 @@ if importlib.util.find_spec("smplx") is None:
     NOT_RUN.append((r"ghgs .*data\.smpl_model=", "needs the package smplx"))
 
 CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
-TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1"
+TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1 data.render_workers=0"
 SHORT = "trainer.max_steps=2 trainer.val_check_interval=2 trainer.limit_val_batches=1"
 FEW = "miniature.size=128 miniature.people.train=2 miniature.people.val=1"
 TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a command that trains
@@ -83,7 +83,8 @@ SMALL = [
     (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
     (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "beside the miniature"),
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
-    (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1", "small photographs"),
+    (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1 data.render_workers=0",
+     "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
     (r"^(.*(?:task=miniature|miniature\.py).*)", rf"\1 {FEW}", "few people"),
     (r"^(python benchmarks/loading\.py.*)", r"\1 --seconds 1 --size 128 --workers 0,1", "one second"),

@@ -77,16 +77,15 @@ def test_a_bad_command_gets_its_exit_code_and_one_line(
         assert part.format(**names) in text
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT])
 @pytest.mark.parametrize(
-    "command",
+    ("command", "number"),
     [
-        "train",
-        "evaluate data=synthetic",
-        "predict checkpoint={ckpt} data=synthetic",
-        "import out=x.ckpt",
-        "export checkpoint={ckpt} vggt=x.pt",
-        "table runs={empty}",
+        ("train", errno.ENOSPC),
+        ("evaluate data=synthetic", errno.EROFS),
+        ("predict checkpoint={ckpt} data=synthetic", errno.EACCES),
+        ("import out=x.ckpt", errno.EDQUOT),
+        ("export checkpoint={ckpt} vggt=x.pt", errno.ENOSPC),
+        ("table runs={empty}", errno.EROFS),
     ],
 )
 def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(
