@@ -163,7 +163,7 @@ def advice_of(directory: Path, config: dict[str, Any]) -> Iterator[str]:
 
 
 def moved_line(moved: dict[str, float]) -> str:
-    """Pixels that each photograph's subject moved by, and the cameras that moved beside others that stayed."""
+    """Pixels that each photograph's subject moved by; names cameras that moved beside others that stayed."""
     off = [name for name, pixels in moved.items() if pixels]
     beside = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
     return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{beside}"
