@@ -1,12 +1,15 @@
 """What a configuration may build: kinds of options by group, never a path of Python code.
 
 A configuration can come from somebody else's checkpoint. A node such as ``depth_head: {kind: dpt, ...}``
-names one of the kinds below or one that the user's own code has registered; code is imported from
-``GHGS_PLUGINS`` alone (:mod:`ghgs_lit.config.plugins`).
+names one of the kinds below or one that is registered: by a file of the group's room, such as
+``ghgs_lit/heads``, or by the user's own code, which is imported from ``GHGS_PLUGINS`` alone
+(:mod:`ghgs_lit.config.plugins`).
 """
 
 import importlib
+import pkgutil
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
@@ -67,7 +70,7 @@ KINDS: dict[str, dict[str | None, str]] = {
 #: Groups whose nodes have names: ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
-#: Kinds of the user's own code.
+#: Kinds that are registered.
 _REGISTERED: dict[tuple[str, str], type[Options]] = {}
 
 
@@ -91,10 +94,29 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
     return keep
 
 
-def kinds_of(group: str) -> list[str | None]:
-    """All kinds of a group, those of the user's own code included."""
+@cache
+def _import_room(group: str) -> None:
+    """Import the files of the group's room (its kinds lie in one), so that they register their kinds."""
+    room = ".".join(next(iter(KINDS[group].values())).split(".")[:2])
+    for file in pkgutil.iter_modules(importlib.import_module(room).__path__, f"{room}."):
+        importlib.import_module(file.name)
+
+
+def _load(group: str) -> None:
+    """Import what may register kinds of a group.
+
+    Raises:
+        InputError: as :func:`load_plugins`.
+    """
     load_plugins()
-    return [*KINDS.get(group, ()), *(kind for of, kind in _REGISTERED if of == group)]
+    if None not in KINDS[group]:
+        _import_room(group)
+
+
+def kinds_of(group: str) -> list[str | None]:
+    """All kinds of a group, those that are registered included."""
+    _load(group)
+    return [*KINDS[group], *(kind for of, kind in _REGISTERED if of == group)]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
@@ -105,7 +127,7 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
     """
     known = KINDS[group]
     if isinstance(kind, str) and kind not in known:
-        load_plugins()
+        _load(group)
         if (group, kind) in _REGISTERED:
             return _REGISTERED[group, kind]
     if not (kind is None or isinstance(kind, str)) or kind not in known:

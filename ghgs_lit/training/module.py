@@ -19,7 +19,7 @@ from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -72,13 +72,16 @@ class GHGSModule(BudgetedModule):
         Raises:
             InputError: the checkpoint cannot be used, or a part is neither configured nor given.
         """
-        config = read_checkpoint(checkpoint_path)["config"]
+        checkpoint = read_checkpoint(checkpoint_path)
+        config = checkpoint["config"]
         for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():
             if name in parts:
                 continue
             place = f"{checkpoint_path}: config.{group}"
             require(group in config, place, f"options of it, or {name}=...", "nothing")
             parts[name] = build(config[group], group)
+            if state := model_state(checkpoint, f"{name}."):  # a loss with weights of its own
+                load_strictly(parts[name], state, checkpoint_path)
         model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
         return cls(model.train(), config=config, **parts)
 

@@ -6,8 +6,10 @@ from typing import Any
 
 from torch import nn
 
+from ghgs_lit.config import build
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
 from ghgs_lit.training.checkpoints import check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 from ghgs_lit.weights.switches import differences as differing_switches
@@ -20,7 +22,7 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
     """
     if config["resume"] is None or config["init_from"] is None:
         return
-    own = Path(config["resume"]).resolve().is_relative_to(directory.resolve())
+    own = resolved(config["resume"]).is_relative_to(directory.resolve())
     require(own, "init_from", "null where resume is given", config["init_from"])
 
 
@@ -43,17 +45,25 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
             )
     check_training_state(path, checkpoint)
     load_strictly(model, model_state(checkpoint), path)
-    _check_optimizer(path, checkpoint, config)
+    _check_optimizer(path, checkpoint, model, config)
     return checkpoint["global_step"], differences(checkpoint["config"], config)
 
 
-def _check_optimizer(path: str | Path, checkpoint: Mapping[str, Any], config: Mapping[str, Any]) -> None:
-    """Refuse to go on with Muon from the averages of AdamW, and the other way round."""
+def _check_optimizer(
+    path: str | Path, checkpoint: Mapping[str, Any], model: nn.Module, config: Mapping[str, Any]
+) -> None:
+    """Refuse to go on with Muon from the averages of AdamW, the other way round, or from other groups."""
     states = checkpoint["optimizer_states"]
     by_muon = any("orthogonal" in group for state in states for group in state["param_groups"])
     key = "optimizer.matrix_scale"
     scale = lookup(config, key)
     require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
+    if "kind" in (node := config.get("optimizer") or {}):
+        own = [len(group["params"]) for group in build(node, "optimizer").optimizer(model).param_groups]
+        for state in states:
+            found = [len(group.get("params", ())) for group in state["param_groups"]]
+            place = f"{path}: optimizer_states.param_groups"
+            require(found == own, place, f"as many groups and parameters as this run has, {own}", found)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

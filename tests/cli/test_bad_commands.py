@@ -35,6 +35,12 @@ def files(tmp_path_factory):
     torch.save([1, 2], places["list"])
     torch.save({"weight": torch.zeros(2)}, places["tensors"])
     torch.save({"state_dict": {}, "config": {}, "format_version": 99}, places["newer"])
+    places |= {"loop": folder / "loop", "yaml": folder / "yaml"}
+    places["loop"].symlink_to(folder / "back")
+    (folder / "back").symlink_to(places["loop"])
+    (places["yaml"] / "views").mkdir(parents=True)
+    (places["yaml"] / "views" / "cut.yaml").write_text("name: cut\ntraining_counts: [3\n")
+    (places["yaml"] / "views" / "tagged.yaml").write_text("name: !!python/object/apply:os.getcwd []\n")
     (places["broken"] / "run").mkdir(parents=True)
     (places["broken"] / "run" / "metrics.json").write_text("{")
     return places

@@ -1,5 +1,6 @@
 """Rendering jobs: killed half-way, started twice, in several processes, with other settings."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -13,7 +14,7 @@ import pytest
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis import jobs, people
 from ghgs_lit.synthesis.jobs import SyntheticSource, render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
@@ -219,6 +220,18 @@ def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp
     assert not list((root / "rendering").glob("tmp/*"))
     assert render_people(root, names, ScanSource(scans), RIG, SMALL, 0, workers=0) == 3
     assert contents(root) == reference
+
+
+def test_a_full_disk_names_the_folder_of_the_data_set(scans, tmp_path, monkeypatch):
+    """The system names no file, and the command line then named the run's directory, which had space."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(jobs, "write_view", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        render_people(tmp_path / "out", {"train": ["s0"]}, ScanSource(scans), RIG, SMALL, 0, workers=0)
+    assert caught.value.filename == str(tmp_path / "out")
 
 
 def test_other_settings_and_other_folders_are_refused(scans, tmp_path):

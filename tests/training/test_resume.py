@@ -281,6 +281,19 @@ def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
         check_resume(path, Standin(), {**CONFIG, "optimizer": dict(now)})
 
 
+def test_groups_of_another_optimizer_are_refused(tmp_path):
+    """PyTorch raised a ValueError hours into the queue, which named no file."""
+    path, model = tmp_path / "a.ckpt", Standin()
+    state = Optimization(lr=0.05).optimizer(model).state_dict()
+    state["param_groups"] *= 2
+    content = {"state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}}
+    now = {**CONFIG, "optimizer": {"kind": "adamw", "lr": 0.05}}
+    content |= {"config": now, "format_version": 1, "global_step": 5, "optimizer_states": [state]}
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"a\.ckpt: optimizer_states\.param_groups: expected .*; found \["):
+        check_resume(path, model, now)
+
+
 def test_an_optimizer_whose_state_was_changed_is_refused(tmp_path):
     """Broken averages of the gradient would be trained on in silence: the checkpoint has a digest of all."""
     path = tmp_path / "checkpoints" / "last.ckpt"

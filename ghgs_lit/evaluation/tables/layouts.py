@@ -9,8 +9,8 @@ from ghgs_lit.evaluation.tables.records import Planned, Variant
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
 DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
+HIGHER_IS_BETTER = ("psnr", "ssim")
 LOWER_IS_BETTER = ("lpips", "flip", "depth_error_mm", "prediction_seconds", "seconds", "peak_gb")
-NEITHER_IS_BETTER = ("gaussians", "steps")
 TITLES = {
     "depth_error_mm": "Depth error (mm)",
     "gaussians": "Gaussians",
@@ -66,9 +66,9 @@ def decimals(metric: str) -> int:
 
 
 def arrow(metric: str) -> str:
-    """Whether higher (↑) or lower (↓) is better; empty where neither is."""
+    """Whether higher (↑) or lower (↓) is better; empty where neither is, or nothing says."""
     stem = _stem(metric)
-    return "" if stem in NEITHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else "↑"
+    return "↑" if stem in HIGHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else ""
 
 
 def title(metric: str) -> str:
