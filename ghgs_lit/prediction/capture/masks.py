@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scipy import ndimage
 
 from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import InputError, choice, require
@@ -59,6 +58,8 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
     Raises:
         InputError: the background's photograph has another size, or nothing differs.
     """
+    from scipy import ndimage  # here: masks of files do not need it
+
     background = read_pixels(path)
     fits = background.size == pixels.size
     require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)
