@@ -4,10 +4,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-import rich
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.syntax import Syntax
 
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import require
@@ -31,6 +29,9 @@ def write_config(config: dict[str, Any], directory: Path) -> None:
     require(bool(is_free), str(path), "no file, or the configuration of an earlier run", "another file")
     write_text_atomically(path, text)
     if config["print_config"]:
+        import rich  # here: it takes a twentieth of a second
+        from rich.syntax import Syntax
+
         rich.print(Syntax(text, "yaml", theme="ansi_dark", background_color="default"))
     overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else ""
     print(f"config: {path} ({overrides or 'no overrides'})", flush=True)
