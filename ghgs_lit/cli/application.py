@@ -8,6 +8,8 @@ import shutil
 import signal
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +17,7 @@ from pathlib import Path
 import hydra
 import omegaconf._utils
 import yaml
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
@@ -90,6 +93,23 @@ def read_yaml_quickly() -> None:
     omegaconf._utils.get_yaml_loader = lambda: loader
 
 
+@contextmanager
+def composed_once(arguments: Sequence[str]) -> Iterator[None]:
+    """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
+
+    No file of ``conf`` sets it. Arguments may, and so may files of the user's own, which flags name.
+    """
+    says = any("hydra.mode" in text or "hydra.searchpath" in text for text in arguments)
+    if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
+        yield
+        return
+    before, Hydra.get_mode = Hydra.get_mode, lambda *_, **__: None
+    try:
+        yield
+    finally:
+        Hydra.get_mode = before
+
+
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
     """Arguments in Hydra's terms.
 
@@ -130,7 +150,7 @@ def run(verb: str, argv: list[str]) -> int:
         sys.argv = [argv[0], *flags_first(_for_hydra(verb, argv[2:]))]
         check_deletions(sys.argv[1:])
         read_yaml_quickly()
-        with interruptible():
+        with interruptible(), composed_once(sys.argv[1:]):
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
         sys.stdout.flush()
     except BrokenPipeError:
