@@ -31,7 +31,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.runs.results import plain
 from ghgs_lit.types import Batch, Prediction
-from ghgs_lit.visualization.pictures import sheet
+from ghgs_lit.visualization.pictures import palette, sheet
 
 
 @dataclass(frozen=True)
@@ -208,6 +208,7 @@ def write_prediction(
     paths, seconds = [directory / name for name in names[:-1]], {}
     files = iter(paths)
     with ThreadPoolExecutor(allowed_cores()) as pool:
+        pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
         tasks = {}
         for name in options.formats:
             begin = time.perf_counter()
