@@ -63,11 +63,17 @@ def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
     Raises:
         InputError: a value is missing, or of the wrong type or range.
     """
+    data = own_keys(cfg, verb)
+    check(data)
+    return data
+
+
+def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
+    """:func:`resolve` without a look at the groups, whose options import PyTorch."""
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     data = OmegaConf.to_container(cfg, resolve=True)
-    check(data)
     if verb is not None:
         VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
     return data

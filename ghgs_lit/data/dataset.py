@@ -11,6 +11,7 @@ from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import require_data_folder
 
 if TYPE_CHECKING:  # it imports Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
@@ -108,8 +109,7 @@ class DataOptions(Options):
         """The folder of the data, which a subclass names as ``root``. InputError: ``data.root`` is null or no
         folder."""
         folder = required_folder("data.root", "the folder of the data set", self.root)
-        if not folder.is_dir():
-            raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
+        require_data_folder(folder)
         return folder
 
     @property

@@ -15,14 +15,14 @@ PREPARED.set_forkserver_preload(
 )
 
 
-def run_python(code: str, **variables: str) -> subprocess.CompletedProcess:
-    """``code``, which must succeed, in a process of its own, with these environment variables."""
+def run_python(code: str, expected: int = 0, **variables: str) -> subprocess.CompletedProcess:
+    """``code``, which must end with exit code ``expected``, in a process with these variables."""
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     environment = {**os.environ, "PYTHONPATH": path, **variables}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == expected, done.stderr
     return done
 
 

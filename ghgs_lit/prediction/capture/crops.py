@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.data.resampling import area_image
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
@@ -71,6 +70,8 @@ def _refined(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """:func:`refined_matte` of a cut, which is made smaller first where it is much larger than the crop."""
+    from ghgs_lit.data.matting import refined_matte  # here: photographs are read while PyTorch is imported
+
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
     image, matte = area_image(image, *sides), area_image(matte, *sides)
     subject, refined = refined_matte(image, matte, pixels * sides[0] / size[0])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scipy import ndimage
 
 from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import InputError, choice, require
@@ -52,8 +51,13 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask: where a photograph differs from one without the subject, without specks and holes. InputError:
-    the background's photograph has another size, or nothing differs."""
+    """A mask: where a photograph differs from one without the subject, without specks and holes.
+
+    Raises:
+        InputError: the background's photograph has another size, or nothing differs.
+    """
+    from scipy import ndimage  # here: masks of files do not need it
+
     background = read_pixels(path)
     fits = background.size == pixels.size
     require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)

@@ -17,7 +17,6 @@ from ghgs_lit.prediction.capture.formats.opencv import (
     has_intrinsics,
     size_from_fields,
 )
-from ghgs_lit.prediction.export.maps import camera_entry, cameras_json
 
 _KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
 
@@ -84,6 +83,8 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
     """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
+    from ghgs_lit.prediction.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
+
     entries = {
         name: camera_entry(camera.intrinsics, camera.extrinsics, size)
         | {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}

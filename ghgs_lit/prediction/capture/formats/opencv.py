@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
@@ -159,6 +158,8 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
 
     rotation = array("rotation", (3, 3), (3,), (3, 1), (1, 3))
     if rotation.size == 3:
+        from scipy.spatial.transform import Rotation  # here: a twentieth of a second for rare files
+
         rotation = Rotation.from_rotvec(rotation.ravel()).as_matrix()
     pose = np.eye(4)
     pose[:3, :3] = rotation
