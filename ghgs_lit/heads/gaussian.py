@@ -20,6 +20,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.geometry.rotations import multiply_quaternions, rotate
 from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.heads import cpu
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
@@ -27,6 +28,7 @@ from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.kernels.precision import without_float16
 from ghgs_lit.types import (
     Batch,
@@ -153,6 +155,11 @@ class FootprintAttributes(Options):
     def opacity_bias(self) -> float:
         """What is added to raw opacities, so that 0 is the start."""
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
+
+    def constants(self, color_limit: float) -> tuple[float, ...]:
+        """What :func:`ghgs_lit.heads.cpu.activate` is told."""
+        size = (self.scale_floor, self.scale_range, *self.scale_biases)
+        return self.offset_limit, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
 
     def __call__(
         self,
@@ -294,6 +301,22 @@ class GaussianHead(nn.Module):
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """The Gaussians of raw attributes at the points of their pixels; arguments as of :meth:`forward`."""
+        numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
+        photo, share, options = batch.once(surface_colors), batch.alpha, self.options
+        inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
+        if isinstance(self.attributes, FootprintAttributes) and cpu.is_supported(*inputs):
+            constants, on_surface = self.attributes.constants(options.color_limit), options.axes == "surface"
+            given = (raw.image, raw.pixel, depth_maps, points, photo, share, batch.cameras)
+            found = cpu.activate(numbers, *given, constants, on_surface)
+        else:
+            found = self._activated(raw, batch, points, depth_maps)
+        constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}
+        return Gaussians(*found, raw.splits, raw.image, raw.pixel, **constants)
+
+    def _activated(
+        self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Means, quaternions, scales, opacities and colours."""
         image, pixel = raw.image, raw.pixel
         focal = (
             at_least_float32(batch.cameras.intrinsics)
@@ -314,20 +337,10 @@ class GaussianHead(nn.Module):
         if batch.alpha is not None:
             opacities = opacities * batch.alpha.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
         colors = batch.once(surface_colors).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
-        return Gaussians(
-            means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
-            quaternions=quaternions,
-            scales=scales,
-            opacities=opacities,
-            colors=colors
-            if raw.color is None
-            else colors + self.options.color_limit * bounded_tanh(raw.color),
-            splits=raw.splits,
-            image=image,
-            pixel=pixel,
-            low_pass=self.options.low_pass,
-            antialiased=self.options.antialiased,
-        )
+        if raw.color is not None:
+            colors = colors + self.options.color_limit * bounded_tanh(raw.color)
+        means = points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset
+        return means, quaternions, scales, opacities, colors
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
         if self.decoder.guide is None:
@@ -364,7 +377,11 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.options.color_limit > 0:
             headers.append(self.color_header)
-        offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
+        if multiplies(descriptors, self.offset_header[0].weight):
+            found = cpu.attributes(headers, descriptors)
+        else:
+            found = (float32_last(header, descriptors) for header in headers)
+        offset, scale, rotation, opacity, *color = found
         return offset, scale, rotation, opacity[..., 0], *color
 
 
