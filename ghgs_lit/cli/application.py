@@ -97,9 +97,9 @@ def read_yaml_quickly() -> None:
 def composed_once(arguments: Sequence[str]) -> Iterator[None]:
     """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
 
-    No file of ``conf`` sets it. Arguments may, and so may files of the user's own, which flags name.
+    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name.
     """
-    says = any("hydra.mode" in text or "hydra.searchpath" in text for text in arguments)
+    says = any(key in text for text in arguments for key in ("sweep", "hydra.mode", "hydra.searchpath"))
     if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
         yield
         return
