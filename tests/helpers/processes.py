@@ -11,7 +11,7 @@ from pathlib import Path
 #: Makes processes by forking one that runs no threads and has imported what takes seconds.
 PREPARED = multiprocessing.get_context("forkserver")
 PREPARED.set_forkserver_preload(
-    ["pytest", "ghgs_lit.cli.prepare", "ghgs_lit.cli.train", "ghgs_lit.cli.predict", "ghgs_lit.cli.table"]
+    ["pytest", *(f"ghgs_lit.cli.{name}" for name in ("application", "prepare", "train", "predict", "table"))]
 )
 
 
