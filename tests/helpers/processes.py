@@ -30,7 +30,8 @@ def run_prepared(function: Callable, *arguments: object) -> None:
     """Call a function of a module, which must succeed, in a process of :data:`PREPARED`."""
     process = PREPARED.Process(target=function, args=arguments)
     process.start()
-    process.join()
+    process.join(300)
+    process.kill()  # where it hangs
     assert process.exitcode == 0
 
 
@@ -39,7 +40,8 @@ def run_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tupl
     output = folder / ".output"
     process = PREPARED.Process(target=_verb, args=(shlex.split(command), folder, dict(environment), output))
     process.start()
-    process.join()
+    process.join(300)
+    process.kill()  # where it hangs
     return process.exitcode, output.read_text()
 
 
