@@ -18,7 +18,6 @@ class Photograph:
     """One photograph without lens distortion, upright.
 
     Attributes:
-        name: of its camera.
         image: [h, w, 3] uint8, RGB.
         matte: [h, w] uint8, 255 times the share of each pixel that shows the subject.
         intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
@@ -88,7 +87,6 @@ def _refined(
 
 
 def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """The image multiplied by its matte."""
     return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
 
 

@@ -119,11 +119,8 @@ class CaptureFolder:
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
-        """The photographs of one instant, two or more.
-
-        Raises:
-            InputError: a photograph or mask is missing or wrong.
-        """
+        """The photographs of one instant, two or more. InputError: a photograph or mask is missing or
+        wrong."""
         views = zip(self.paths[instant], self.decode(instant), strict=True)
         self._begun.clear()  # they take much memory
         return tuple(self.photograph(name, *view, self.convention) for name, view in views)

@@ -27,10 +27,8 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
 
     An alpha channel counts unless it is the same everywhere. Of labels any but 0 is the subject, and the
-    largest number beside them, void, is not.
-
-    Raises:
-        InputError: it cannot be decoded, or fits the photograph neither as shown nor as stored.
+    largest number beside them, void, is not. InputError: it cannot be decoded, or fits the photograph neither
+    as shown nor as stored.
     """
     image = read_image(path)
     values = np.asarray(image)
@@ -78,14 +76,8 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from a photograph to its matte.
-
-    Args:
-        name: one of :data:`SEGMENTERS`.
-
-    Raises:
-        InputError: its package is not installed.
-    """
+    """A function from a photograph to its matte. ``name``: one of :data:`SEGMENTERS`. InputError: its package
+    is not installed."""
     choice("segment", name, SEGMENTERS)
     try:
         import rembg

@@ -101,15 +101,9 @@ FORMATS: dict[str, Format] = {
 
 
 def output_options(config: Mapping[str, Any]) -> OutputOptions:
-    """The options of a verb's configuration, checked before any work.
-
-    Args:
-        config: plain data with ``formats`` (``all`` stands for all of them), ``up``, ``smooth`` and
-            ``turntable``.
-
-    Raises:
-        InputError: an unknown format, a value out of range, or a package that is not installed.
-    """
+    """The options of a verb's configuration, checked before any work. ``config``: plain data with ``formats``
+    (``all`` stands for all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a
+    value out of range, or a package that is not installed."""
     formats = config["formats"]
     formats = [formats] if isinstance(formats, str) else formats
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
@@ -131,16 +125,8 @@ def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace an input, or a file that :func:`write_prediction` did not write.
-
-    Args:
-        directory: of the outputs.
-        names: of these, below it.
-        inputs: files that are read.
-
-    Raises:
-        InputError: names the first such file.
-    """
+    """Refuse to replace an input, or a file that :func:`write_prediction` did not write. InputError: names
+    the first such file."""
     read = {path.resolve() for path in inputs}
     written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
     for name in names:
@@ -164,7 +150,6 @@ def _report_before(directory: Path) -> dict[str, Any]:
 
 
 def _written_before(directory: Path) -> list[str]:
-    """The files that earlier predictions wrote into a directory."""
     report = _report_before(directory)
     earlier = report.get("earlier_files")
     return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]
@@ -187,9 +172,7 @@ def write_prediction(
         directory: files that an earlier prediction wrote are replaced, others stay.
         batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets,
             or with the photographs where it has none.
-        prediction: of this batch.
         renderer: draws the turntable, and the input views for the report.
-        options: the formats and the frame.
         facts: further plain data for the report, such as the seconds of each stage.
 
     Returns:
