@@ -34,6 +34,9 @@ from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
 
 #: Gaussians whose views go through the network at once.
 _AT_ONCE = 2048
+#: How far the depths that a round compares lie from the current one, in the first round: a share of the
+#: distance from near to far.
+REACH = 0.25
 #: Of :class:`Search`: how far from near to far a Gaussian is, and the distance between them.
 _PLACE = 2
 
@@ -109,8 +112,6 @@ class RoundsOptions(Options):
     """Width of the network."""
     depths: Count = 8
     """Number of depths around the current one at which a round compares the photographs."""
-    reach: float = Field(0.25, gt=0, le=1)
-    """How far these lie from it in the first round, as a share of the distance from near to far."""
     gains: bool = True
     """Photographs of cameras whose exposure differs are made alike first."""
     exchange: Width | None = 16
@@ -187,7 +188,7 @@ class Rounds(nn.Module):
         """New depths and changes of raw attributes, and what the next round remembers."""
         gaussians = state.gaussians.detach()
         each = observe(gaussians, batch)
-        search = self._search(state, batch, rays, size * self.options.reach)
+        search = self._search(state, batch, rays, size * REACH)
         rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
         memory, change = self._looked(*rows, windows)
         step = bounded_tanh(change[:, 0])
