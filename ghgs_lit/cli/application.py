@@ -22,7 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.main import VERBS, collect_garbage_again
+from ghgs_lit.cli.commands import VERBS, collect_garbage_again
 from ghgs_lit.cli.messages import (
     BAD_INPUT,
     BadUsage,
