@@ -22,7 +22,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.main import VERBS, collect_garbage_again
 from ghgs_lit.cli.messages import (
     BAD_INPUT,
     BadUsage,
@@ -32,7 +31,9 @@ from ghgs_lit.cli.messages import (
     raised_by_hydra,
     takes_value,
 )
+from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import check_groups, conf_dir, own_keys, resolve
+from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
 

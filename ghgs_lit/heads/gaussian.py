@@ -159,7 +159,7 @@ class FootprintAttributes(Options):
     def constants(self, color_limit: float) -> tuple[float, ...]:
         """What :func:`ghgs_lit.heads.cpu.activate` is told."""
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
-        return self.offset_limit, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
+        return OFFSET_LIMIT, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
 
     def __call__(
         self,
