@@ -8,6 +8,7 @@ from typing import Any
 from unittest import mock
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ghgs_lit.bounds import cpu as bounds
@@ -160,7 +161,8 @@ def _kernels(device: str) -> Iterator[None]:
     """The shapes of the results of compiled kernels; PyTorch's own operators where ``device`` has none."""
     results = [
         (encoder, "attend", lambda q, k, v: v.new_empty(q.transpose(1, 2).shape)),
-        (geometry, "sweep", lambda colors, masks, *rest: colors.new_empty(*masks.shape, len(rest[-2]))),
+        (geometry, "padded", lambda photo, masks: photo.new_empty(4 * F.pad(masks, (1, 1, 1, 1)).numel())),
+        (geometry, "sweep", lambda colors, pixels, *rest: colors.new_empty(len(pixels), len(rest[-2]))),
         (chamfer, "nearest", lambda queries, _: torch.zeros(len(queries), dtype=torch.long)),
     ]
     if device != "cpu":
