@@ -215,7 +215,7 @@ class Rounds(nn.Module):
         return memory, float32_last(self.change, memory)
 
     def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
-        """:meth:`_remembered` of as much as a cache holds: half the time. Backward few operators matter."""
+        """:meth:`_remembered` in parts that fit a CPU's cache: half the time. All at once with a gradient."""
         count, device = len(rows[0]), rows[0].device
         parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
         return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
