@@ -8,6 +8,7 @@ from typing import Any
 from unittest import mock
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ghgs_lit.bounds import cpu as bounds
@@ -162,7 +163,7 @@ def _kernels(device: str) -> Iterator[None]:
     """The shapes of the results of compiled kernels; PyTorch's own operators where ``device`` has none."""
     results = [
         (encoder, "attend", lambda q, k, v: v.new_empty(q.transpose(1, 2).shape)),
-        (geometry, "padded", lambda photo, masks: photo.new_empty(masks.numel() * 4)),
+        (geometry, "padded", lambda photo, masks: photo.new_empty(4 * F.pad(masks, (1, 1, 1, 1)).numel())),
         (geometry, "sweep", lambda colors, pixels, *rest: colors.new_empty(len(pixels), len(rest[-2]))),
         (heads, "is_supported", lambda *_: False),
         (gaussian, "multiplies", lambda *_: False),
