@@ -15,9 +15,10 @@ $(BIN)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt torch==2.13.0
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python scripts/compile_kernels.py
 	touch $@
 
-setup: $(BIN)/.installed ## Create the virtual environment with pinned versions
+setup: $(BIN)/.installed ## Create the virtual environment with pinned versions, compile kernels
 
 demo: setup ## A person from four photographs; then train the four ablations, print the table
 	PATH="$(abspath $(BIN)):$$PATH" bash scripts/demo.sh

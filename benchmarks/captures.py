@@ -1,4 +1,4 @@
-"""What imperfect captures cost a model: built-in people, photographed in eleven ways, with the same targets.
+"""What imperfect captures cost a model: built-in people, photographed in twelve ways, with the same targets.
 
     python benchmarks/captures.py model.ckpt [model.ckpt ...] --baselines all --out captures.json
 
@@ -47,20 +47,22 @@ _PIXELS = ("mask_offset", "mask_ragged", "calibration")
 _HELD = {"camera_pitch": 6.0, "camera_roll": 8.0, "camera_look_at": 0.08}
 _COLORS = {"exposure": 0.5, "white_balance": 0.25}
 _OUTLINES = {"mask_offset": 1.5, "mask_ragged": 2.0}
-_PIECES = {"mask_hole": 0.12, "mask_hole_chance": 1.0}
+_PIECES = {"mask_hole_chance": 1.0}
 
 
 @dataclass(frozen=True)
 class Imperfection:
     """How a capture differs: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`.
 
-    Photographs have exact mattes, or ``masks`` of 0 and 1.
+    Photographs have exact mattes, or ``masks`` of 0 and 1. A ``bumped`` camera is the only one whose
+    calibration is wrong; None: all are.
     """
 
     rig: Mapping[str, Any] = field(default_factory=dict)
     positions: list[int] = field(default_factory=lambda: _EVEN)
     augmentation: Mapping[str, float] = field(default_factory=dict)
     masks: bool = False
+    bumped: int | None = None
 
 
 CAPTURES = {
@@ -75,6 +77,7 @@ CAPTURES = {
     "masks off and ragged": Imperfection(augmentation=_OUTLINES, masks=True),
     "masks with holes": Imperfection(augmentation=_PIECES, masks=True),
     "calibration up to 3 px": Imperfection(augmentation={"calibration": 3.0}),
+    "one camera up to 6 px": Imperfection(augmentation={"calibration": 6.0}, bumped=2),
     "all at once": Imperfection(
         {"radius": [2.67, 2.67], "pitch": [-28.0, -28.0], "fill": [0.7, 0.7], **_HELD},
         _UNEVEN,
@@ -95,7 +98,7 @@ def data_of(capture: Imperfection, people: int, size: list[int]) -> PhotographsD
         f"data.size={size}",
         f"data.render.positions={positions}",
         "data.render.views=[0,3]",
-        f"data.evaluation_positions={{{_VIEWS}: {capture.positions}}}",
+        f"data.evaluation_positions=[{list(capture.positions)}]",
         *(f"data.rig.variation.{name}={value}" for name, value in capture.rig.items()),
     ]
     data = build_data(resolve(compose("prepare", overrides)))
@@ -134,7 +137,12 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
     mattes = wrong.masks.float() if capture.masks else batch.alpha
     pixels = (255 * images[0].movedim(1, -1)).round().byte().numpy()
     shares = (255 * mattes[0]).round().byte().numpy()
-    matrices = (wrong.cameras.intrinsics[0].double().numpy(), wrong.cameras.extrinsics[0].double().numpy())
+    is_wrong = torch.tensor([capture.bumped in (None, view) for view in range(_VIEWS)])[:, None, None]
+    matrices = [
+        torch.where(is_wrong, getattr(wrong.cameras, name)[0], getattr(batch.cameras, name)[0])
+        for name in ("intrinsics", "extrinsics")
+    ]
+    matrices = [one.double().numpy() for one in matrices]
     views = zip(batch.views[0], pixels, shares, *matrices, strict=True)
     return Capture(subject, tuple(Photograph(*view) for view in views))
 

@@ -19,7 +19,7 @@ from literal import write_out
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
-from ghgs_lit.diagnostics.benchmark.measure import Job, inspect, time_jobs
+from ghgs_lit.diagnostics.benchmark.measure import inspect, time_cases
 from ghgs_lit.diagnostics.benchmark.presets import Case, Source, cases_of, presets_of
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL, top_level
 from ghgs_lit.types import Batch
@@ -67,8 +67,8 @@ def main() -> None:
     device = torch.device("cpu")
     batch = person(resolve(cfg), options.share)
     cases = variants(cfg, options.presets.split(","), device)
-    works = [inspect(case, batch, device, count_flops=True)[0] for case in cases]
-    times = time_jobs([Job(case, [batch]) for case in cases], 0, options.repeats, device)
+    works = [inspect(case, batch, device)[0] for case in cases]
+    times = time_cases(cases, [batch], 0, options.repeats, device)
     report(cases, works, times, batch, options)
 
 

@@ -10,6 +10,7 @@ memory. The first batch, which starts the processes, does not count.
 
 import argparse
 import os
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -18,9 +19,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from ghgs_lit.config import build, compose
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.synthesis.miniatures import thuman2
+from scripts.miniatures import thuman2
 
 
 def build_data(overrides: list[str]) -> PhotographsDataModule:

@@ -25,7 +25,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LIST = Path(__file__).with_suffix(".json")
 #: Copied. Caches of kernels are, too: they are stamped with their sources, and compiling takes a minute.
-COPIED = ("ghgs_lit", "hydra_plugins", "conf", "tests", "benchmarks", "examples", "pyproject.toml")
+COPIED = ("ghgs_lit", "hydra_plugins", "conf", "tests", "benchmarks", "scripts", "examples", "pyproject.toml")
 #: What tests take seconds to import, and is not ours.
 LOADED = ("pytest", "torch", "lightning.pytorch", "kornia", "hydra", "pandas", "scipy.spatial", "trimesh")
 

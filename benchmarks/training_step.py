@@ -27,7 +27,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.config import build, conf_dir
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import GHGSModule
-from ghgs_lit.training.callbacks import StepTime
+from ghgs_lit.training.callbacks import Costs
 
 steps, warmup, threads, *overrides = sys.argv[1:]
 torch.set_num_threads(int(threads))
@@ -58,7 +58,7 @@ with tempfile.TemporaryDirectory() as folder:
         accelerator="cpu", max_steps=int(steps) + int(warmup), max_epochs=-1, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
         limit_val_batches=0, num_sanity_val_steps=0, log_every_n_steps=10**9, default_root_dir=folder,
-        callbacks=[StepTime(), Keep()],
+        callbacks=[Costs(), Keep()],
     ).fit(module, data)
 print("RESULT" + json.dumps(found))
 """

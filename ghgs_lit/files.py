@@ -51,6 +51,29 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
             temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def naming(folder: Path) -> Iterator[None]:
+    """Name the ``folder`` that is written to in errors of the system that name no file, as of a full disk.
+
+    Raises:
+        OSError: with ``folder`` as its ``filename``.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        probe = folder / f".{os.getpid()}.tmp"
+        try:
+            # NumPy reports a full disk without the system's number.
+            cause = error if error.errno is not None else _refusal(probe)
+        finally:
+            probe.unlink(missing_ok=True)
+        if cause is None:
+            raise
+        raise OSError(cause.errno, cause.strerror, str(folder)) from error
+
+
 def _refusal(path: Path) -> OSError | None:
     """The system's reason not to write more to the file ``path``; None where it can be written."""
     try:
@@ -59,6 +82,18 @@ def _refusal(path: Path) -> OSError | None:
     except OSError as error:
         return error
     return None
+
+
+def resolved(path: str | Path) -> Path:
+    """The absolute path without links; ``~`` is the user's folder.
+
+    Raises:
+        InputError: its links go in a loop (before Python 3.13; later whatever opens it says so).
+    """
+    try:
+        return Path(path).expanduser().resolve()
+    except RuntimeError as error:
+        raise InputError(f"{path}: expected a path; found links in a loop") from error
 
 
 def write_text_atomically(path: str | Path, text: str) -> None:

@@ -56,6 +56,8 @@ class GHGS(nn.Module):
         self.feature_cache = None
         #: Whether predictions outside of training hold the Gaussians before each round, too.
         self.keeps_drafts = False
+        #: Whether photographs, depths and bodies with NaN or values out of range are refused.
+        self.checks_values = True
         self.precision = "inherit"
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -66,7 +68,7 @@ class GHGS(nn.Module):
 
     def forward(self, batch: Batch) -> Prediction:
         """Gaussians, depths and points, in the world of the cameras; InputError: the batch does not fit."""
-        around = surroundings(self.options, self.encoder.patch_size)
+        around = surroundings(self.options, self.encoder.patch_size, self.checks_values)
         for layer in around:
             batch = layer.enter(batch)
         with computing(self.precision, self.auto, self.encoder, batch.masks) as (decisions, kept):

@@ -7,12 +7,14 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import yaml
 
 from ghgs_lit.errors import InputError, require
+
+if TYPE_CHECKING:  # runs and --help read no arrays
+    import numpy as np
 
 #: Bytes of a file of text, and levels of its mappings and lists.
 LARGEST, DEEPEST = 1 << 28, 64
@@ -28,6 +30,12 @@ def require_file(path: str | os.PathLike, expected: str) -> None:
             f"{path}: expected {expected}; found {'no such file' if missing else error.strerror}"
         ) from error
     require(is_file, str(path), expected, "a folder" if os.path.isdir(path) else "no regular file")
+
+
+def require_data_folder(folder: Path) -> None:
+    """Refuse a folder of a data set that is missing."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
 
 
 def read_text(path: Path, expected: str = "text") -> str:
@@ -80,12 +88,14 @@ def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
             yield entry
 
 
-def read_npy(path: Path, expected: str = "a readable .npy file") -> np.ndarray:
+def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray":
     """The array of an ``.npy`` file without objects.
 
     Raises:
         InputError: it is missing, another format, or shorter than its header says.
     """
+    import numpy as np  # here: commands that read no array start sooner
+
     require_file(path, expected)
     try:
         # A mapping is refused where the file is too short; reading would ask for the memory first.

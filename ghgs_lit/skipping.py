@@ -12,7 +12,6 @@ from pydantic import model_validator
 from torch import Tensor
 
 from ghgs_lit.config.options import Amount, Index, Options, Text
-from ghgs_lit.errors import InputError
 from ghgs_lit.types import Decision, DecodedPixels
 
 
@@ -39,6 +38,10 @@ def seeing(encoder: Any, view: View) -> Iterator[None]:
         encoder.tokens, encoder.margin = before
 
 
+#: PSNR in dB that ``skip=exact`` may lose: rounding.
+EXACT_LOSS = 0.001
+
+
 class Preset(Options):
     """What is left out of the work, and what that may cost."""
 
@@ -52,7 +55,7 @@ class Preset(Options):
     pixels: DecodedPixels = "subject"
     """Pixels that the dense heads decode: whole views, or windows around the subject. The depth head decodes
     all where recalibration.tokens=all: all tokens need a depth."""
-    budget_db: float | None = 0.001
+    budget_db: float | None = EXACT_LOSS
     """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it); null: no promise."""
     max_rel_diff: Amount | None = 1e-5
     """Largest difference of an attribute or a render from skip=none, as a share of its largest value, which
@@ -70,14 +73,12 @@ class Preset(Options):
 
 
 class Choices(Options):
-    """Presets of which ``skip=auto`` gives each subject one; null: not that one."""
+    """PSNR that presets may lose against ``skip=none``, in dB; null: not that one."""
 
-    exact: Preset | None = None
-    """The same values without work that no output depends on."""
-    balanced: Preset | None = None
+    balanced: Amount | None = None
     """The encoder works on a window around the subject."""
-    fast: Preset | None = None
-    """The encoder works on the subject alone."""
+    fast: Amount | None = None
+    """The encoder works on the subject and ``skip.margin`` patches around it."""
 
 
 class SkipOptions(Preset):
@@ -85,32 +86,30 @@ class SkipOptions(Preset):
 
     group = "skip"
     choices: Choices = Choices()
-    """Presets to choose from with skip=auto; none: this one is a preset itself."""
+    """With skip=auto: the presets to choose from beside exact; none: this is a preset itself."""
 
     @model_validator(mode="after")
     def _check(self) -> "SkipOptions":
         """Refuse keys that would be ignored, and a budget in which there is no preset."""
-        if not self.presets:
-            return self
-        self.require(self.tokens == "all", "tokens", "all with skip=auto, which chooses it")
-        for name, preset in self.presets.items():
-            for key in ("pixels", "margin") if preset.tokens == "subject" else ("pixels",):
-                wanted, found = getattr(self, key), getattr(preset, key)
-                if found != wanted:
-                    raise InputError(
-                        f"choices.{name}.{key}: expected {wanted}, as skip.{key}; found {found!r}"
-                    )
-            if preset.budget_db is None:
-                raise InputError(f"choices.{name}.budget_db: expected a number; found None")
-        least = min(preset.budget_db for preset in self.presets.values())
-        enough = self.budget_db is not None and self.budget_db >= least
-        self.require(enough, "budget_db", f"{least:g} or more with skip=auto")
+        if self.presets:
+            self.require(self.tokens == "all", "tokens", "all with skip=auto, which chooses it")
+            enough = self.budget_db is not None and self.budget_db >= EXACT_LOSS
+            self.require(enough, "budget_db", f"{EXACT_LOSS:g} or more with skip=auto")
         return self
 
     @property
     def presets(self) -> dict[str, Preset]:
-        """The presets to choose from, by name."""
-        return {name: preset for name, preset in self.choices if preset is not None}
+        """The presets to choose from, by name, as their files in conf/skip have them; none: no choice."""
+        exact = Preset(pixels=self.pixels, budget_db=EXACT_LOSS)
+        seen = {"balanced": ("window", 0), "fast": ("subject", self.margin)}
+        others = {
+            name: exact.replace(
+                name=name, tokens=seen[name][0], margin=seen[name][1], budget_db=loss, max_rel_diff=None
+            )
+            for name, loss in self.choices
+            if loss is not None
+        }
+        return {"exact": exact, **others} if others else {}
 
     def build(self) -> "AutoSkip | None":
         """What chooses among the presets; None where there are none."""
@@ -127,8 +126,8 @@ class AutoSkip:
     """Gives each subject the preset in which the encoder has the fewest products, among those in the budget.
 
     The encoder's products decide: the heads compute windows around the subject in every preset. Presets lose
-    what their YAML says (``ghgs benchmark`` checks it). The machine has no say: half precision is a choice of
-    its own for every preset (``precision=auto``).
+    what ``skip.choices`` says. The machine has no say: half precision is a choice of its own for every preset
+    (``precision=auto``).
 
     Args:
         presets: by name, those in the budget, the most accurate first.

@@ -35,8 +35,6 @@ class ModelOptions(Options):
     matte: float | None = Field(None, ge=0, le=0.5)
     """Pixels that show a larger share of the subject become Gaussians, whose colours and opacities know that
     share; null: masks decide, mattes are ignored."""
-    check_inputs: bool = True
-    """Photographs, depths and bodies with NaN or values out of range are refused."""
 
 
 class Surrounding:
@@ -102,10 +100,10 @@ def side_multiple(options: ModelOptions, patch_size: int) -> int:
     return 1 if options.pad == "multiple" else patch_size
 
 
-def surroundings(options: ModelOptions, patch_size: int) -> Sequence[Surrounding]:
+def surroundings(options: ModelOptions, patch_size: int, checks_values: bool) -> Sequence[Surrounding]:
     """All that surrounds the stages for one batch, from the outside to the inside."""
     return [
-        Checks(side_multiple(options, patch_size), options.check_inputs),
+        Checks(side_multiple(options, patch_size), checks_values),
         Mattes(options.matte),
         *([SubjectFrame()] if options.frame == "subject" else []),
         *([Border(patch_size)] if options.pad == "multiple" else []),

@@ -49,7 +49,7 @@ NOT_RUN = [
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"(ghgs table|python benchmarks/when_recalibration\.py) .*runs/ablation", "needs twelve runs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
-    (r"ghgs benchmark task=peers data=scans", "fits Gaussians to each person, for minutes"),
+    (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python benchmarks/half_precision", "takes an hour"),
     (r"SMPL_MODEL=…", "needs the licensed body model and both data sets"),
@@ -60,7 +60,7 @@ if importlib.util.find_spec("smplx") is None:
     NOT_RUN.append((r"ghgs .*data\.smpl_model=", "needs the package smplx"))
 
 CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
-TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1"
+TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1 data.render_workers=0"
 SHORT = "trainer.max_steps=2 trainer.val_check_interval=2 trainer.limit_val_batches=1"
 FEW = "miniature.size=128 miniature.people.train=2 miniature.people.val=1"
 TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a command that trains
@@ -68,11 +68,8 @@ TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a comma
 SMALL = [
     (r"^make demo$", f"bash scripts/demo.sh {TINY} {SHORT}", "without the set-up, two steps"),
     (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
-    (r"^(ghgs benchmark (?!.*(?:-help|task=)).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
+    (r"^(ghgs benchmark (?!.*-help).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
-    (r"^(ghgs benchmark task=scaling .*)",
-     r"\1 encoder=vggt_nano 'scaling={share: [0.1, 0.2], views: [2, 3], size: [56, 70], batch: [1]}'",
-     "small photographs"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
     (r"^(python benchmarks/part_awareness\.py.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
@@ -86,9 +83,10 @@ SMALL = [
     (r"(?<=data\.root=)(\.\.\.|zju_mocap)", "zju", "a miniature"),
     (r"(?<=THuman2\.0_Release )data\.root=rendered", "data.root=rendered_scans", "beside the miniature"),
     (r"their_results\.json", "docs/example_others.json", "a complete file"),
-    (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1", "small photographs"),
+    (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1 data.render_workers=0",
+     "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
-    (r"^(ghgs prepare task=miniature.*)", rf"\1 {FEW}", "few people"),
+    (r"^(.*(?:task=miniature|miniature\.py).*)", rf"\1 {FEW}", "few people"),
     (r"^(python benchmarks/loading\.py.*)", r"\1 --seconds 1 --size 128 --workers 0,1", "one second"),
     (r"^(python benchmarks/captures\.py.*)", r"\1 --people 1", "one person"),
     (r"^(python scripts/check_resume\.py)(?: --steps 40 --kill-at 20)?(.*)",
@@ -156,7 +154,7 @@ BEFORE = {
     "docs/add_a_data_set.md": (*_RENDERED, _PHOTOGRAPHS),
     "docs/benchmark.md": _CHECKPOINTS,
     "docs/data.md": (
-        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW}",
+        f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW}",
         _SCANS.format("THuman2.0_Release"),
     ),
     "docs/encoder.md": _CHECKPOINTS,
@@ -167,7 +165,7 @@ BEFORE = {
     "docs/outputs.md": _CHECKPOINTS,
     "docs/photographs.md": (
         f"{_RUN} hydra.run.dir=runs/mine",
-        f"ghgs prepare task=miniature data=thuman2 data.root=rendered {FEW} miniature.size=112",
+        f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW} miniature.size=112",
         _CAPTURE,
     ),
     "docs/rounds.md": _RENDERED,
@@ -175,7 +173,7 @@ BEFORE = {
     "docs/tables.md": (_SWEEP,),
     "docs/training.md": (
         f"{_RUN} hydra.run.dir=runs/before",
-        f"ghgs prepare task=miniature data=thuman2 data.root=thuman2 {FEW}",
+        f"python scripts/miniature.py data=thuman2 data.root=thuman2 {FEW}",
         *_RENDERED,
     ),
 }  # fmt: skip

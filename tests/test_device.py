@@ -19,9 +19,9 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.callbacks import StepTime
+from ghgs_lit.training.callbacks import Costs
 from ghgs_lit.training.checkpoints import CheckpointOptions
-from ghgs_lit.training.validation_pictures import Pictures
+from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.losses import losses_of
@@ -120,8 +120,8 @@ def train(folder, **place):
         limit_val_batches=1,
         default_root_dir=folder,
         callbacks=[
-            StepTime(),
-            Pictures(1),
+            Costs(),
+            PicturesOptions(subjects=1).build(),
             CheckpointOptions(filename="last", every_n_train_steps=2).build(),
         ],
         logger=False,

@@ -8,11 +8,12 @@ import socket
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
-from ghgs_lit.files import is_locked, lock, lock_owner, write_atomically, write_text_atomically
+from ghgs_lit.files import is_locked, lock, lock_owner, naming, write_atomically, write_text_atomically
 
 SPAWN = multiprocessing.get_context("spawn")
 
@@ -126,6 +127,34 @@ def test_a_full_disk_names_the_file_and_leaves_nothing(tmp_path, kind):
     process.join(60)
     assert answer == (OSError, f"[Errno 27] File too large: '{path}'")
     assert list(tmp_path.iterdir()) == []
+
+
+def limited_save(folder, answers):
+    """In a process of its own: NumPy writes 8 MB where files may have half of one."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
+    try:
+        with naming(folder):
+            np.save(folder / "a.npy", np.zeros(1 << 20))
+    except BaseException as error:
+        answers.put((type(error), str(error)))
+
+
+def test_a_full_disk_names_the_folder_where_no_file_is_named(tmp_path):
+    """NumPy says how many numbers it wrote, and neither why no more nor where."""
+    context = multiprocessing.get_context("fork")
+    answers = context.Queue()
+    process = context.Process(target=limited_save, args=(tmp_path, answers))
+    process.start()
+    answer = answers.get(timeout=60)
+    process.join(60)
+    assert answer == (OSError, f"[Errno 27] File too large: '{tmp_path}'")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
+
+
+def test_errors_that_name_a_file_keep_it(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught, naming(tmp_path):
+        (tmp_path / "none").read_text()
+    assert caught.value.filename == str(tmp_path / "none")
 
 
 def test_a_bug_in_the_writer_keeps_its_type(tmp_path):

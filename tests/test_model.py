@@ -17,6 +17,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import DepthHeadOptions
+from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.gaussian import GaussianHeadOptions
 from ghgs_lit.model import GHGS
 from ghgs_lit.recalibration import RecalibrationOptions
@@ -53,16 +54,19 @@ def element(batch, b):
 
 
 def release_model(inputs, dtype):
-    dpt = {"features": 16, "out_channels": [16, 20, 24, 32]}
     model = GHGS(
         NoBounds(),
         GivenTokens(inputs),
-        DepthHeadOptions(dpt=dpt, parameterization="inverse_linear").build(64),
-        Unprojection(tokens="release", border=3),
+        DepthHeadOptions(parameterization="inverse_linear").build(64),
+        Unprojection(tokens="release"),
         RecalibrationOptions(k=8, similarity="product_clamped", tokens="all").build(64),
-        GaussianHeadOptions(dpt=dpt, parameterization="release").build(64),
+        GaussianHeadOptions(parameterization="release").build(64),
         options=ModelOptions(pad="multiple", frame="world"),
-    ).to(dtype)
+    )
+    widths = 16, (16, 20, 24, 32)  # of the fixture
+    model.depth_head.dpt = DPTHead(64, 2, widths=widths)
+    model.gaussian_head.decoder = DPTHead(64, 32, widths=widths)
+    model.to(dtype)
     published = fixture("predict_gaussian_reduced", "state", dtype)
     model.load_state_dict({to_ours(key, RELEASE): value for key, value in published.items()})
     return model

@@ -12,6 +12,10 @@ import torch
 from ghgs_lit import GHGS
 from ghgs_lit.config import plugins, registry
 from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.export.ply import read_ply
+from ghgs_lit.training import GHGSModule
+from tests.helpers.figures import Figure
+from tests.helpers.models import TINY
 from tests.helpers.people import render_boxes
 from tests.helpers.scenes import make_batch
 from tests.helpers.verbs import ghgs
@@ -20,6 +24,8 @@ FILE = Path(__file__).parent / "fixtures" / "own_stages.py"
 GROUPS = (
     "bounds", "encoder", "depth_head", "unprojection", "recalibration", "gaussian_head", "renderer", "loss"
 )  # fmt: skip
+#: What verbs need to be told again: a checkpoint brings its model.
+SAID = {"renderer": ["renderer=mine"], "loss": ["metrics=mine"]}
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +36,19 @@ def boxes(tmp_path_factory):
     return folder / "rendered"
 
 
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory):
+    """Four photographs of somebody, with their cameras."""
+    folder = tmp_path_factory.mktemp("photographs")
+    Figure().write(folder)
+    return [f"images={folder}", f"cameras={folder / 'cameras.json'}"]
+
+
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A user's folder: a Python file of stages, and a YAML for each of them."""
     shutil.copy(FILE, tmp_path / "own_stages.py")
-    for group in GROUPS:
+    for group in (*GROUPS, "metrics"):
         (tmp_path / "conf" / group).mkdir(parents=True)
         (tmp_path / "conf" / group / "mine.yaml").write_text("kind: mine\n")
     monkeypatch.chdir(tmp_path)
@@ -46,29 +60,41 @@ def project(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("group", GROUPS)
-def test_each_stage_can_be_replaced_alone(project, boxes, monkeypatch, group):
-    """Nothing else of a stage is used than what its protocol says (:mod:`ghgs_lit.stages`)."""
-    common = ["--config-dir", "conf", "views=v3", "evaluation.targets=[midway]", "evaluation.pictures=0"]
+def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypatch, group):
+    """Nothing else of a stage is used than what its protocol says (:mod:`ghgs_lit.stages`).
+
+    Weights of a loss are the checkpoint's, too; numbers of a metric are written like all others.
+    """
+    said = ["--config-dir", "conf", *SAID.get(group, [])]
+    common = [*said, "views=v3", "evaluation.targets=[midway]", "evaluation.pictures=0"]
     arguments = [
-        "model=paper", "data=scans", f"data.root={boxes}", "data.size=42", f"{group}=mine",
+        "model=paper", "data=scans", f"data.root={boxes}", "data.size=28", f"{group}=mine",
         "trainer.max_steps=2", "logger=none", "callbacks=none", "hydra.run.dir=run",
     ]  # fmt: skip
+    arguments += [small for small in TINY if not small.startswith(f"{group}.")]
     assert ghgs("train", *common, *arguments) == 0
     checkpoint = project / "run" / "checkpoints" / "last.ckpt"
     before = json.loads(Path("run/metrics.json").read_text())
     assert before["provenance"]["training"]["steps"] == 2
     with torch.no_grad():
-        prediction = GHGS.from_checkpoint(checkpoint)(make_batch(1, 3, 42, 42))
+        prediction = GHGS.from_checkpoint(checkpoint)(make_batch(1, 3, 28, 28))
     assert len(prediction.gaussians) == int(prediction.depth_valid.sum()) > 0
     assert prediction.gaussians.is_finite.all()
     assert torch.isfinite(prediction.depth).all()
-    again = [f"checkpoint={checkpoint}", "hydra.run.dir=measured"]
-    again += [f"{group}=mine"] * (group == "renderer")  # the only one that a checkpoint does not bring
-    assert ghgs("evaluate", *common, *again) == 0
+    assert ghgs("evaluate", *common, f"checkpoint={checkpoint}", "hydra.run.dir=measured") == 0
     measured = json.loads(Path("measured/metrics.json").read_text())
     values = [[row["psnr"] for row in content["rows"]] for content in (before, measured)]
     assert np.isfinite(values[0]).all()
     assert values[1] == pytest.approx(values[0], abs=1e-3)
+    if group == "loss":
+        saved = torch.load(checkpoint)["state_dict"]["losses.network.weight"]
+        assert torch.equal(GHGSModule.load_from_checkpoint(checkpoint).losses.network.weight, saved)
+        assert "largest" in measured["provenance"]["protocol"]["reported"]
+        assert all(0 < row["largest"] <= 1 for row in measured["rows"])
+        said.remove("metrics=mine")
+    run = [f"checkpoint={checkpoint}", "out=splat", "formats=[ply]", "turntable.frames=0"]
+    assert ghgs("predict", *said, *photographs, *run, "check_cameras=false") == 0
+    assert read_ply("splat/gaussians.ply").is_finite.all()
     if group not in ("renderer", "loss"):
         monkeypatch.delenv(plugins.VARIABLE)
         registry._REGISTERED.clear()

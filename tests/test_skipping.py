@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from ghgs_lit.skipping import encoder_products
+from ghgs_lit.skipping import SkipOptions, encoder_products
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from ghgs_lit.weights.loading import load_weights
 from tests.helpers.models import close, config, make_model
@@ -54,7 +54,7 @@ def test_each_subject_gets_the_cheapest_preset_and_it_is_what_runs():
 @pytest.mark.parametrize(
     ("said", "expected"),
     [
-        (["skip.choices.balanced.budget_db=0.2"], ("exact", "exact", "fast")),
+        (["skip.choices.balanced=0.2"], ("exact", "exact", "fast")),
         (["skip.budget_db=0.01"], ("exact",) * 3),
         # Equal cost goes to the more exact preset: here fast keeps the window of the second subject.
         (["skip.margin=0"], ("exact", "balanced", "fast")),
@@ -102,6 +102,13 @@ def test_presets_that_the_training_did_not_show_are_left_out(tmp_path, trained, 
     assert model.auto.report(decisions).count("not shown in training") == 3 - len(left)
 
 
+@pytest.mark.parametrize("name", ["exact", "balanced", "fast"])
+def test_the_presets_to_choose_from_are_those_of_their_files(name):
+    """One of them that is changed in its file alone would be another one with skip=auto."""
+    auto, own = (SkipOptions.read(config(f"skip={option}")["skip"], "skip") for option in ("auto", name))
+    assert dict(auto.presets[name]) == {key: value for key, value in own if key != "choices"}
+
+
 def test_the_authors_weights_have_seen_all_tokens_only(tmp_path):
     """Their file may be written with any preset; what their training did not show must not be chosen."""
     path, model = tmp_path / "release.ckpt", make_model("skip=auto")
@@ -116,8 +123,7 @@ def test_keys_that_would_be_ignored_are_refused():
         ("skip.budget_db=0", r"skip\.budget_db: expected 0\.001 or more with skip=auto; found 0"),
         ("skip.budget_db=null", r"skip\.budget_db: expected 0\.001 or more"),
         ("skip.tokens=subject", r"skip\.tokens: expected all with skip=auto"),
-        ("skip.choices.fast.margin=3", r"skip\.choices\.fast\.margin: expected 1, as skip\.margin"),
-        ("skip.pixels=all", r"skip\.choices\.exact\.pixels: expected all"),
+        ("skip.choices.fast=-1", r"skip\.choices\.fast: expected a number >= 0 or null; found -1"),
     ):
         with pytest.raises(InputError, match=message):
             make_model("skip=auto", said)

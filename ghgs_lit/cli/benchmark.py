@@ -1,4 +1,4 @@
-"""``ghgs benchmark``: run time against error of every preset and of other methods, and how cost grows."""
+"""``ghgs benchmark``: run time against error of every preset."""
 
 import itertools
 import math
@@ -11,16 +11,14 @@ import lightning.pytorch as L
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.benchmark_peers import peers
 from ghgs_lit.cli.inputs import build_data, choices, overrides, pick_device, with_trained_data
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
-from ghgs_lit.diagnostics.benchmark import report, scaling
+from ghgs_lit.diagnostics.benchmark import report
 from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
-from ghgs_lit.diagnostics.benchmark.peers import tables_of as tables_of_peers
-from ghgs_lit.diagnostics.benchmark.plot import draw_presets, draw_scaling
+from ghgs_lit.diagnostics.benchmark.plot import draw_presets
 from ghgs_lit.diagnostics.benchmark.presets import (
     KNOBS,
     YARDSTICK,
@@ -30,34 +28,22 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     presets_of,
 )
 from ghgs_lit.diagnostics.output import print_tables, save_figure
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
-from ghgs_lit.weights.reading import SHIPPED
-
-TASKS = ("presets", "peers", "scaling")
 
 
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the results last. Exit code 1 where a preset breaks its budget."""
     directory = output_dir()
-    choice("task", cfg.task, TASKS)
-    if cfg.task == "peers" and cfg.checkpoint is None:
-        cfg.checkpoint = SHIPPED
-    cfg = cfg if cfg.task == "scaling" else with_trained_data(cfg)
-    config = save_config(cfg, directory)
+    config = save_config(with_trained_data(cfg), directory)
     check_options(config, overrides())
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     with threads(config["threads"]):
-        if cfg.task == "peers":
-            content = peers(cfg, config, directory, device)
-        else:
-            cases = configured_cases(config, device)
-            measured = _presets if cfg.task == "presets" else _scaling
-            content = measured(cases, config, device)
-        content = {"task": config["task"], "machine": machine_facts(device), **content}
+        content = _presets(configured_cases(config, device), config, device)
+        content = {"machine": machine_facts(device), **content}
     path = _write(directory, content, config)
     announce(path)
     if content["broken"]:
@@ -67,18 +53,7 @@ def run(cfg: DictConfig) -> None:
 
 
 def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
-    """Refuse what cannot be measured.
-
-    Args:
-        config: of ``ghgs benchmark``, resolved.
-        given: overrides that were asked for.
-
-    Raises:
-        InputError: an option that has no effect beside the others.
-    """
-    require(bool(config["presets"]), "presets", "a list with a name", config["presets"])
-    for key in ("vs", "knobs") if config["task"] == "peers" else ():
-        require(config[key] is None, key, "null with task=peers", config[key])
+    """Refuse an option, or one of the overrides that were ``given``, that has no effect beside others."""
     if config["checkpoint"] is None:
         require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
         return
@@ -93,19 +68,13 @@ _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """Every source in every preset; for errors the yardstick is always among them.
-
-    Args:
-        config: of ``ghgs benchmark``, resolved.
-        device: of the models.
+    """Every source in every preset, the yardstick always among them.
 
     Raises:
         FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.
     """
-    names = config["presets"]
-    if config["task"] == "presets":
-        names = list(dict.fromkeys([YARDSTICK, *names]))
-    presets = presets_of(names, config["skip"])
+    names = dict.fromkeys([YARDSTICK, *config["presets"]])
+    presets = presets_of(list(names), config["skip"])
     if config["checkpoint"] is None:
         sources = [Source("model", config, None)]
     else:
@@ -145,15 +114,6 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     }
 
 
-def _scaling(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
-    """Measure how cost grows, on analytic scenes."""
-    rows, fits = scaling.study(cases, config["scaling"], device, **config["timing"])
-    base = ", ".join(f"{name} {value:g}" for name, value in config["scaling"]["base"].items())
-    about = f"{_weights(config, cases)}; an ellipsoid, elsewhere {base}"
-    random_weights = config["checkpoint"] is None
-    return {"about": about, "random_weights": random_weights, "rows": rows, "fits": fits, "broken": []}
-
-
 def _weights(config: dict[str, Any], cases: list[Case]) -> str:
     """The models in words."""
     number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
@@ -165,14 +125,8 @@ def _weights(config: dict[str, Any], cases: list[Case]) -> str:
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
     """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
-    if content["task"] == "peers":
-        tables = tables_of_peers(rows)
-    elif content["task"] == "presets":
-        tables = report.tables_of(rows)
-        save_figure(draw_presets(rows, *words), directory / "benchmark.png")
-    else:
-        tables = scaling.tables_of(rows, content["fits"])
-        save_figure(draw_scaling(rows, content["fits"], *words), directory / "benchmark.png")
+    tables = report.tables_of(rows)
+    save_figure(draw_presets(rows, *words), directory / "benchmark.png")
     print_tables(tables)
     print(*content.get("decisions", []), sep="\n", flush=True)
     source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())

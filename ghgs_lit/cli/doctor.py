@@ -5,7 +5,6 @@ from collections.abc import Callable
 from omegaconf import DictConfig
 
 from ghgs_lit.cli import doctor_cameras, doctor_machine, doctor_selfcheck
-from ghgs_lit.errors import choice
 
 TASKS: dict[str, Callable[[DictConfig], None]] = {
     "cameras": doctor_cameras.run,
@@ -16,5 +15,4 @@ TASKS: dict[str, Callable[[DictConfig], None]] = {
 
 def run(cfg: DictConfig) -> None:
     """The verb: one of :data:`TASKS`."""
-    choice("task", cfg.task, tuple(TASKS))
     TASKS[cfg.task](cfg)

@@ -47,7 +47,8 @@ def run(cfg: DictConfig) -> None:
     console.print(
         f"every figure of memory includes the weights, {weights}; in training AdamW's moments: {state}"
     )
-    free = _free(device) if config["gpu_memory"] is None else int(1e9 * config["gpu_memory"])
+    free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else memory_of_host()[1]
+    free = free if config["gpu_memory"] is None else int(1e9 * config["gpu_memory"])
     for line in advice(config, kind, prediction, step, free):
         console.print(line, markup=False)
 
@@ -72,10 +73,6 @@ def trained(config: Mapping[str, Any], kind: str) -> Pass:
 def _scene(config: Mapping[str, Any]) -> Scene:
     size = image_size("data.size", config["data"]["size"])
     return Scene(config["share"], config["views"]["evaluation_count"], size)
-
-
-def _free(device: torch.device) -> int:
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else memory_of_host()[1]
 
 
 def _table(config: Mapping[str, Any], prediction: Pass, step: Pass) -> Table:

@@ -26,12 +26,7 @@ from ghgs_lit.runs.results import METHOD, read_results
 
 
 def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
-    """The methods to measure by name, and facts about them for the results.
-
-    Args:
-        config: of the verb; its model is that of the checkpoint where there is one.
-        device: where the methods run.
-    """
+    """The methods to measure by name, and facts about them for the results."""
     path = config["checkpoint"]
     if path is None and not config["baselines"]:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")

@@ -13,7 +13,7 @@ from ghgs_lit.config import build
 from ghgs_lit.config.ablation import ablation_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.data.sampling import CAMERAS
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
@@ -117,10 +117,6 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
 
     Only what was said counts: the options that a verb composes by default describe another model.
 
-    Args:
-        checkpoint: the path.
-        cfg: the composed configuration of the verb.
-
     Raises:
         InputError: the command line changes what the weights were trained for; names the key.
     """
@@ -184,12 +180,7 @@ def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def pick_device(name: str) -> torch.device:
-    """The device ``cpu`` or ``cuda``; ``auto`` is CUDA, and the CPU where there is no CUDA.
-
-    Raises:
-        InputError: another name, or CUDA where there is none.
-    """
-    choice("device", name, ("auto", "cpu", "cuda"))
+    """The device ``cpu`` or ``cuda`` (InputError: there is none); ``auto`` is CUDA, else the CPU."""
     there = torch.cuda.is_available()
     require(there or name != "cuda", "device", "auto or cpu on a machine without CUDA", name)
     return torch.device("cuda" if name != "cpu" and there else "cpu")

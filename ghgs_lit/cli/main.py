@@ -1,41 +1,15 @@
-"""``ghgs <verb> [overrides]``: every verb is a Hydra application over ``conf/<verb>.yaml``."""
+"""``ghgs <verb> [overrides]``: the verbs, and how a command begins and ends.
 
-import importlib
-import importlib.metadata
-import keyword
+:mod:`ghgs_lit.cli.application` runs a verb; it is imported where there is one.
+"""
+
+import gc
 import os
-import re
-import shutil
-import signal
 import sys
-import time
-from dataclasses import dataclass, field
-from itertools import pairwise
-from pathlib import Path
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
-from omegaconf import DictConfig
-
-from ghgs_lit.cli.messages import (
-    BAD_INPUT,
-    BadUsage,
-    check_deletions,
-    flags_first,
-    one_line,
-    raised_by_hydra,
-    takes_value,
-)
-from ghgs_lit.config import check_groups, conf_dir, resolve
-from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.kernels.allocation import keep_freed_memory
-from ghgs_lit.runs.job import register_resolvers
-from ghgs_lit.runs.signals import Interrupted, interruptible
 
-register_resolvers()  # on import, so that the processes of a launcher have them too
-
-# verb: (what it does, an example)
+#: What each verb does, and an example.
 VERBS = {
     "prepare": (
         "render scans into training data, or make the built-in people",
@@ -86,11 +60,6 @@ VERBS = {
 }
 
 
-def module_of(verb: str) -> str:
-    """The module of a verb; a keyword of Python gets an underscore."""
-    return f"ghgs_lit.cli.{verb}" + "_" * keyword.iskeyword(verb)
-
-
 def usage() -> str:
     """The text of ``ghgs --help``."""
     lines = ["usage: ghgs <verb> [key=value ...] [group=option ...] [-m]", ""]
@@ -101,42 +70,6 @@ def usage() -> str:
         "ghgs <verb> --help lists the groups and keys of a verb; ghgs --version prints the version.",
     ]
     return "\n".join(lines)
-
-
-def discard_unused(directory: Path, verb: str, since: float) -> None:
-    """Remove a run's directory that holds only how the run began, all of it written after ``since``."""
-    begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
-    paths = [] if directory == Path.cwd() else list(directory.glob("*"))
-    if paths and all(path.name in begun and path.stat().st_mtime >= since for path in paths):
-        shutil.rmtree(directory, ignore_errors=True)
-
-
-@dataclass(frozen=True)
-class Verb:
-    """The function of one verb that Hydra calls, here or in the processes of a launcher."""
-
-    name: str
-    argv: tuple[str, ...]
-    wants_trace: bool = False
-    started: float = field(default_factory=time.time)
-
-    def __call__(self, cfg: DictConfig) -> object:
-        # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
-        sys.argv = list(self.argv)
-        try:
-            # Before the verb's module is imported, which takes seconds.
-            resolve(cfg, self.name)
-            check_groups(self.name, cfg)
-            return importlib.import_module(module_of(self.name)).run(cfg)
-        except BAD_INPUT as error:
-            # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise
-            discard_unused(Path(HydraConfig.get().runtime.output_dir), self.name, self.started)
-            if self.wants_trace:
-                raise
-            print(f"ghgs {self.name}: {one_line(error, self.name)}", file=sys.stderr)
-            raise SystemExit(1) from error
 
 
 def _completion_argv(argv: list[str]) -> list[str] | None:
@@ -156,68 +89,42 @@ def _completion_argv(argv: list[str]) -> list[str] | None:
     return [argv[0], words[1], *argv[1:]]
 
 
-def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Arguments in Hydra's terms.
+def collect_garbage_again() -> None:
+    """Undo that :func:`main` turned the collector off; what was imported so far it leaves alone, at exit too.
 
-    ``table sweep=<directory>`` is the key ``runs``: to Hydra ``sweep`` is a group. Where the data is that of
-    a checkpoint, which Hydra does not know, its keys are forced.
+    That once in a process: the next call of ``main`` finds objects that may become garbage.
     """
-    if verb == "table":
-        return [re.sub("^sweep=", "runs=", argument) for argument in arguments]
-    has_data = any(argument.startswith("data=") for argument in arguments)
-    if verb in ("evaluate", "predict", "view") and not has_data:
-        return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
-    return arguments
+    if not gc.isenabled():
+        if not gc.get_freeze_count():
+            gc.freeze()
+        gc.enable()
 
 
-def _help(verb: str, arguments: list[str]) -> int:
-    """``ghgs <verb> --help [group]``; of other arguments only ``--config-dir`` has a say."""
-    from ghgs_lit.cli.help import print_group, print_verb
+def _command(argv: list[str]) -> int:
+    if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
+        completed = _completion_argv(argv)
+        return 0 if completed is None else _run(completed)
+    if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if len(argv) > 1 else 2
+    if argv[1] == "--version":
+        from importlib.metadata import version  # here: --help does not need it
 
-    words = flags_first(arguments)
-    folders = [Path(folder) for flag, folder in pairwise(words) if flag in ("-cd", "--config-dir")]
-    values = {word for flag, word in pairwise(words) if takes_value(flag)}
-    groups = [word for word in words if not word.startswith("-") and "=" not in word and word not in values]
-    for group in groups:
-        print_group(verb, group, folders)
-    if not groups:
-        print_verb(verb, *VERBS[verb], folders)
-    return 0
+        print(version("ghgs-lit"))
+        return 0
+    if argv[1] not in VERBS:
+        from ghgs_lit.config.options import did_you_mean  # here: it loads pydantic
 
-
-def _run(verb: str, argv: list[str]) -> int:
-    # With this variable Hydra raises errors, which are handled below, instead of printing them.
-    wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    task = Verb(verb, tuple(argv), wants_trace)
-    try:
-        if "--help" in argv or "-h" in argv:
-            return _help(verb, argv[2:])
-        sys.argv = [argv[0], *flags_first(_for_hydra(verb, argv[2:]))]
-        check_deletions(sys.argv[1:])
-        with interruptible():
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader, such as `head`, has seen enough; Python must not write the rest when it exits.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
-    except BadUsage as error:
-        print(f"ghgs {verb}: {error}", file=sys.stderr)
+        hint = did_you_mean(argv[1], VERBS)
+        print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}{hint}", file=sys.stderr)
         return 2
-    except Exception as error:
-        if wants_trace or not (isinstance(error, BAD_INPUT) or raised_by_hydra(error)):
-            raise
-        print(f"ghgs {verb}: {one_line(error, verb)}", file=sys.stderr)
-        return 1
-    except Interrupted as stop:
-        if not stop.explained:
-            print(f"ghgs {verb}: interrupted ({signal.Signals(stop.number).name})", file=sys.stderr)
-        return stop.code
-    except KeyboardInterrupt:
-        print(f"ghgs {verb}: interrupted", file=sys.stderr)
-        return 130
-    return 0
+    return _run(argv)
+
+
+def _run(argv: list[str]) -> int:
+    from ghgs_lit.cli.application import run  # here: it loads Hydra
+
+    return run(argv[1], argv)
 
 
 def main() -> int:
@@ -230,20 +137,12 @@ def main() -> int:
     # OpenMP threads that spin while they wait slow down other processes on the same cores tenfold.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()
-    if len(argv) > 2 and argv[1] in ("-sc", "--shell-completion"):
-        completed = _completion_argv(argv)
-        return 0 if completed is None else _run(completed[1], completed)
-    if len(argv) < 2 or argv[1] in ("-h", "--help", "help"):
-        print(usage())
-        return 0 if len(argv) > 1 else 2
-    if argv[1] == "--version":
-        print(importlib.metadata.version("ghgs-lit"))
-        return 0
-    if argv[1] not in VERBS:
-        hint = did_you_mean(argv[1], VERBS)
-        print(f"ghgs: expected a verb ({', '.join(VERBS)}); found {argv[1]!r}{hint}", file=sys.stderr)
-        return 2
-    return _run(argv[1], argv)
+    # Modules are no garbage: looking for some among them takes a third of the start.
+    gc.disable()
+    try:
+        return _command(argv)
+    finally:
+        collect_garbage_again()
 
 
 if __name__ == "__main__":

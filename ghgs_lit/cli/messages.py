@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from ghgs_lit.config import compose, conf_dir
 from ghgs_lit.config.keys import flatten, is_below
@@ -48,6 +49,8 @@ def one_line(error: Exception, verb: str) -> str:
         text = _system(error)
     elif isinstance(error, OmegaConfBaseException):
         text = f"{error.full_key}: expected a value that can be resolved; found {error.msg}"
+    elif isinstance(error, YAMLError):
+        text = _yaml(error)
     elif isinstance(error, InputError):
         text = str(error)
     else:  # of Hydra, which does not say which override it refuses
@@ -64,6 +67,13 @@ def _unread_override(error: OverrideParseException) -> str:
     return (
         f"{key}: expected quotes around such a value, two kinds because of the shell: {quoted}; found {value}"
     )
+
+
+def _yaml(error: YAMLError) -> str:
+    """A file of ``--config-dir`` that is no YAML of plain data, with its line."""
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    place = f"{mark.name}, line {mark.line + 1}" if mark else "--config-dir"
+    return f"{place}: expected YAML of plain data; found {problem or error}"
 
 
 def _missing_option(error: MissingConfigException) -> str:
@@ -106,7 +116,9 @@ def _system(error: OSError) -> str:
 
 
 def raised_by_hydra(error: Exception) -> bool:
-    """Whether an error of any type was raised in Hydra's own code: it is about the command line."""
+    """Whether an error of any type is about the command line: raised in Hydra's own code, or of its YAML."""
+    if isinstance(error, YAMLError):
+        return True
     *_, (innermost, _) = traceback.walk_tb(error.__traceback__)
     return innermost.f_globals.get("__name__", "").split(".")[0] in ("hydra", "omegaconf")
 

@@ -1,4 +1,4 @@
-"""The methods that `ghgs evaluate` and `ghgs benchmark task=peers` measure, as configured."""
+"""The methods that `ghgs evaluate` measures, as configured."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,13 +14,7 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
-    """The model of ``config["checkpoint"]``, and facts about it for results.
-
-    Args:
-        config: of the verb; its model is that of the checkpoint. ``refine`` and
-            ``refine_cameras`` may be missing: none.
-        device: where it runs.
-    """
+    """The model of ``config["checkpoint"]`` on a device, refined as the verb says, and facts about it."""
     renderer, model = build_renderer(config, device), load_model(config, device)
     checkpoint = read_checkpoint(config["checkpoint"])
     facts: dict[str, Any] = {

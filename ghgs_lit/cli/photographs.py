@@ -1,18 +1,21 @@
 """What ``predict images=...`` and ``doctor task=cameras`` share: the folder of a configuration."""
 
 from collections.abc import Mapping
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.prediction.capture.camera_report import Diagnosis
-from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.types import Cameras
+
+if TYPE_CHECKING:  # photographs are read while PyTorch is imported
+    from ghgs_lit.prediction.capture.camera_report import Diagnosis
+    from ghgs_lit.prediction.capture.capture import Capture
+    from ghgs_lit.types import Cameras
 
 #: Longer side of the pictures of a video of instants, in pixels.
 _VIDEO_SIDE = 720
+
+#: The folder that is being read, if any.
+_BEGUN: list[CaptureFolder] = []
 
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration")
 
@@ -25,10 +28,22 @@ def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
     """
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(config[name] is not None, name, example, None)
-    return CaptureFolder(**{name: config[name] for name in _SOURCES})
+    folder = CaptureFolder(**{name: config[name] for name in _SOURCES})
+    return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 
-def require_consistent(diagnosis: Diagnosis) -> None:
+def begin_to_read(config: Mapping[str, Any]) -> None:
+    """Decode the photographs of the first instant, which the next :func:`capture_folder` then has.
+
+    Raises:
+        InputError: as :func:`capture_folder`.
+    """
+    _BEGUN[:] = [capture_folder(config)]
+    if config["segment"] is None:
+        _BEGUN[0].begin(_BEGUN[0].instants[0])
+
+
+def require_consistent(diagnosis: "Diagnosis") -> None:
     """Refuse cameras that the masks contradict, with what would fit.
 
     Raises:
@@ -41,8 +56,12 @@ def require_consistent(diagnosis: Diagnosis) -> None:
         )
 
 
-def fixed_camera(capture: Capture) -> Cameras:
+def fixed_camera(capture: "Capture") -> "Cameras":
     """The first camera of a capture with all that its photograph shows, [1, 1]: a video stays at it."""
+    import torch
+
+    from ghgs_lit.types import Cameras
+
     photograph = capture.photographs[0]
     height, width = photograph.mask.shape
     matrices = (photograph.intrinsics, photograph.extrinsics)

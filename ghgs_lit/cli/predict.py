@@ -162,6 +162,13 @@ def advice_of(directory: Path, config: dict[str, Any]) -> Iterator[str]:
         )
 
 
+def moved_line(moved: dict[str, float]) -> str:
+    """Pixels that each photograph's subject moved by; names cameras that moved beside others that stayed."""
+    off = [name for name, pixels in moved.items() if pixels]
+    beside = f": {', '.join(off)} beside the others" if 0 < len(off) < len(moved) else ""
+    return f"refine_cameras: moved by {', '.join(f'{p:.2f}' for p in moved.values())} pixels{beside}"
+
+
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
     """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile."""
     names = folder.instants
@@ -196,9 +203,8 @@ def write_result(
         print(f"refine_masks: changed by {shares} of the subject", flush=True)
         facts["refine_masks"] = list(result.changed)
     if result.moved:
-        pixels = ", ".join(f"{value:.2f}" for value in result.moved)
-        print(f"refine_cameras: moved by {pixels} pixels", flush=True)
-        facts["refine_cameras"] = list(result.moved)
+        facts["refine_cameras"] = dict(zip(result.batch.views[0], result.moved, strict=True))
+        print(moved_line(facts["refine_cameras"]), flush=True)
     if model.auto is not None:
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)

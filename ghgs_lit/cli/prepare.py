@@ -1,4 +1,4 @@
-"""``ghgs prepare``: render people or scans into training data, make a miniature, or check a data set."""
+"""``ghgs prepare``: render people or scans into training data, make a few scans, or check a data set."""
 
 import logging
 from pathlib import Path
@@ -10,7 +10,7 @@ from ghgs_lit.config import build
 from ghgs_lit.data.check import inspect, show, write
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
-from ghgs_lit.errors import InputError, choice
+from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.datasets import Scans
 from ghgs_lit.synthesis.miniature import make_miniature
 
@@ -19,7 +19,6 @@ log = logging.getLogger(__name__)
 
 def run(cfg: DictConfig) -> None:
     """Run the task and print the folder of its result last."""
-    choice("task", cfg.task, ("render", "miniature", "check"))
     data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
     root = Path(data.dataset.root or ".").expanduser().resolve()
     if cfg.task == "render":
@@ -27,8 +26,7 @@ def run(cfg: DictConfig) -> None:
         announce(root)
     elif cfg.task == "miniature":
         miniature = cfg.miniature
-        for folder in make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed):
-            announce(folder)
+        announce(make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed))
     else:
         check(data, output_dir(), **cfg.check)
 

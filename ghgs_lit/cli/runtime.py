@@ -1,15 +1,13 @@
 """What all verbs share: their directory, their saved configuration, and the path that they print last."""
 
-import re
 from pathlib import Path
 from typing import Any
 
-import rich
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
-from rich.syntax import Syntax
+from omegaconf import DictConfig
 
 from ghgs_lit.config import resolve
+from ghgs_lit.config.compose import HEADER, saved_text
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 
@@ -20,18 +18,15 @@ def output_dir() -> Path:
 
 
 def write_config(config: dict[str, Any], directory: Path) -> None:
-    """Write ``directory/config.yaml``; print its path, with ``print_config`` also its content.
+    """Write ``directory/config.yaml`` and print its path.
 
     Raises:
         InputError: such a file of another program is there.
     """
-    text = OmegaConf.to_yaml(OmegaConf.create(config))
     path = directory / "config.yaml"
-    is_free = not path.is_file() or re.search("(?m)^print_config:", path.read_text(errors="replace"))
-    require(bool(is_free), str(path), "no file, or the configuration of an earlier run", "another file")
-    write_text_atomically(path, text)
-    if config["print_config"]:
-        rich.print(Syntax(text, "yaml", theme="ansi_dark", background_color="default"))
+    is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
+    require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")
+    write_text_atomically(path, saved_text(config))
     overrides = " ".join(HydraConfig.get().overrides.task) if HydraConfig.initialized() else ""
     print(f"config: {path} ({overrides or 'no overrides'})", flush=True)
 

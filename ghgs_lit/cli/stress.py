@@ -22,7 +22,7 @@ def run(cfg: DictConfig) -> None:
     config = save_config(cfg, directory)
     if config["dump"] is not None:
         return _replay(config["dump"])
-    tasks = tasks_of(config["stages"], config["families"], config["dtypes"], config["quick"])
+    tasks = tasks_of(config["stages"], config["families"], config["quick"])
     require(bool(tasks), "families", "a family that one of the stages has", config["families"])
     workers = allowed_cores() if config["workers"] is None else config["workers"]
     rows = run_tasks(tasks, directory / "cells.jsonl", workers)

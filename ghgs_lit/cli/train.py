@@ -39,7 +39,6 @@ from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 from ghgs_lit.training import GHGSModule, loggers, start
-from ghgs_lit.training.budgets import TokenBudgets
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.interruption import StopAtStep
@@ -165,10 +164,7 @@ def _run(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> f
 def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
     """Train, save the last weights, measure them; returns the mean PSNR of the first protocol.
 
-    Args:
-        config: the resolved configuration.
-        directory: the run's directory.
-        stats: gets the ``steps`` and ``seconds`` that are trained here.
+    ``stats`` gets the ``steps`` and ``seconds`` that are trained here.
     """
     if rank_zero_only.rank == 0:
         write_config(config, directory)
@@ -183,14 +179,13 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     config = start.with_origin(config, model)
     renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")
     data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
-    budgets = config.get("token_budgets")
     module = GHGSModule(
         model,
         renderer,
         losses,
         build(config["optimizer"], "optimizer"),
         config,
-        None if budgets is None else TokenBudgets(budgets),
+        config.get("token_budgets"),
     )
     quiet()
     cost = TrainingCost()

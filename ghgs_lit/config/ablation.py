@@ -13,11 +13,7 @@ ABLATIONS = {
 
 
 def switches_of(config: Mapping[str, Any]) -> tuple[bool, bool]:
-    """Whether a model finds neighbours among 3D points, and weights attention by semantic similarity.
-
-    Args:
-        config: the configuration of the model, with the node ``recalibration``.
-    """
+    """Whether the model of ``config`` finds neighbours in 3D, and weights attention by similarity."""
     recalibration = config["recalibration"]
     # A class of the user's own may have other keys.
     return recalibration.get("neighborhood", "xyz") == "xyz", recalibration.get("similarity") != "none"

@@ -12,15 +12,12 @@ from ghgs_lit.config.registry import KINDS, check
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
+#: First line of the configuration that a run saves: a file without it is another program's.
+HEADER = "# The configuration of this run, by ghgs."
+
 
 def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) -> DictConfig:
-    """The configuration ``conf/<verb>.yaml`` after ``overrides``, as ``ghgs <verb>`` composes it.
-
-    Args:
-        verb: a verb of the command line, such as ``train``.
-        overrides: as on the command line (``key=value``, ``group=option``).
-        with_hydra: whether to keep the node ``hydra``.
-    """
+    """The configuration of ``ghgs <verb> <overrides>``, with the node ``hydra`` or without."""
     # A verb that is running has initialized Hydra already.
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
@@ -55,21 +52,28 @@ def _has_node(group: str, option: str | None) -> bool:
     return not path.read_text().startswith("# @package _global_") or group in OmegaConf.load(path)
 
 
-def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
-    """The configuration as plain data, interpolations resolved.
+def saved_text(config: dict[str, Any]) -> str:
+    """A resolved configuration as runs save it, in YAML."""
+    return f"{HEADER}\n{OmegaConf.to_yaml(OmegaConf.create(config))}"
 
-    Args:
-        cfg: a composed configuration.
-        verb: whose own keys are checked beside the groups; None: groups alone.
+
+def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
+    """A composed configuration as plain data; the groups are checked, and the keys of ``verb``.
 
     Raises:
         InputError: a value is missing, or of the wrong type or range.
     """
+    data = own_keys(cfg, verb)
+    check(data)
+    return data
+
+
+def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
+    """:func:`resolve` without a look at the groups, whose options import PyTorch."""
     missing = sorted(OmegaConf.missing_keys(cfg))
     if missing:
         raise InputError(f"{missing[0]}: expected a value ({missing[0]}=...); found none")
     data = OmegaConf.to_container(cfg, resolve=True)
-    check(data)
     if verb is not None:
         VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
     return data

@@ -1,6 +1,5 @@
 """Options of config groups by name, beside those that the composed configuration has."""
 
-import difflib
 from contextlib import nullcontext
 from typing import Any
 
@@ -8,6 +7,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.paths import conf_dir
 from ghgs_lit.errors import InputError
 
@@ -17,28 +17,14 @@ def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]
 
     Inside a Hydra application its search path counts, which has the user's ``--config-dir`` too.
 
-    Args:
-        group: config group, such as ``targets``.
-        name: option of the group.
-        key: the configuration key that named the option, for messages (default: the group).
-
     Raises:
-        InputError: the group has no such option.
+        InputError: the group has no such option; names ``key``, or the group.
     """
     inside = GlobalHydra.instance().is_initialized()
     with nullcontext() if inside else initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        known = sorted(_options(group))
+        known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
         if name in known:
-            return _read(group, name)
-    close = difflib.get_close_matches(str(name), known, n=1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
+            node = OmegaConf.select(compose(f"{group}/{name}"), group.replace("/", "."))
+            return OmegaConf.to_container(node, resolve=True)
+    hint = did_you_mean(name, known)
     raise InputError(f"{key or group}: expected one of {', '.join(known)}; found {name!r}{hint}")
-
-
-def _options(group: str) -> list[str]:
-    return GlobalHydra.instance().config_loader().get_group_options(group)
-
-
-def _read(group: str, name: str) -> dict[str, Any]:
-    node = OmegaConf.select(compose(f"{group}/{name}"), group.replace("/", "."))
-    return OmegaConf.to_container(node, resolve=True)

@@ -10,7 +10,6 @@ WITHOUT_INFLUENCE = (
     "dry_run",
     "feature_cache.max_gb",
     "overwrite",
-    "print_config",
     "resume",
     "logger",
     "callbacks",

@@ -55,17 +55,6 @@ class PerScene(Options):
     """Where it starts."""
 
 
-class Peers(Options):
-    """The methods beside the model with task=peers."""
-
-    baselines: Texts = ("nearest_view", "hull", "photo_depth", "per_scene", "true_depth")
-    """Names as in ``ghgs evaluate baselines=``."""
-    views: tuple[Views, ...] = (3, 4, 5)
-    """Numbers of input views."""
-    targets: tuple[Text, ...] = ("release", "midway")
-    """Names of files of conf/targets."""
-
-
 class Timing(Options):
     """How times are taken."""
 
@@ -73,38 +62,6 @@ class Timing(Options):
     """Rounds that do not count."""
     repeats: Count = 9
     """Rounds that count; each runs all presets, and each begins with another one."""
-    count_flops: bool = True
-    """False: one forward pass less for each batch and preset."""
-
-
-class Base(Options):
-    """Where the other axes stay."""
-
-    share: Share = 0.15
-    """Part of the frame that the subject covers."""
-    views: Views = 4
-    """Number of input views."""
-    size: Side = 140
-    """Side of the photographs, pixels."""
-    batch: Count = 1
-    """Elements of a batch."""
-
-
-class Scaling(Options):
-    """How cost grows: one axis is changed at a time; an empty list leaves it out."""
-
-    share: tuple[Share, ...] = (0.05, 0.1, 0.2, 0.4, 0.6)
-    """Parts of the frame that the subject covers."""
-    views: tuple[Views, ...] = (2, 3, 4, 6, 8)
-    """Numbers of input views."""
-    size: tuple[Side, ...] = (140, 280, 518, 1022)
-    """Sides of the photographs in pixels; multiples of the encoder's patch."""
-    batch: tuple[Count, ...] = (1, 2, 4)
-    """Numbers of elements of a batch."""
-    threads: tuple[Count, ...] = (1, 2)
-    """Threads of PyTorch."""
-    base: Base = Base()
-    """Where the other axes stay."""
 
 
 class Phases(Options):
@@ -117,12 +74,12 @@ class Phases(Options):
 
 
 class Miniature(Options):
-    """A small data set of built-in people in the published layout of data=..."""
+    """A small data set of built-in people."""
 
     people: Phases = Phases()
     """Number of people of each phase."""
     size: Side = 256
-    """Longer side of the photographs, pixels."""
+    """Longer side of the photographs, half that of the textures of scans; pixels."""
 
 
 class Check(Options):

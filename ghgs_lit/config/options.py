@@ -52,16 +52,6 @@ Side = Annotated[int, Field(ge=1, le=8192)]
 Size = Annotated[Side | tuple[Side, Side], AfterValidator(_pair)]
 
 
-def multiple_of_four(value: int) -> int:
-    """``value``, refused unless four divides it."""
-    if value % 4:
-        raise ValueError("a multiple of 4")
-    return value
-
-
-MultipleOfFour = Annotated[int, Field(ge=4, le=65536), AfterValidator(multiple_of_four)]
-
-
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """`` (did you mean ...?)`` with the closest of ``known``, or nothing."""
     close = difflib.get_close_matches(str(name), list(known), 1)
@@ -109,14 +99,10 @@ class Options(BaseModel, metaclass=_Checked):
 
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:
-        """The options in ``values``, a mapping (or options already).
-
-        Args:
-            values: by name; what is missing has its default.
-            key: dotted key of the mapping, for messages.
+        """The options in ``values``, a mapping (or options already); what is missing has its default.
 
         Raises:
-            InputError: names the key of the first wrong value, what was expected and what was found.
+            InputError: names the first wrong key below ``key``, what was expected and what was found.
         """
         if isinstance(values, cls):
             return values

@@ -5,6 +5,7 @@ with ``GHGS_PLUGINS`` in the environment (Python files or names of modules, sepa
 installing a package that declares an entry point in the group ``ghgs_lit.plugins``.
 """
 
+import gc
 import importlib
 import importlib.metadata
 import importlib.util
@@ -26,6 +27,8 @@ def load_plugins() -> None:
     """
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
+        # The command line freezes what is imported while it is off: open files would not be flushed at exit.
+        gc.enable()
         importlib.import_module(name)
 
 

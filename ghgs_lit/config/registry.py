@@ -1,12 +1,15 @@
 """What a configuration may build: kinds of options by group, never a path of Python code.
 
 A configuration can come from somebody else's checkpoint. A node such as ``depth_head: {kind: dpt, ...}``
-names one of the kinds below or one that the user's own code has registered; code is imported from
-``GHGS_PLUGINS`` alone (:mod:`ghgs_lit.config.plugins`).
+names one of the kinds below or one that is registered: by a file of the group's room, such as
+``ghgs_lit/heads``, or by the user's own code, which is imported from ``GHGS_PLUGINS`` alone
+(:mod:`ghgs_lit.config.plugins`).
 """
 
 import importlib
+import pkgutil
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
@@ -53,13 +56,10 @@ KINDS: dict[str, dict[str | None, str]] = {
     "targets": {None: "ghgs_lit.data.sampling.TargetProtocol"},
     "augmentation": {None: "ghgs_lit.data.augmentation.Augmentation"},
     "callbacks": {
-        "attention": "ghgs_lit.training.validation_pictures.AttentionOptions",
         "checkpoints": "ghgs_lit.training.checkpoints.CheckpointOptions",
-        "memory": "ghgs_lit.training.callbacks.MemoryOptions",
+        "costs": "ghgs_lit.training.callbacks.CostsOptions",
         "pictures": "ghgs_lit.training.validation_pictures.PicturesOptions",
-        "point_clouds": "ghgs_lit.training.validation_pictures.PointCloudOptions",
         "progress": "ghgs_lit.training.callbacks.ProgressOptions",
-        "step_time": "ghgs_lit.training.callbacks.StepTimeOptions",
     },
     "logger": {
         "csv": "ghgs_lit.training.loggers.CsvOptions",
@@ -71,16 +71,12 @@ KINDS: dict[str, dict[str | None, str]] = {
 #: Groups whose nodes have names: ``callbacks.<name>: {kind: ...}``.
 NAMED = ("callbacks", "logger")
 
-#: Kinds of the user's own code.
+#: Kinds that are registered.
 _REGISTERED: dict[tuple[str, str], type[Options]] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
     """Class decorator: configurations may say ``<group>: {kind: <kind>, ...}`` for these options.
-
-    Args:
-        group: a key of :data:`KINDS`.
-        kind: a name that no kind of the group has.
 
     Raises:
         InputError: there is no such group, or the kind is taken.
@@ -99,26 +95,40 @@ def register(group: str, kind: str) -> Callable[[_C], _C]:
     return keep
 
 
-def kinds_of(group: str) -> list[str | None]:
-    """All kinds of a group, those of the user's own code included."""
+@cache
+def _import_room(group: str) -> None:
+    """Import the files of the group's room (its kinds lie in one), so that they register their kinds."""
+    room = ".".join(next(iter(KINDS[group].values())).split(".")[:2])
+    for file in pkgutil.iter_modules(importlib.import_module(room).__path__, f"{room}."):
+        importlib.import_module(file.name)
+
+
+def _load(group: str) -> None:
+    """Import what may register kinds of a group.
+
+    Raises:
+        InputError: as :func:`load_plugins`.
+    """
     load_plugins()
-    return [*KINDS.get(group, ()), *(kind for of, kind in _REGISTERED if of == group)]
+    if None not in KINDS[group]:
+        _import_room(group)
+
+
+def kinds_of(group: str) -> list[str | None]:
+    """All kinds of a group, those that are registered included."""
+    _load(group)
+    return [*KINDS[group], *(kind for of, kind in _REGISTERED if of == group)]
 
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
-    """The options of a kind.
-
-    Args:
-        group: a key of :data:`KINDS`.
-        kind: a kind of the group, None where its nodes have none.
-        key: dotted key of the node, for messages.
+    """The options of a kind of a group (None where its nodes have none); ``key`` is the node's, for messages.
 
     Raises:
         InputError: there is no such kind; names those that there are.
     """
     known = KINDS[group]
     if isinstance(kind, str) and kind not in known:
-        load_plugins()
+        _load(group)
         if (group, kind) in _REGISTERED:
             return _REGISTERED[group, kind]
     if not (kind is None or isinstance(kind, str)) or kind not in known:
@@ -137,7 +147,7 @@ def read_node(node: Any, key: str) -> Options:
 
     Args:
         node: a mapping of plain data, with ``kind`` where its group has kinds.
-        key: its dotted key in the configuration, such as ``bounds`` or ``callbacks.best``.
+        key: its dotted key, such as ``bounds`` or ``callbacks.best``.
 
     Raises:
         InputError: names the key of the first wrong value, what was expected and what was found.
@@ -151,23 +161,12 @@ def read_node(node: Any, key: str) -> Options:
 
 
 def build(node: Any, key: str, **extra: Any) -> Any:
-    """The object that a node describes.
-
-    Args:
-        node, key: as for :func:`read_node`.
-        extra: what the options need beside themselves.
-
-    Raises:
-        InputError: as :func:`read_node`; other errors keep their type.
-    """
+    """The object that a node describes, as for :func:`read_node`; ``extra`` is what its ``build`` takes."""
     return read_node(node, key).build(**extra)
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Refuse wrong values of all groups of a configuration.
-
-    Args:
-        config: plain data, interpolations resolved. A node that lacks its kind is refused where it is built.
+    """Refuse wrong values of all groups; a node that lacks its kind is refused where it is built.
 
     Raises:
         InputError: names the key of the first wrong value, what was expected and what was found.

@@ -9,9 +9,7 @@ from ghgs_lit.config.nodes import (
     Check,
     Miniature,
     PairedTest,
-    Peers,
     PerScene,
-    Scaling,
     Texts,
     Timing,
     Turntable,
@@ -34,16 +32,10 @@ Precision = Literal["inherit", "float32", "bfloat16", "float16", "auto"]
 Axis = Literal["y", "-y", "z"]
 #: One entry of ``token_budgets``.
 Budget = Literal["all", "window"] | Index
+Budgets = Annotated[tuple[Budget, ...], Field(min_length=1)]
 
 
-class Verb(Options):
-    """Keys of every verb."""
-
-    print_config: bool = False
-    """Print the whole configuration; config.yaml in the run's directory always has it."""
-
-
-class Measured(Verb):
+class Measured(Options):
     """Keys of verbs that run a model."""
 
     device: Device = "auto"
@@ -54,7 +46,7 @@ class Measured(Verb):
     """Of the data's random choices and of random weights."""
 
 
-class Run(Verb):
+class Run(Options):
     """Keys of verbs that train."""
 
     seed: Seed = 1
@@ -68,7 +60,7 @@ class Run(Verb):
 class Train(Run):
     """Train a model, then measure it."""
 
-    token_budgets: tuple[Budget, ...] | None = None
+    token_budgets: Budgets | None = None
     """What the encoder sees in a training step, drawn from this list: all, window (around the subject), or a
     number (patches around the subject that stay). One checkpoint then serves all presets of skip."""
     init_from: Path | None = None
@@ -159,8 +151,6 @@ class View(Predict):
 class Doctor(Photographs):
     """Find out what is wrong."""
 
-    print_config: bool = False
-    """Print the whole configuration; config.yaml in the run's directory always has it."""
     task: Literal["cameras", "machine", "selfcheck"] = "cameras"
     """cameras: whether photographs, masks and calibration fit together, and what would fit. machine: what
     there is, what is missing for which feature; operations and memory of a configuration, by stage.
@@ -173,7 +163,7 @@ class Doctor(Photographs):
     """Of task=machine: GB of a GPU that is not here; null: what is free on ``device``."""
     seed: Seed = 1
     """Of random weights."""
-    token_budgets: tuple[Budget, ...] | None = None
+    token_budgets: Budgets | None = None
     """As for ``ghgs train``."""
 
 
@@ -195,16 +185,12 @@ class Evaluate(Measured):
 class Benchmark(Measured):
     """Run time against error."""
 
-    task: Literal["presets", "peers", "scaling"] = "presets"
-    """presets: every preset of conf/skip. peers: the model beside other methods. scaling: how cost grows."""
     checkpoint: Path | None = None
-    """null: random weights, of which only run times and differences mean something; with task=peers those
-    that come with the package."""
+    """null: random weights, of which only run times and differences mean something."""
     vs: Path | None = None
     """A second checkpoint, measured in the same rounds."""
-    presets: tuple[Text, ...] = ("none", "exact", "balanced", "fast")
-    """Names of files of conf/skip; task=presets always measures none, too, which the others are compared
-    with."""
+    presets: Annotated[tuple[Text, ...], Field(min_length=1)] = ("none", "exact", "balanced", "fast")
+    """Names of files of conf/skip; none, which the others are compared with, is always measured, too."""
     knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
     """Lists of values by key, such as {recalibration.k: [4, 8]}: each preset is measured with every
     combination."""
@@ -212,19 +198,13 @@ class Benchmark(Measured):
     """bench: frozen people of data=synthetic."""
     subjects: Count | None = 4
     """Number of subjects, the first of the split; null: all."""
-    peers: Peers = Peers()
-    """The methods beside the model with task=peers."""
-    per_scene: PerScene = PerScene()
-    """3D Gaussian splatting on each subject's inputs."""
     timing: Timing = Timing()
     """How times are taken."""
-    scaling: Scaling = Scaling()
-    """How cost grows."""
     threads: Count | None = None
     """Threads of PyTorch; null: as many as it chooses."""
 
 
-class Export(Verb):
+class Export(Options):
     """A checkpoint to published names, or to a small one for prediction."""
 
     checkpoint: Path
@@ -239,7 +219,7 @@ class Export(Verb):
     """Of the weights in it."""
 
 
-class Import(Verb):
+class Import(Options):
     """Published weights to a checkpoint; the groups describe the model that takes them."""
 
     vggt: Path | None = None
@@ -256,21 +236,21 @@ class Import(Verb):
     """Of random weights."""
 
 
-class Prepare(Verb):
+class Prepare(Options):
     """Make data, or check it."""
 
     task: Literal["render", "miniature", "check"] = "render"
     """render: render what is missing. check: read every photograph and camera once, with tables and a
-    contact sheet. miniature: write a small data set of built-in people in the published layout."""
+    contact sheet. miniature: write built-in people as scans of THuman2.0."""
     miniature: Miniature = Miniature()
-    """A small data set of built-in people."""
+    """Of task=miniature, and of ``scripts/miniature.py``."""
     check: Check = Check()
     """What task=check expects of data."""
     seed: Seed = 0
     """Of miniatures, and of the samples that task=check draws."""
 
 
-class Stress(Verb):
+class Stress(Options):
     """Every stage on adversarial inputs, against float64, forward and backward."""
 
     quick: bool = False
@@ -279,15 +259,13 @@ class Stress(Verb):
     """Names of stages, as a run prints them; null: all."""
     families: tuple[Text, ...] | None = None
     """Names of families of inputs, as stress.md lists them; null: all."""
-    dtypes: tuple[Literal["float64", "float32", "bfloat16", "float16"], ...] | None = None
-    """null: all."""
     dump: Path | None = None
     """A training step that was not finite, <run>/faults/step_<n>.pt: run it again, and nothing else."""
     workers: Workers | None = None
     """Processes; null: one for each processor, 0: this one."""
 
 
-class Table(Verb):
+class Table(Options):
     """The runs below a directory as one of the paper's tables."""
 
     runs: Annotated[

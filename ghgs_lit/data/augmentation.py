@@ -22,6 +22,9 @@ from ghgs_lit.types import Batch, Cameras
 # Streams of random numbers beside those of ghgs_lit.data.sampling.
 _SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
 
+#: Greatest diameter of a missing piece of a mask, as a share of the subject's height: a hand or a foot.
+HOLE = 0.12
+
 Size = tuple[int, int]
 
 
@@ -49,10 +52,8 @@ class Augmentation(Options):
     """Pixels that masks grow or shrink by at most; inputs are then black outside their masks."""
     mask_ragged: Amount = 0.0
     """Pixels: greatest height of bumps of the outlines of masks."""
-    mask_hole: Amount = 0.0
-    """Greatest diameter of a missing piece of a mask, as a share of the subject's height."""
     mask_hole_chance: Amount = 0.0
-    """How often a piece of a mask is missing, 0 to 1."""
+    """How often a piece of a mask is missing, of a diameter of up to 0.12 of the subject's height, 0 to 1."""
     background: Share = 0.0
     """Share of samples with wrong masks that were taken before a background, which a mask that is too large
     shows; behind the others it is black."""
@@ -69,12 +70,8 @@ class Augmentation(Options):
         return self
 
     def draw_sizes(self, size: Size, target: Size, seed: int, step: int) -> tuple[Size, Size]:
-        """Sizes of the inputs and of the targets of a step.
-
-        Args:
-            size, target: where none are drawn; the drawn inputs' targets keep this proportion.
-            seed, step: of the run.
-        """
+        """Sizes of the inputs and of the targets of a step. ``size``, ``target``: where none are drawn; the
+        drawn inputs' targets keep this proportion."""
         rng = np.random.default_rng([seed, _SIZES, step])
         chosen, share = rng.uniform(size=2)
         drawn = size if self.sizes is None else self.sizes[int(chosen * len(self.sizes))]
@@ -89,12 +86,7 @@ class Augmentation(Options):
 
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """The batch of a training step, as imperfect captures show it in a share ``chance`` of the steps.
-
-        Args:
-            batch: its samples.
-            seed, step: of the run.
-            indices: numbers of the samples in the run.
-        """
+        ``indices``: numbers of the samples in the run."""
         if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
             return batch
         return self.imperfections(
@@ -124,7 +116,7 @@ class Augmentation(Options):
                 cameras.height,
                 cameras.width,
             )
-        if self.mask_offset or self.mask_ragged or self.mask_hole:
+        if self.mask_offset or self.mask_ragged or self.mask_hole_chance:
             known = masks.to(images) if alpha is None else alpha
             segmented = [
                 self._segmented(images[b], masks[b], known[b], s[2], s[3]) for b, s in enumerate(streams)
@@ -167,5 +159,5 @@ class Augmentation(Options):
         return images, refined > 0.5, refined
 
     def _masks(self, masks: Tensor, rng: np.random.Generator) -> Tensor:
-        limits = (self.mask_offset, self.mask_ragged, self.mask_hole, self.mask_hole_chance)
+        limits = (self.mask_offset, self.mask_ragged, HOLE, self.mask_hole_chance)
         return torch.from_numpy(np.stack([imperfect_mask(mask, *limits, rng) for mask in masks.numpy()]))

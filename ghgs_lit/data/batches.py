@@ -32,12 +32,8 @@ class BatchBuilder:
     def batch(
         self, specs: Sequence[SampleSpec], size: Size | None = None, target_size: Size | None = None
     ) -> Batch:
-        """Samples with equal numbers of inputs and equal protocols of targets, which may be none.
-
-        Args:
-            specs: the samples.
-            size, target_size: (height, width) of inputs and targets (None: those of the photographs).
-        """
+        """Samples with equal numbers of inputs and equal protocols of targets, which may be none. ``size``,
+        ``target_size``: (height, width) of inputs and targets (None: those of the photographs)."""
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
         depths = [[view.depth for view in row] for row in inputs]
         bodies = [self._body(s.subject) for s in specs]

@@ -112,7 +112,6 @@ def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: fl
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
 
     Args:
-        data: the data set with its protocols.
         min_iou: least IoU of a body's silhouette and a mask; below it a camera counts as wrong. Clothed
             people reach 0.75 to 0.95, a wrong camera 0 to 0.4.
         min_agreement: the same for people without a body: least share of a mask that the other masks allow.

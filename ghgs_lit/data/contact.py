@@ -44,12 +44,8 @@ def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
 
 
 def save_sheet(rows: Mapping[str, Sequence[tuple[str, Tile]]], path: Path) -> None:
-    """Save tiles as one picture, a row for each subject.
-
-    Args:
-        rows: (label, tile) pairs by name of the subject; labels are camera and IoU.
-        path: the picture.
-    """
+    """Save tiles as one picture, a row for each subject. ``rows``: (label, tile) pairs by name of the
+    subject; labels are camera and IoU."""
     width = max(sum(tile.shape[1] + 2 for _, tile in tiles) for tiles in rows.values())
     step = _HEIGHT + 2 * _LINE
     sheet = Image.new("RGB", (width, step * len(rows)))

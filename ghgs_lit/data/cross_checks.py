@@ -11,12 +11,7 @@ from ghgs_lit.data.silhouettes import height, supports, twins
 
 def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
     """``seen`` with the agreement of those masks that no body checked; at most one problem for each subject.
-
-    Args:
-        seen: photographs of a phase.
-        reader: gives their places.
-        least: share of a mask that the other masks of its subject must allow.
-    """
+    ``least``: share of a mask that the other masks of its subject must allow."""
     by_subject: dict[str, list[int]] = {}
     for i, one in enumerate(seen):
         if one.silhouette is not None:
@@ -30,7 +25,6 @@ def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
 
 
 def _compared(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
-    """The photographs of one subject, compared."""
 
     def broken(one: Seen, line: str) -> Seen:
         return replace(one, problem=f"{reader.place(one.name, one.position, one.view)}: {line}")

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning import LightningDataModule, Trainer
@@ -13,7 +13,6 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.batches import BatchBuilder, EvaluationBatches, StepSampler, TrainingBatches
-from ghgs_lit.data.dataset import DataOptions
 from ghgs_lit.data.reader import PHASES, Photographs
 from ghgs_lit.data.sampling import (
     RING_VIEW,
@@ -25,6 +24,9 @@ from ghgs_lit.data.sampling import (
 )
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.types import Batch
+
+if TYPE_CHECKING:  # its options build this class
+    from ghgs_lit.data.dataset import DataOptions
 
 Targets = TargetProtocol | Mapping[str, Any]
 
@@ -55,10 +57,8 @@ class PhotographsDataModule(LightningDataModule):
     """Batches of a data set.
 
     Args:
-        dataset: which photographs, and how they become batches.
         views: :class:`ViewProtocol` or its mapping.
         targets: :class:`TargetProtocol` or its mapping.
-        seed: seed of all samples.
         augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
 
     Raises:
@@ -67,7 +67,7 @@ class PhotographsDataModule(LightningDataModule):
 
     def __init__(
         self,
-        dataset: DataOptions,
+        dataset: "DataOptions",
         views: ViewProtocol | Mapping[str, Any],
         targets: Targets,
         seed: int = 0,
@@ -168,12 +168,7 @@ class PhotographsDataModule(LightningDataModule):
         targets: Targets | Sequence[Targets] | None = None,
     ) -> Batch:
         """The sample of one subject; nothing of others is read. Arguments as for :meth:`evaluation_loader`.
-
-        Args:
-            subject: its name.
-            split, views: whose inputs.
-            targets: a protocol or its mapping, or several; None: the batch has no targets.
-        """
+        ``targets``: a protocol or its mapping, or several; None: the batch has no targets."""
         protocols = [] if targets is None else _protocols(targets)
         available = {subject: self.subjects(split)[subject]}
         return self.builder(split).batch(self._evaluation_samples(available, protocols, views))

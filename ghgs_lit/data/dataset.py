@@ -3,9 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
-
-from pydantic import BeforeValidator
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Amount, Count, Index, Options, Size, Text, Workers
@@ -13,14 +11,10 @@ from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.reader import PHASES, Reader
 from ghgs_lit.data.sampling import TargetProtocol, ViewProtocol
 from ghgs_lit.errors import InputError
+from ghgs_lit.readers import require_data_folder
 
 if TYPE_CHECKING:  # it imports Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
-
-
-def _number(key: Any) -> Any:
-    """A key of a mapping as a number: the command line and JSON make texts of them."""
-    return int(key) if isinstance(key, str) and key.isdecimal() else key
 
 
 class Limit(Options):
@@ -65,8 +59,8 @@ class DataOptions(Options):
     """Training steps of an epoch; null: one pass over the subjects."""
     cache_images_mb: Amount = 512
     """MiB of decoded photographs kept in memory by each process."""
-    evaluation_positions: dict[Annotated[int, BeforeValidator(_number)], tuple[Index, ...]] | None = None
-    """Input positions by number of views, such as {3: [0, 6, 11]}; null, or another number: evenly spaced."""
+    evaluation_positions: tuple[tuple[Index, ...], ...] = ()
+    """Lists of input positions, such as [[0, 6, 11]] for 3 views; other numbers of views: evenly spaced."""
     workers: Workers = 0
     """Loading processes; 0: none."""
 
@@ -112,14 +106,10 @@ class DataOptions(Options):
 
     @property
     def folder(self) -> Path:
-        """The folder of the data, which a subclass names as ``root``.
-
-        Raises:
-            InputError: ``data.root`` is null or no folder.
-        """
+        """The folder of the data, which a subclass names as ``root``. InputError: ``data.root`` is null or no
+        folder."""
         folder = required_folder("data.root", "the folder of the data set", self.root)
-        if not folder.is_dir():
-            raise InputError(f"{folder}: expected the folder of the data set; found no such folder")
+        require_data_folder(folder)
         return folder
 
     @property
@@ -142,11 +132,7 @@ class DataSet(DataOptions):
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:
-    """The path configured at ``key``, which need not exist.
-
-    Raises:
-        InputError: it is null.
-    """
+    """The path configured at ``key``, which need not exist. InputError: it is null."""
     if value is None:
         raise InputError(f"{key}: expected {expected}; found null")
     return Path(value).expanduser()

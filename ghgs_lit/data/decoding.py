@@ -26,11 +26,7 @@ Shapes = Sequence[tuple[int | None, ...]]
 
 
 def read_image(path: Path) -> Image.Image:
-    """Decode an image.
-
-    Raises:
-        InputError: it is missing or cannot be decoded.
-    """
+    """Decode an image. InputError: it is missing or cannot be decoded."""
     require_file(path, "an image")
     try:
         image = Image.open(path)
@@ -42,10 +38,7 @@ def read_image(path: Path) -> Image.Image:
 
 def read_photograph(path: Path) -> np.ndarray:
     """[h, w, 3] uint8 from an image of 8 bits a channel (grey, palette, RGB or CMYK, with or without alpha).
-
-    Raises:
-        InputError: it is missing or cannot be decoded, has other values, or is to be turned when it is shown.
-    """
+    InputError: it is missing or cannot be decoded, has other values, or is to be turned when it is shown."""
     image = read_image(path)
     if image.mode not in _EIGHT_BITS:
         raise InputError(f"{path}: expected a photograph of 8 bits a channel; found mode {image.mode}")
@@ -60,15 +53,8 @@ def read_photograph(path: Path) -> np.ndarray:
 
 
 def read_map(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read channel 0 of a mask or depth map.
-
-    Args:
-        path: the image file.
-        size: (height, width) of its photograph, which it must have too.
-
-    Raises:
-        InputError: it is missing, cannot be decoded, has another size, or is no map of whole numbers.
-    """
+    """Read channel 0 of a mask or depth map. ``size``: (height, width) of its photograph, which it must have
+    too. InputError: it is missing, cannot be decoded, has another size, or is no map of whole numbers."""
     array = np.asarray(read_image(path))
     if array.dtype.kind not in "bui":
         raise InputError(f"{path}: expected whole numbers; found {array.dtype}")
@@ -86,11 +72,8 @@ def read_array(path: Path, shapes: Shapes) -> np.ndarray:
 
 
 def read_vertices(path: Path) -> np.ndarray:
-    """The vertices [n, 3] float32 of a body, at least one, in an ``.npy`` file.
-
-    Raises:
-        InputError: it is missing or another array, or a coordinate is beyond 1e6.
-    """
+    """The vertices [n, 3] float32 of a body, at least one, in an ``.npy`` file. InputError: it is missing or
+    another array, or a coordinate is beyond 1e6."""
     vertices = read_array(path, [(None, 3)])
     require(len(vertices) > 0, str(path), "vertices", "none")
     check_extent(path, vertices)
@@ -104,16 +87,8 @@ def check_extent(place: Path | str, vertices: np.ndarray) -> None:
 
 
 def check_array(place: Path | str, array: Any, shapes: Shapes) -> np.ndarray:
-    """Convert to a finite float64 array.
-
-    Args:
-        place: the file, or the file and key, for messages.
-        array: anything that NumPy takes.
-        shapes: the shapes that are accepted; None is any length.
-
-    Raises:
-        InputError: it is not an array of numbers, has another shape, or is not finite.
-    """
+    """Convert to a finite float64 array. ``shapes``: the shapes that are accepted; None is any length.
+    InputError: it is not an array of numbers, has another shape, or is not finite."""
     try:
         array = np.asarray(array)
         if array.dtype.kind in "cmM":
@@ -138,11 +113,8 @@ def _describe(shapes: Shapes) -> str:
 
 
 def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
-    """Finite intrinsics [3, 3] with focal lengths above 0 and the last row 0 0 1, float64.
-
-    Raises:
-        InputError: they are not; it names ``place``.
-    """
+    """Finite intrinsics [3, 3] with focal lengths above 0 and the last row 0 0 1, float64. InputError: they
+    are not; it names ``place``."""
     intrinsics = check_array(place, intrinsics, [(3, 3)])
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
         raise InputError(
@@ -154,10 +126,7 @@ def check_intrinsics(place: Path | str, intrinsics: Any) -> np.ndarray:
 
 def check_extrinsics(place: Path | str, extrinsics: Any) -> np.ndarray:
     """Extrinsics [4, 4] float64 from [3, 4] or [4, 4], world to camera: finite, with a proper rotation.
-
-    Raises:
-        InputError: they are not; it names ``place``.
-    """
+    InputError: they are not; it names ``place``."""
     extrinsics = check_array(place, extrinsics, [(3, 4), (4, 4)])
     if len(extrinsics) == 3:
         extrinsics = np.concatenate((extrinsics, [[0, 0, 0, 1]]))
@@ -181,14 +150,7 @@ def _check_last_row(place: Path | str, matrix: np.ndarray) -> None:
 
 def check_view(place: Path | str, view: View) -> None:
     """Refuse values that are not a :class:`View`'s, such as photographs of floats or masks of numbers.
-
-    Args:
-        place: how messages refer to the photograph.
-        view: what a reader gave.
-
-    Raises:
-        InputError: an array has another shape or type, or the camera is bad.
-    """
+    InputError: an array has another shape or type, or the camera is bad."""
     size = np.shape(view.mask)
     arrays = {"image": (view.image, (*size, 3), np.uint8), "mask": (view.mask, size, np.bool_)}
     if view.inverse_depth is not None:
@@ -210,7 +172,6 @@ def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) ->
     """Refuse a photograph that was resized after its calibration.
 
     Args:
-        path: the photograph, for messages.
         intrinsics: [3, 3] in pixels of the calibration.
         height, width: size of the photograph in pixels.
 

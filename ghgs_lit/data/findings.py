@@ -16,15 +16,10 @@ class Seen:
     """What reading one photograph gave.
 
     Attributes:
-        name, position, view: the photograph.
         iou, inside: how the body fits the mask (:class:`Overlap`), where there is a body.
         agreement: where there is none, the share of the mask that the other masks allow (:func:`supports`).
-        body: whether the subject has a body.
         tall: its largest side in world units, by its body or by its masks, where that is known.
-        digest: of the photograph's pixels.
-        problem: the line of the error, if there is one.
         silhouette: the coarse mask, where the body does not check the camera.
-        tile: picture for the contact sheet.
     """
 
     name: str
@@ -66,7 +61,6 @@ class Report:
     """The result of a check.
 
     Attributes:
-        phases: what was found in ``train`` and ``val``.
         problems: lines ``<place>: expected ...; found ...`` of what keeps training from starting.
         notes: the same of what does not.
         inspections: number of files that were checked beside the photographs.

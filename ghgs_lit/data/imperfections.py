@@ -34,10 +34,8 @@ def color_gains(
     Photographs do not tell which camera is right, so that only differences between cameras can be undone.
 
     Args:
-        views: number of cameras.
         exposure: greatest deviation of a camera in stops.
         white_balance: greatest deviation of red and of blue from green in stops.
-        rng: random numbers.
     """
     deviation = rng.uniform(-1, 1, (views, 3))
     deviation -= deviation.mean(0)
@@ -62,7 +60,6 @@ def imperfect_mask(
         ragged: greatest number of pixels that bumps of its outline are high.
         hole: greatest diameter of a round piece that is missing, as a share of the subject's height.
         hole_chance: how often a piece is missing.
-        rng: random numbers.
     """
     grow, height, missing, size, place = rng.uniform(size=5)
     bumps = rng.uniform(-1, 1, [side // _BUMP + 2 for side in mask.shape])
@@ -107,10 +104,8 @@ def miscalibrated(
     a rig is: only differences between cameras can be undone.
 
     Args:
-        cameras: ``V`` of one subject.
         masks: theirs; in place of an empty one counts the whole photograph.
         pixels: greatest error in pixels.
-        rng: random numbers.
 
     Raises:
         InputError: no point is before all cameras.

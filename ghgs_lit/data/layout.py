@@ -71,15 +71,11 @@ class Layout(Reader):
     """Subjects of one phase of a rendered data set.
 
     Args:
-        root: folder of the phases.
-        phase: ``train`` or ``val``.
         names: the subjects to read (None: all that there are). Those that the folder of the phase lacks are
             read from the other one: a split may differ from the one that the folders were made for.
         limit: number of subjects, the first ones (None: all).
         pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
             package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
-        further_bodies: reads bodies that are not among the renders.
-        strict: as for :class:`Reader`.
 
     Raises:
         InputError: the root or phase is missing, empty, not completely rendered, or lacks one of ``names``.

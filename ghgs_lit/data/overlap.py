@@ -44,7 +44,6 @@ def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
 
     Args:
         vertices: [n, 3] in the world, metres.
-        view: the photograph.
 
     Returns:
         The overlap; None for a body with fewer than :data:`MIN_VERTICES` vertices.

@@ -78,15 +78,9 @@ def _load(path: Path, stream: io.BufferedIOBase, also: Mapping[tuple[str, str], 
 
 
 def load_pickle(path: Path, also: Mapping[tuple[str, str], Any] = _NOTHING) -> Any:
-    """Read the arrays, scalars and plain containers of a pickle.
-
-    Args:
-        path: the file.
-        also: further names that are admitted, (module, name), with harmless replacements for them.
-
-    Raises:
-        InputError: it is missing, broken, or names anything else, which is then not called.
-    """
+    """Read the arrays, scalars and plain containers of a pickle. ``also``: further names that are admitted,
+    (module, name), with harmless replacements for them. InputError: it is missing, broken, or names anything
+    else, which is then not called."""
     if not path.is_file():
         raise InputError(f"{path}: expected a pickle; found no such file")
     with path.open("rb") as stream:
@@ -97,9 +91,7 @@ def load_npy(path: Path) -> Any:
     """Read an ``.npy`` file; pickled objects in it are read as by :func:`load_pickle`.
 
     A pickled object in an array without dimensions (``np.save`` of a dictionary) is returned itself.
-
-    Raises:
-        InputError: it is missing, broken, or names anything but arrays and plain containers.
+    InputError: it is missing, broken, or names anything but arrays and plain containers.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected an .npy file; found no such file")

@@ -44,7 +44,6 @@ class Reader(ABC):
         """Read one photograph at its stored size.
 
         Args:
-            name: the subject.
             position: number of the camera, or position on the ring.
             view: number of the view at that position.
             depth: whether to read the depth map too, if there is one.
@@ -116,10 +115,8 @@ class Photographs:
     """The photographs of a reader, resized and kept in memory.
 
     Args:
-        reader: decodes the files.
         size: (height, width) in pixels; None keeps the stored size.
         cache_mb: MiB of decoded views and bodies kept in each process; the least recently used go first.
-        resampling: as for :func:`resize_view`.
     """
 
     def __init__(
@@ -137,16 +134,9 @@ class Photographs:
     def view(
         self, name: str, position: int, view: int = 0, depth: bool = True, size: tuple[int, int] | None = None
     ) -> View:
-        """One photograph, resized together with its intrinsics.
-
-        Args:
-            name, position, view, depth: as for :meth:`Reader.read_view`.
-            size: (height, width) in pixels; None: that of all.
-
-        Raises:
-            InputError: a file is missing or bad, the reader gives something else than a :class:`View` has, or
-                the mask is empty.
-        """
+        """One photograph, resized together with its intrinsics. ``size``: (height, width) in pixels; None:
+        that of all. InputError: a file is missing or bad, the reader gives something else than a
+        :class:`View` has, or the mask is empty."""
         size = size or self.size
 
         def read() -> View:
@@ -160,11 +150,7 @@ class Photographs:
         return self._cached((name, position, view, depth, size), read)
 
     def body(self, name: str) -> np.ndarray | None:
-        """Body vertices as :meth:`Reader.read_body`.
-
-        Raises:
-            InputError: they are bad.
-        """
+        """Body vertices as :meth:`Reader.read_body`. InputError: they are bad."""
 
         def read() -> np.ndarray | None:
             vertices = self.reader.read_body(name)

@@ -6,10 +6,13 @@ masks by half an old pixel less half a new one.
 """
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
-from scipy import sparse
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 #: Depths of one surface differ by less than this share between neighbouring pixels.
 _SAME_SURFACE = 0.02
@@ -79,8 +82,10 @@ def _area_means(layers: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _area_weights(old: int, new: int) -> sparse.csr_array:
+def _area_weights(old: int, new: int) -> "sparse.csr_array":
     """[new, old]: which share of each new pixel each old one covers; rows sum to 1."""
+    from scipy import sparse  # here: a wrong path is refused before it is needed
+
     edges = np.union1d(np.arange(old + 1) * new, np.arange(new + 1) * old)  # in units of 1 / (old * new)
     middles = (edges[:-1] + edges[1:]) / 2
     places = ((middles / old).astype(int), (middles / new).astype(int))

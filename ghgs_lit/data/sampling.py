@@ -59,8 +59,6 @@ class ViewProtocol(Options):
 
     group = "views"
 
-    name: Text
-    """Name of the protocol in results."""
     training_counts: tuple[Several, ...] = Field((3, 4, 5), min_length=1)
     """Numbers of input views; one of them is drawn for each training step."""
     evaluation_count: Several = 4
@@ -148,14 +146,7 @@ class TargetProtocol(Options):
     def evaluation(
         self, available: Sequence[int], inputs: Sequence[int], ring: int, rng: np.random.Generator
     ) -> tuple[Photo, ...]:
-        """The targets of an evaluation sample.
-
-        Args:
-            available: positions of the subject.
-            inputs: positions of the sample's inputs.
-            ring: number of positions on a full ring.
-            rng: random numbers of the subject.
-        """
+        """The targets of an evaluation sample."""
         if self.kind == "cameras":
             return self._cameras(available, inputs)
         count = len(inputs) if self.per_subject == "all" else int(self.per_subject)
@@ -187,9 +178,6 @@ class TrainingSampler:
     """The endless sequence of training samples.
 
     Attributes:
-        subjects: available positions by name.
-        views, targets: the protocols.
-        ring: number of positions on a full ring.
         batch_size: samples of one step in each process.
         seed: together with the step and the index in the batch, it determines a sample.
     """
@@ -241,23 +229,18 @@ def evaluation_samples(
     protocols: Sequence[TargetProtocol],
     ring: int,
     seed: int,
-    positions: Mapping[int, Sequence[int]] | None = None,
+    positions: Sequence[Sequence[int]] = (),
 ) -> list[SampleSpec]:
     """One sample for each subject, always the same ones.
 
     Args:
-        subjects: available positions by name.
-        count: number of inputs.
         protocols: whose targets a sample has, one after another; none: samples without targets.
-        ring: number of positions on a full ring.
-        seed: of random targets.
-        positions: input positions by number of inputs; evenly spaced where they are not listed.
+        positions: lists of input positions; evenly spaced where none has ``count``.
 
     Raises:
         InputError: the input positions are not different ones, or a subject lacks one.
     """
-    inputs = list((positions or {}).get(count) or even_positions(ring, count))
-    require(len(inputs) == count, f"data.evaluation_positions.{count}", f"{count} positions", inputs)
+    inputs = next((list(listed) for listed in positions if len(listed) == count), even_positions(ring, count))
     expected = f"different positions of a ring of {ring}"
     require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, inputs)
     specs = []

@@ -20,12 +20,9 @@ def split_names(
     """Divide the scans of a folder.
 
     Args:
-        source: folder of the scans.
-        names: ids of the scans.
         split: as for :func:`read_split` (None: the split files in ``source``, if there are any).
         val_fraction: fraction of ``names`` that is ``val`` where nothing else decides, 0 to 1; above 0 at
             least one of them.
-        seed: of the division by fraction.
 
     Raises:
         InputError: the split is missing or malformed, names scans that do not exist, or overlaps.

@@ -80,7 +80,6 @@ def resize_view(view: View, height: int, width: int, resampling: str = "area") -
     """Resize a photograph with its mask and depth map, and scale its intrinsics.
 
     Args:
-        view: the photograph.
         height, width: the new size in pixels.
         resampling: one of :data:`RESAMPLINGS`. ``area`` keeps everything at its place; ``release`` resizes
             photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Mattes are resized

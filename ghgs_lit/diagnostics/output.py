@@ -21,12 +21,8 @@ def text(value: Any, form: str) -> str:
 
 
 def texts(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
-    """The columns of ``frame`` that a table shows.
-
-    Args:
-        frame: with one line for each of the table.
-        columns: by heading, the name of a column and its format; those that ``frame`` has not are left out.
-    """
+    """The columns of ``frame`` that a table shows. ``columns``: by heading, the name of a column and its
+    format; those that ``frame`` has not are left out."""
     return pd.DataFrame(
         {
             heading: [text(value, form) for value in frame[name]]

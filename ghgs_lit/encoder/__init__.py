@@ -1,7 +1,6 @@
 """The encode stage: VGGT's aggregator over patch tokens, of any size."""
 
 from ghgs_lit.encoder.cache import FeatureCache, FeatureCacheOptions, PhotographCache
-from ghgs_lit.encoder.encoder import VGGTEncoder
-from ghgs_lit.encoder.options import VGGTOptions
+from ghgs_lit.encoder.encoder import VGGTEncoder, VGGTOptions
 
 __all__ = ["FeatureCache", "FeatureCacheOptions", "PhotographCache", "VGGTEncoder", "VGGTOptions"]

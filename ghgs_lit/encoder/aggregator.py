@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, run_block
-from ghgs_lit.encoder.options import VGGTOptions
+from ghgs_lit.encoder.options import VGGTSettings
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables
 
@@ -29,7 +29,7 @@ class Aggregator(nn.Module):
         options: of the stage.
     """
 
-    def __init__(self, patch_embed: nn.Module, options: VGGTOptions):
+    def __init__(self, patch_embed: nn.Module, options: VGGTSettings):
         super().__init__()
         width, heads = options.width, options.heads
         self.patch_size, self.layers = options.patch_size, options.layers

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
-from ghgs_lit.encoder.options import VGGTOptions
+from ghgs_lit.encoder.options import VGGTSettings
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.vit import VisionTransformer
@@ -36,7 +36,7 @@ class VGGTEncoder(nn.Module):
         margin: patches around them that stay, too.
     """
 
-    def __init__(self, options: VGGTOptions, tokens: str = "all", margin: int = 1):
+    def __init__(self, options: VGGTSettings, tokens: str = "all", margin: int = 1):
         super().__init__()
         choice("skip.tokens", tokens, ("all", *KEPT))
         require(margin >= 0, "skip.margin", "0 or more patches", margin)
@@ -146,7 +146,7 @@ def _joined(pairs: list[Pair], kept: KeptPatches, special: int) -> Iterator[Floa
         yield torch.cat([kept.take(tokens, special) for tokens in pairs.pop(0)], dim=-1)
 
 
-def _patch_embedding(options: VGGTOptions, channels: int) -> nn.Module:
+def _patch_embedding(options: VGGTSettings, channels: int) -> nn.Module:
     """What ``encoder.vit`` describes, for images of so many channels."""
     vit, width, patch_size = options.vit, options.width, options.patch_size
     if vit.kind == "conv":
@@ -156,3 +156,11 @@ def _patch_embedding(options: VGGTOptions, channels: int) -> nn.Module:
     return VisionTransformer(
         channels, width, vit.depth, vit.heads, patch_size, options.image_size, options.checkpointing
     )
+
+
+class VGGTOptions(VGGTSettings):
+    """Photographs and masks to tokens, by VGGT of any size."""
+
+    def build(self, tokens: str = "all", margin: int = 1) -> VGGTEncoder:
+        """The stage; arguments as of :class:`VGGTEncoder`."""
+        return VGGTEncoder(self, tokens, margin)

@@ -1,15 +1,12 @@
 """What the encode stage can be told."""
 
 import re
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from ghgs_lit.config.options import Count, Options, Side, Text, Width
 from ghgs_lit.encoder.semantic import SemanticOptions
-
-if TYPE_CHECKING:
-    from ghgs_lit.encoder.encoder import VGGTEncoder
 
 #: Fields of each kind of patch embedding.
 _FIELDS = {"conv": (), "stem": ("channels",), "dinov2": ("depth", "heads")}
@@ -38,8 +35,8 @@ class PatchOptions(Options):
         return self
 
 
-class VGGTOptions(Options):
-    """Photographs and masks to tokens, by VGGT of any size."""
+class VGGTSettings(Options):
+    """The fields of :class:`ghgs_lit.encoder.VGGTOptions`, for the modules that it is built of."""
 
     group = "encoder"
     width: Width
@@ -74,7 +71,7 @@ class VGGTOptions(Options):
     ghgs import and ghgs pretext, a note for tables only"""
 
     @model_validator(mode="after")
-    def _parts_fit(self) -> "VGGTOptions":
+    def _parts_fit(self) -> "VGGTSettings":
         fits = self.width % (4 * self.heads) == 0
         self.require(fits, "width", "a multiple of 4 * heads (rows and columns rotate)")
         if self.vit.kind == "dinov2":
@@ -95,9 +92,3 @@ class VGGTOptions(Options):
         """All that the tokens depend on, the weights and the choice of tokens apart."""
         others = {"image_size", "layer_scale", "trainable", "checkpointing", "weights"}
         return self.model_dump(exclude=others)
-
-    def build(self, tokens: str = "all", margin: int = 1) -> "VGGTEncoder":
-        """The stage; arguments as of :class:`ghgs_lit.encoder.VGGTEncoder`."""
-        from ghgs_lit.encoder.encoder import VGGTEncoder  # here: it takes these options
-
-        return VGGTEncoder(self, tokens, margin)

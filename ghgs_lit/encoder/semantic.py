@@ -14,6 +14,8 @@ from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.projection import at_least_float32
 
 NORM_EPS = 1e-5
+#: Parts of the body that ``ghgs pretext`` tells (``ghgs_lit.training.pretext.parts``): channels of a feature.
+PARTS = 16
 
 
 class SemanticOptions(Options):
@@ -28,8 +30,6 @@ class SemanticOptions(Options):
     """Attention heads of each block"""
     channels: Width
     """Channels of the stem after its first convolution"""
-    parts: Width
-    """Number of parts, which is that of a feature's channels"""
 
     @model_validator(mode="after")
     def _heads_rotate(self) -> "SemanticOptions":
@@ -65,7 +65,7 @@ class SemanticBranch(nn.Module):
 
     def __init__(self, options: SemanticOptions, patch_size: int):
         super().__init__()
-        width, heads, self.parts = options.width, options.heads, options.parts
+        width, heads, self.parts = options.width, options.heads, PARTS
         self.patch_size, self.head_width = patch_size, width // heads
         self.stem = ConvStem(4, width, patch_size, options.channels)
         self.token = nn.Parameter(draw_normal_(torch.empty(1, 1, width), 0.02))

@@ -11,16 +11,10 @@ from ghgs_lit.evaluation.protocols import target_protocols
 
 
 def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
-    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read.
-
-    Args:
-        config: the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used).
-        data: the photographs.
-
-    Raises:
-        InputError: a value is impossible, a metric cannot be computed, the split has no subjects, or a
-            subject lacks an input or a target.
-    """
+    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read. ``config``:
+    the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used). InputError: a value is
+    impossible, a metric cannot be computed, the split has no subjects, or a subject lacks an input or a
+    target."""
     evaluation = config["evaluation"]
     for key in ("views", "targets"):
         found = evaluation[key]
@@ -41,7 +35,6 @@ def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> 
 
 
 def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol: TargetProtocol) -> None:
-    """Refuse a protocol that asks for photographs that a subject does not have."""
     reader = data.builder(split).targets.reader
     for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.specs:
         for spec in batch:

@@ -127,7 +127,6 @@ def decisions_of(rows: Iterable[Row]) -> list[Decision]:
 
 
 def _draw(batch: Batch, estimate: Estimate, element: int, pictures: Path, name: str) -> None:
-    """A picture of one subject for each protocol."""
     for protocol in dict.fromkeys(batch.targets.protocols):
         chosen = [p == protocol for p in batch.targets.protocols]
         part = dataclasses.replace(batch, targets=batch.targets.of_protocol(protocol))
@@ -149,11 +148,7 @@ def measure(
     """Measure one method; the targets of all protocols come from one prediction.
 
     Args:
-        method: what is measured.
-        name: its name in the rows.
         loader: batches with targets and their protocols.
-        metrics: what is computed of the renders.
-        device: where the method runs.
         pictures: folder for pictures (None: none are written).
         picture_count: the number of subjects, the first ones, that are drawn.
 
@@ -193,19 +188,9 @@ def measure_all(
     pictures: Path | None = None,
     picture_count: int = 0,
 ) -> list[Row]:
-    """Measure all methods on the same subjects and photographs.
-
-    Args:
-        methods: what is measured, by name.
-        data: gives the photographs (``evaluation_loader``).
-        views: numbers of input views.
-        targets: target protocols by name.
-        split: subjects of ``train`` or ``val``.
-        metrics, device, pictures, picture_count: as for :func:`measure`.
-
-    Returns:
-        The rows of every number of views, protocol and method, in this order.
-    """
+    """Measure all methods on the same subjects and photographs. ``data``: gives the photographs
+    (``evaluation_loader``). Returns: The rows of every number of views, protocol and method, in this
+    order."""
     rows: list[Row] = []
     for count in views:
         loader = data.evaluation_loader(views=count, targets=list(targets.values()), split=split)

@@ -10,10 +10,7 @@ def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The protocols that ``evaluation.targets`` lists, by name.
 
     Each has the values of its own file in ``conf/targets``, and the file's name; the one that ``targets=``
-    selects has the configured values, overrides included.
-
-    Raises:
-        InputError: there is no such file.
+    selects has the configured values, overrides included. InputError: there is no such file.
     """
     configured = config["targets"]
     protocols = {

@@ -40,12 +40,9 @@ def measure_and_write(
     What :func:`ghgs_lit.evaluation.check.check_evaluation` checks is not checked again.
 
     Args:
-        methods: what is measured, by name.
-        data: gives the photographs.
         config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used, and the
             model's where one is measured).
         directory: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
-        device: where the methods run.
         facts: further entries of the provenance.
 
     Returns:

@@ -81,7 +81,8 @@ class Frame:
         dtype = torch.promote_types(dtype, torch.float32)
         views, points = prediction.depth.shape[1], prediction.points
         everyone = torch.arange(len(self.metre), device=points.pixels.device)[:, None, None, None]
-        maps = self._maps(prediction.depth_maps)
+        known: dict[Tensor, Tensor] = {}
+        maps = self._maps(prediction.depth_maps, known)
         return dataclasses.replace(
             prediction,
             gaussians=self._gaussians(prediction.gaussians, views, dtype),
@@ -92,16 +93,20 @@ class Frame:
                 tokens=self._to_world(points.tokens, points.token_image // views, dtype),
             ),
             depth_maps=maps,
-            rounds=tuple(self._maps(found) for found in prediction.rounds),
+            rounds=tuple(self._maps(found, known) for found in prediction.rounds),
             drafts=tuple(self._gaussians(draft, views, dtype) for draft in prediction.drafts),
         )
 
-    def _maps(self, maps: DepthMaps) -> DepthMaps:
-        metre = self.metre.to(maps.depth)[:, None, None, None]
-        bounds = maps.bounds
-        if bounds is not None:
-            bounds = DepthBounds(bounds.near * metre, bounds.far * metre)
-        return dataclasses.replace(maps, depth=maps.depth * metre, bounds=bounds)
+    def _maps(self, maps: DepthMaps, known: dict[Tensor, Tensor]) -> DepthMaps:
+        """Maps in the world; ``known`` holds what is there already: rounds share their bounds."""
+
+        def scaled(depth: Tensor) -> Tensor:
+            if depth not in known:
+                known[depth] = depth * self.metre.to(depth)[:, None, None, None]
+            return known[depth]
+
+        bounds = maps.bounds and DepthBounds(scaled(maps.bounds.near), scaled(maps.bounds.far))
+        return dataclasses.replace(maps, depth=scaled(maps.depth), bounds=bounds)
 
     def _gaussians(self, gaussians: Gaussians, views: int, dtype: torch.dtype) -> Gaussians:
         element, lengths = gaussians.image // views, self.metre.to(gaussians.scales)

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -10,6 +9,8 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
     The image's border is no outline: a mask without one is infinitely far from it.
     """
+    from scipy.ndimage import distance_transform_edt  # here: a plain prediction does not need it
+
     if mask.all() or not mask.any():
         return np.where(mask, np.inf, -np.inf)
     return np.where(mask, distance_transform_edt(mask) - 0.5, 0.5 - distance_transform_edt(~mask))

@@ -39,30 +39,40 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
     Returns:
         0 outside the subject, and where no other view has the point inside its mask.
     """
+    near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
+    found = consistency_of(batch, batch.pixels, near, far, steps)
+    result = found.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, found)
+    return result.view(*batch.masks.shape, steps).permute(0, 1, 4, 2, 3)
+
+
+@torch.no_grad()
+def consistency_of(
+    batch: Batch, pixels: Int[Tensor, " N"], near: Float[Tensor, " N"], far: Float[Tensor, " N"], steps: int
+) -> Float[Tensor, "N S"]:
+    """:func:`photo_consistency` of some pixels.
+
+    Args:
+        batch: as there.
+        pixels: of the subject: indices among those of all images, in ascending order.
+        near, far: of these, in metres.
+        steps: as there.
+    """
+    near, far = at_least_float32(near), at_least_float32(far)
+    shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     # All of it: half a pixel in bfloat16 is a different colour.
     with torch.autocast(batch.masks.device.type, enabled=False):
-        return _sweep(batch, bounds, steps)
-
-
-def _sweep(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
-    """:func:`photo_consistency` outside autocast."""
-    b, v, height, width = batch.masks.shape
-    near, far = at_least_float32(bounds.near), at_least_float32(bounds.far)
-    shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
-    colors, turn, shift, compared = (x.to(near) if x.is_floating_point() else x for x in batch.once(_views))
-    if cpu.is_supported(near, far):
-        result = cpu.sweep(
-            batch.once(_padded), batch.masks, near, far, turn, shift, compared, shares, TOLERANCE
+        colors, turn, shift, compared = (
+            x.to(near) if x.is_floating_point() else x for x in batch.once(_views)
         )
-        return result.permute(0, 1, 4, 2, 3)
-    result = near.new_zeros(b * v * height * width, steps)
-    pixels = batch.pixels
-    for part in even_parts(len(pixels), _SAMPLES // (steps * (v - 1))):
-        some = pixels[part]
-        low, high = (bound.flatten()[some, None] for bound in (near, far))
-        depth = low + (high - low) * shares
-        result[some] = _best_match(some, depth, colors, turn, shift, compared)
-    return result.view(b, v, height, width, steps).permute(0, 1, 4, 2, 3)
+        views = (turn, shift, compared)
+        if cpu.is_supported(near, far):
+            size = tuple(batch.masks.shape[2:])
+            return cpu.sweep(batch.once(_padded), pixels, near, far, size, *views, shares, TOLERANCE)
+        result = near.new_zeros(len(pixels), steps)
+        for part in even_parts(len(pixels), _SAMPLES // (steps * (batch.masks.shape[1] - 1))):
+            depth = near[part, None] + (far - near)[part, None] * shares
+            result[part] = _best_match(pixels[part], depth, colors, *views)
+        return result
 
 
 def _views(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:

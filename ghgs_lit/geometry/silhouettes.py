@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import ndimage
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,10 @@ class Silhouette:
     @cached_property
     def grown(self) -> np.ndarray:
         """The mask [h, w] with the cells beside it."""
-        return ndimage.binary_dilation(self.mask, np.ones((3, 3)))
+        padded = np.pad(self.mask, 1)
+        height, width = self.mask.shape
+        shifts = (padded[row : row + height, column : column + width] for row, column in np.ndindex(3, 3))
+        return np.logical_or.reduce(list(shifts))
 
     def rays(self, cells: np.ndarray) -> np.ndarray:
         """World directions [n, 3] of z 1 in the camera, through ``cells`` [n, 2] (column, row)."""

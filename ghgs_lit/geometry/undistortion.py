@@ -6,8 +6,6 @@ OpenCV itself is not a dependency; kornia has its camera models.
 import numpy as np
 import torch
 import torch.nn.functional as F
-from kornia.geometry.calibration import distort_points
-from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
 
 # Pixels between evaluations of the model; it is interpolated linearly, with errors below 0.01 px.
 _STEP = 8
@@ -27,6 +25,10 @@ def undistorting_grid(
     Returns:
         [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``.
     """
+    # Here: kornia takes longer to import than photographs without distortion take to be read.
+    from kornia.geometry.calibration import distort_points
+    from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
+
     counts = [max(2, -(-side // _STEP) + 1) for side in (height, width)]
     knots = [
         torch.linspace(0.5, side - 0.5, n, dtype=torch.float64)

@@ -7,9 +7,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.config.options import Index, Options
+from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, unproject, unproject_maps
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
+
+#: Pixels on each side of the image that the token grid of the release leaves out (512 + 2 x 3 = 518).
+RELEASE_BORDER = 3
 
 
 class Unprojection(Options):
@@ -26,11 +29,9 @@ class Unprojection(Options):
     tokens: Literal["subject", "release"] = "subject"
     """Where a token lies: subject, at the mean pixel and mean depth of the subject's pixels in its patch |
     release, as in the authors' code, which scales intrinsics by 37 / 512 as if there were no border"""
-    border: Index = 0
-    """Pixels on each side of the image that the token grid of the release leaves out (512 + 2 x 3 = 518)"""
 
     def __call__(self, depth_maps: DepthMaps, tokens: Tokens, batch: Batch) -> Points:
-        locate = subject_tokens if self.tokens == "subject" else self._release_tokens
+        locate = subject_tokens if self.tokens == "subject" else _release_tokens
         pixels, depth, valid = locate(depth_maps, tokens.patch_size)
         cameras = batch.cameras
         points = unproject(
@@ -49,14 +50,15 @@ class Unprojection(Options):
             token_image=tokens.image,
         )
 
-    def _release_tokens(self, depth_maps: DepthMaps, patch_size: int) -> tuple[Tensor, Tensor, Tensor]:
-        height, width = depth_maps.depth.shape[-2:]
-        grid = (height // patch_size, width // patch_size)
-        inverse = F.interpolate(1 / depth_maps.depth, size=grid, mode="bilinear", align_corners=False)
-        inner = inverse.new_tensor([width - 2 * self.border, height - 2 * self.border])
-        centers = pixel_centers(*grid, inverse) * (inner / inner.new_tensor(grid[::-1])) + self.border
-        valid = F.max_pool2d(depth_maps.valid.float(), patch_size).bool()
-        return centers.expand(*inverse.shape, 2), 1 / inverse, valid
+
+def _release_tokens(depth_maps: DepthMaps, patch_size: int) -> tuple[Tensor, Tensor, Tensor]:
+    height, width = depth_maps.depth.shape[-2:]
+    grid = (height // patch_size, width // patch_size)
+    inverse = F.interpolate(1 / depth_maps.depth, size=grid, mode="bilinear", align_corners=False)
+    inner = inverse.new_tensor([width - 2 * RELEASE_BORDER, height - 2 * RELEASE_BORDER])
+    centers = pixel_centers(*grid, inverse) * (inner / inner.new_tensor(grid[::-1])) + RELEASE_BORDER
+    valid = F.max_pool2d(depth_maps.valid.float(), patch_size).bool()
+    return centers.expand(*inverse.shape, 2), 1 / inverse, valid
 
 
 def subject_tokens(

@@ -16,7 +16,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.heads.activations import CONFIDENCES, bounded_sigmoid
 from ghgs_lit.heads.dense import Part, decode
-from ghgs_lit.heads.dpt import DPTHead, DPTOptions
+from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.types import Batch, DecodedPixels, DepthBounds, DepthMaps, Tokens
@@ -57,8 +57,8 @@ class DepthHeadOptions(Options):
     """Tokens to one depth and one confidence for each pixel, by a dense head."""
 
     group = "depth_head"
-    dpt: DPTOptions = DPTOptions()
-    """The dense head."""
+    rectified_skip: bool = True
+    """Residual units add what they rectified, as published weights expect; in training it can die."""
     guide: bool = False
     """The dense head also sees photographs, masks and bounds at full resolution; the paper: false."""
     consistency_depths: int = Field(0, ge=0, le=4096)
@@ -98,7 +98,7 @@ class DepthHead(nn.Module):
         super().__init__()
         self.options, self.start = options, log(options.start / (1 - options.start))
         seen = options.guide * (PHOTO_CHANNELS + options.is_bounded * BOUNDS_CHANNELS)
-        self.dpt = DPTHead(options.dpt, dim_latent, 2, seen + options.consistency_depths)
+        self.dpt = DPTHead(dim_latent, 2, options.rectified_skip, seen + options.consistency_depths)
         if self.is_bounded:
             last = self.dpt.scratch.output_conv2[-1]
             nn.init.zeros_(last.weight)

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from pydantic import model_validator
 from torch import Tensor, nn
 
-from ghgs_lit.config.options import MultipleOfFour, Options, Width
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.guide import Guide, GuidePyramid
@@ -33,30 +31,17 @@ HIDDEN = 32
 _LARGEST, _ROWS = 1 << 21, 8
 
 
-class DPTOptions(Options):
-    """Widths of a dense head, and how its residual units begin."""
+Widths = tuple[int, tuple[int, int, int, int]]
 
-    features: Width | None = None
-    """Channels of the fused maps, a multiple of 8; null: encoder.dim_latent / 8 (256 as published)."""
-    out_channels: tuple[MultipleOfFour, MultipleOfFour, MultipleOfFour, MultipleOfFour] | None = None
-    """Channels of the four levels, fine to coarse, multiples of 4; null: encoder.dim_latent x (1/8, 1/4, 1/2,
-    1/2) (256, 512, 1024, 1024 as published)."""
-    rectified_skip: bool = True
-    """Residual units add what they rectified, as published weights expect; in training it can die."""
 
-    @model_validator(mode="after")
-    def _check(self) -> "DPTOptions":
-        self.require(self.features is None or self.features % 8 == 0, "features", "a multiple of 8 or null")
-        return self
+def published_widths(dim_latent: int) -> Widths:
+    """Channels of the fused maps, and of the four levels from fine to coarse, in the published proportions.
 
-    def widths(self, dim_latent: int) -> tuple[int, tuple[int, ...]]:
-        """``features`` and ``out_channels`` for tokens of a width; null keeps the published proportions."""
-        features = self.features or _multiple(dim_latent / 8, 8)
-        levels = (_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2))
-        return features, self.out_channels or tuple(levels)
-
-    def build(self, dim_latent: int, output_dim: int, guide_channels: int = 0) -> "DPTHead":
-        return DPTHead(self, dim_latent, output_dim, guide_channels)
+    1/8 of the tokens' width (multiples of 8), and 1/8, 1/4, 1/2 and 1/2 (multiples of 4): 256, and 256, 512,
+    1024 and 1024 as published.
+    """
+    levels = tuple(_multiple(dim_latent * part, 4) for part in (1 / 8, 1 / 4, 1 / 2, 1 / 2))
+    return _multiple(dim_latent / 8, 8), levels
 
 
 def _multiple(value: float, of: int) -> int:
@@ -167,16 +152,24 @@ class DPTHead(nn.Module):
     """Tokens of four layers to ``output_dim`` raw channels for each pixel.
 
     Args:
-        options: widths and residual units.
         dim_latent: width of a token of ``Tokens.latent``.
         output_dim: channels of the result; activations are the caller's.
+        rectified_skip: of the residual units.
         guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
             sharp; 0: none, as published.
+        widths: in place of :func:`published_widths`.
     """
 
-    def __init__(self, options: DPTOptions, dim_latent: int, output_dim: int, guide_channels: int = 0):
+    def __init__(
+        self,
+        dim_latent: int,
+        output_dim: int,
+        rectified_skip: bool = True,
+        guide_channels: int = 0,
+        widths: Widths | None = None,
+    ):
         super().__init__()
-        features, out_channels = options.widths(dim_latent)
+        features, out_channels = widths or published_widths(dim_latent)
         self.full_channels = features // 2
         c0, c1, _, c3 = out_channels
         self.norm = nn.LayerNorm(dim_latent, eps=NORM_EPS)
@@ -189,7 +182,7 @@ class DPTHead(nn.Module):
                 _Halving(c3, c3, 3, stride=2, padding=1),
             )
         )
-        self.scratch = Scratch(out_channels, features, HIDDEN, output_dim, options.rectified_skip)
+        self.scratch = Scratch(out_channels, features, HIDDEN, output_dim, rectified_skip)
         self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 
     def forward(

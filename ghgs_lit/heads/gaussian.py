@@ -20,13 +20,15 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.geometry.rotations import multiply_quaternions, rotate
 from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.heads import cpu
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode
-from ghgs_lit.heads.dpt import DPTHead, DPTOptions
+from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, Guide, photo_guide
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
+from ghgs_lit.kernels.pool import multiplies
 from ghgs_lit.kernels.precision import without_float16
 from ghgs_lit.types import (
     Batch,
@@ -40,6 +42,13 @@ from ghgs_lit.types import (
 )
 
 Attributes = tuple[Tensor, Tensor, Tensor, Tensor]
+
+#: Metres: the largest offset of a Gaussian from its pixel's point, along each axis.
+OFFSET_LIMIT = 0.05
+#: The largest scale in footprints: a splat of a whole limb hides what is wrong beneath it.
+SCALE_CAP = 4.0
+#: Opacity at which training starts: high, since splats that become transparent do not recover.
+OPACITY_START = 0.8
 
 #: The gradient of a shorter quaternion is that of this length: it would grow without bound near 0.
 _SHORTEST = 0.1
@@ -105,8 +114,6 @@ class FootprintAttributes(Options):
     A pixel's footprint is ``z / f`` metres. The paper gives no values.
     """
 
-    offset_limit: Amount = 0.05
-    """Largest offset along each axis, in metres."""
     scale_floor: Positive = 0.15
     """Least scale in footprints; it leaves no holes when splats are rendered at a higher resolution."""
     scale_start: Positive = 0.25
@@ -116,22 +123,16 @@ class FootprintAttributes(Options):
     inward: Amount = 0.0
     """Distance along the third axis to which training starts moving the splats, in footprints: with axes of
     the surface, away from the camera. What a splat covers beside its pixel then ends at the silhouette."""
-    scale_cap: Positive = 4.0
-    """Largest scale in footprints."""
     opacity_floor: Share = 0.1
     """Least opacity: below 1/255 a splat has no gradient left."""
-    opacity_start: Share = 0.8
-    """Opacity at which training starts."""
 
     @model_validator(mode="after")
     def _check(self) -> "FootprintAttributes":
         for name, start in self._starts.items():
-            between = self.scale_floor < start < self.scale_cap
-            limits = f"between scale_floor={self.scale_floor:g} and scale_cap={self.scale_cap:g}"
+            between = self.scale_floor < start < SCALE_CAP
+            limits = f"between scale_floor={self.scale_floor:g} and {SCALE_CAP:g}"
             self.require(between or getattr(self, name) is None, name, f"a number {limits}")
-        between = self.opacity_floor < self.opacity_start < 1
-        expected = f"a number above opacity_floor={self.opacity_floor:g} and below 1"
-        self.require(between, "opacity_start", expected)
+        self.require(self.opacity_floor < OPACITY_START, "opacity_floor", f"a number below {OPACITY_START:g}")
         return self
 
     @property
@@ -142,7 +143,7 @@ class FootprintAttributes(Options):
     @property
     def scale_range(self) -> float:
         """Logarithm of the largest scale over the least."""
-        return log(self.scale_cap / self.scale_floor)
+        return log(SCALE_CAP / self.scale_floor)
 
     @property
     def scale_biases(self) -> tuple[float, float]:
@@ -153,7 +154,12 @@ class FootprintAttributes(Options):
     @property
     def opacity_bias(self) -> float:
         """What is added to raw opacities, so that 0 is the start."""
-        return _logit((self.opacity_start - self.opacity_floor) / (1 - self.opacity_floor))
+        return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
+
+    def constants(self, color_limit: float) -> tuple[float, ...]:
+        """What :func:`ghgs_lit.heads.cpu.activate` is told."""
+        size = (self.scale_floor, self.scale_range, *self.scale_biases)
+        return self.offset_limit, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
 
     def __call__(
         self,
@@ -169,7 +175,7 @@ class FootprintAttributes(Options):
         scale = self.scale_floor * torch.exp(self.scale_range * bounded_sigmoid(scale))
         shown = bounded_sigmoid(opacity + self.opacity_bias)
         return (
-            self.offset_limit * bounded_tanh(offset) + F.pad(self.inward * footprint[:, None], (2, 0)),
+            OFFSET_LIMIT * bounded_tanh(offset) + F.pad(self.inward * footprint[:, None], (2, 0)),
             footprint[:, None] * scale,
             unit(identity + rotation, _SHORTEST),
             self.opacity_floor + (1 - self.opacity_floor) * shown,
@@ -191,8 +197,8 @@ class GaussianHeadOptions(Options):
     """Recalibrated tokens to one Gaussian for each pixel of the subject."""
 
     group = "gaussian_head"
-    dpt: DPTOptions = DPTOptions()
-    """The dense head."""
+    rectified_skip: bool = True
+    """Residual units add what they rectified, as published weights expect; in training it can die."""
     guide: bool = False
     """The dense head also sees photographs, masks and depths at full resolution; the paper: false."""
     photo_consistency: bool = False
@@ -244,7 +250,7 @@ class GaussianHead(nn.Module):
         self.options, self.channels = options, options.channels
         channels, hidden = options.channels, options.hidden
         guided = PHOTO_CHANNELS + 1 + options.photo_consistency if options.guide else 0
-        self.decoder = DPTHead(options.dpt, dim_latent, channels, guided)
+        self.decoder = DPTHead(dim_latent, channels, options.rectified_skip, guided)
         self.offset_header = _mlp((channels, *hidden, 3), nn.Tanh)
         self.scale_header = _mlp((channels, *hidden, 3), nn.ReLU)
         self.rot_header = _mlp((channels, *hidden, 4), nn.ReLU)
@@ -295,6 +301,22 @@ class GaussianHead(nn.Module):
 
     def activate(self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps) -> Gaussians:
         """The Gaussians of raw attributes at the points of their pixels; arguments as of :meth:`forward`."""
+        numbers = (raw.offset, raw.scale, raw.rotation, raw.opacity, raw.color)
+        photo, share, options = batch.once(surface_colors), batch.alpha, self.options
+        inputs = (*numbers, photo, share, depth_maps.depth, points.pixels, batch.cameras.extrinsics)
+        if isinstance(self.attributes, FootprintAttributes) and cpu.is_supported(*inputs):
+            constants, on_surface = self.attributes.constants(options.color_limit), options.axes == "surface"
+            given = (raw.image, raw.pixel, depth_maps, points, photo, share, batch.cameras)
+            found = cpu.activate(numbers, *given, constants, on_surface)
+        else:
+            found = self._activated(raw, batch, points, depth_maps)
+        constants = {"low_pass": options.low_pass, "antialiased": options.antialiased}
+        return Gaussians(*found, raw.splits, raw.image, raw.pixel, **constants)
+
+    def _activated(
+        self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Means, quaternions, scales, opacities and colours."""
         image, pixel = raw.image, raw.pixel
         focal = (
             at_least_float32(batch.cameras.intrinsics)
@@ -315,20 +337,10 @@ class GaussianHead(nn.Module):
         if batch.alpha is not None:
             opacities = opacities * batch.alpha.to(opacities).flatten(0, 1).flatten(1)[image, pixel]
         colors = batch.once(surface_colors).flatten(0, 1).flatten(2).transpose(1, 2)[image, pixel]
-        return Gaussians(
-            means=points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset,
-            quaternions=quaternions,
-            scales=scales,
-            opacities=opacities,
-            colors=colors
-            if raw.color is None
-            else colors + self.options.color_limit * bounded_tanh(raw.color),
-            splits=raw.splits,
-            image=image,
-            pixel=pixel,
-            low_pass=self.options.low_pass,
-            antialiased=self.options.antialiased,
-        )
+        if raw.color is not None:
+            colors = colors + self.options.color_limit * bounded_tanh(raw.color)
+        means = points.pixels.flatten(0, 1).flatten(1, 2)[image, pixel] + offset
+        return means, quaternions, scales, opacities, colors
 
     def _guide(self, batch: Batch, points: Points, depth_maps: DepthMaps) -> Guide | None:
         if self.decoder.guide is None:
@@ -365,7 +377,11 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.options.color_limit > 0:
             headers.append(self.color_header)
-        offset, scale, rotation, opacity, *color = (float32_last(header, descriptors) for header in headers)
+        if multiplies(descriptors, self.offset_header[0].weight):
+            found = cpu.attributes(headers, descriptors)
+        else:
+            found = (float32_last(header, descriptors) for header in headers)
+        offset, scale, rotation, opacity, *color = found
         return offset, scale, rotation, opacity[..., 0], *color
 
 

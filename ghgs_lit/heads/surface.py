@@ -14,7 +14,7 @@ from ghgs_lit.types import Cameras, DepthMaps
 
 #: A neighbour counts fully where its depth differs by less of a pixel's footprints than the first number, and
 #: from the second on it lies on another surface.
-_SAME, _OTHER = 4.0, 8.0
+SAME, OTHER = 4.0, 8.0
 
 
 @torch.no_grad()
@@ -46,7 +46,7 @@ def surface_axes(
     def neighbor(step: int) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """Depth of a neighbour less the pixel's (0 off its surface), and whether it is on it, 0 to 1."""
         deeper = around[place + step] - own
-        near = ((_OTHER - deeper.abs() / footprint) / (_OTHER - _SAME)).clamp(0, 1)
+        near = ((OTHER - deeper.abs() / footprint) / (OTHER - SAME)).clamp(0, 1)
         return near * torch.where(near > 0, deeper, 0), near
 
     def slope(step: int) -> Float[Tensor, " N"]:

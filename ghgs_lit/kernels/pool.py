@@ -4,6 +4,7 @@ import os
 import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -39,6 +40,20 @@ def _workers(count: int) -> ThreadPoolExecutor:
 def is_supported(*tensors: Tensor) -> bool:
     """Whether kernels in single precision, which see tensors as NumPy arrays, can work on these."""
     return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+
+
+@cache
+def features() -> set[str]:
+    """LLVM's names of the processor features that kernels may use; see ``processor_features``."""
+    from ghgs_lit.kernels.compile import processor_features  # here: it loads a compiler
+
+    return processor_features()
+
+
+def multiplies(*tensors: Tensor) -> bool:
+    """Whether kernels compute products of these, and as fast as PyTorch: no gradient, no half precision."""
+    plain = not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
+    return plain and is_supported(*tensors) and features() >= {"avx2", "fma"}
 
 
 def run(tasks: list, work: int) -> None:

@@ -265,6 +265,18 @@ def exp2_minus(typing_context, x):
     return floats(floats), emit
 
 
+_ZERO, _ONE, _TWICE = np.float32(0), np.float32(1), np.float32(2 * math.log2(math.e))
+
+
+@helper
+def tanh(x):
+    """The hyperbolic tangent of floats, within 1e-7; NaN stays."""
+    distance = maximum(x, _ZERO - x)
+    shrunk = exp2_minus(minimum(full(EXP2_LIMIT), distance * _TWICE))
+    found = (_ONE - shrunk) / (_ONE + shrunk)
+    return select(x < _ZERO, _ZERO - found, found)
+
+
 # log2(m) = 2 / ln 2 (s + s^3 / 3 + s^5 / 5 + ...), s = (m - 1) / (m + 1): 1e-14 for m in [1/sqrt 2, sqrt 2).
 _LOG2 = [2 / math.log(2) / k for k in range(1, 19, 2)]
 # Subtracted from the bits of x, so that the remaining mantissa lies in [1/sqrt 2, sqrt 2).

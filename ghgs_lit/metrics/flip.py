@@ -32,7 +32,6 @@ _RGB_TO_XYZ = (
 
 
 def _transform_colors(image: Tensor, matrix: Tensor) -> Tensor:
-    """``matrix`` times the colour of every pixel."""
     return torch.einsum("ij,njhw->nihw", matrix, image)
 
 
@@ -44,7 +43,6 @@ def _xyz_matrices(like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _linear_rgb(image: Tensor) -> Tensor:
-    """sRGB to linear RGB."""
     steep = ((image.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(image > 0.04045, steep, image / 12.92)
 
@@ -56,7 +54,6 @@ def _opponent(xyz: Tensor) -> Tensor:
 
 
 def _from_opponent(ycc: Tensor) -> Tensor:
-    """The inverse of :func:`_opponent`."""
     y = (ycc[:, :1] + 16) / 116
     return torch.cat((y + ycc[:, 1:2] / 500, y, y - ycc[:, 2:] / 200), dim=1)
 
@@ -132,11 +129,7 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
 
 
 def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
-    """FLIP of each pixel, in [0, 1].
-
-    Args:
-        image, target: values outside [0, 1] are clamped first.
-    """
+    """FLIP of each pixel, in [0, 1]. ``image``, ``target``: values outside [0, 1] are clamped first."""
     # Each image separately: rounding can depend on the position in memory, and equal images must give 0.
     with torch.autocast(image.device.type, enabled=False):
         image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)

@@ -43,12 +43,8 @@ def mean_inside(
 
 
 def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n h w"]:
-    """The bounding box of each mask, as a mask; empty where the mask is empty.
-
-    Args:
-        mask: one mask for each image.
-        margin: part of the box's height and width that is added on each side, inside the image.
-    """
+    """The bounding box of each mask, as a mask; empty where the mask is empty. ``margin``: part of the box's
+    height and width that is added on each side, inside the image."""
 
     def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
         index = torch.arange(hit.shape[1], device=hit.device)
@@ -153,11 +149,7 @@ def depth_error_mm(
     depth: Float[Tensor, "n h w"], truth: Float[Tensor, "n h w"], region: Bool[Tensor, "n h w"]
 ) -> Float[Tensor, ""]:
     """Mean |z - true z| in millimetres over all pixels of ``region`` with a true depth; nan without any.
-
-    Args:
-        depth, truth: metres; a truth of 0 is unknown.
-        region: the pixels that count.
-    """
+    ``depth``, ``truth``: metres; a truth of 0 is unknown."""
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()

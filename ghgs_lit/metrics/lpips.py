@@ -12,14 +12,8 @@ NETWORK = "vgg"
 
 
 class LPIPS:
-    """LPIPS of whole images: one value for each.
-
-    Args:
-        signed: map [0, 1] to [-1, 1], for which the network was calibrated; the authors' evaluation does not.
-
-    Raises:
-        InputError: torchvision or the weights are not available.
-    """
+    """LPIPS of whole images: one value for each. ``signed``: map [0, 1] to [-1, 1], for which the network was
+    calibrated; the authors' evaluation does not. InputError: torchvision or the weights are not available."""
 
     def __init__(self, signed: bool = True):
         try:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.config.options import Amount, Options, Text
+from ghgs_lit.config.options import Amount, Options
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
@@ -26,20 +26,25 @@ class MetricsOptions(Options):
     """What is measured, and how."""
 
     group = "metrics"
-    protocol: Text = "correct"
-    """Name that is reported with every number."""
+    protocol: Literal["correct", "release"] = "correct"
+    """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it was
+    calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. Reported with every number."""
     regions: tuple[Literal["image", "box", "subject"], ...] = REGIONS
     """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP)."""
     box_margin: Amount = 0.0
     """Part of the box's height and width that is added to it on each side."""
-    ssim_padding: Literal["reflect", "valid", "zeros"] = "reflect"
-    """Border of SSIM: reflect (torchmetrics), valid (none, scikit-image), zeros (the authors)."""
-    clamp: bool = True
-    """Whether renders are clamped to [0, 1] first."""
     lpips: Literal["auto", "require", "off"] = "auto"
     """auto: left out, with a message, where torchvision or its weights are missing; require: an error."""
-    lpips_signed: bool = True
-    """Whether LPIPS sees [-1, 1], for which it was calibrated; false: [0, 1]."""
+
+    @property
+    def is_release(self) -> bool:
+        """Whether numbers are those of the authors' code."""
+        return self.protocol == "release"
+
+    @property
+    def ssim_padding(self) -> str:
+        """Border of SSIM."""
+        return "zeros" if self.is_release else "reflect"
 
     def build(self) -> "ImageMetrics":
         return ImageMetrics(self)
@@ -62,7 +67,7 @@ class ImageMetrics:
         self.left_out: dict[str, str] = {}
         if options.lpips != "off":
             try:
-                self.lpips = LPIPS(options.lpips_signed)
+                self.lpips = LPIPS(signed=not options.is_release)
             except InputError as error:
                 if options.lpips == "require":
                     raise
@@ -86,8 +91,9 @@ class ImageMetrics:
     def definitions(self) -> dict[str, str]:
         """How each metric and region is defined, to be stored beside the numbers."""
         options = self.options
+        renders = "as they are" if options.is_release else "clamped to [0, 1]"
         said = {
-            "image": f"renders {'clamped to [0, 1]' if options.clamp else 'as they are'}, RGB, data range 1",
+            "image": f"renders {renders}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
             "depth_error_mm": "mean |z - true z| over a subject's input pixels with predicted and true depth",
         }
@@ -101,19 +107,16 @@ class ImageMetrics:
         if "subject" in options.regions:
             said["subject"] = "the pixels of the subject's mask in the target"
         if self.lpips is not None:
-            said["lpips"] = f"{NETWORK} on {'[-1, 1]' if options.lpips_signed else '[0, 1]'}, whole image"
+            said["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
         return said
 
     @torch.no_grad()
     def __call__(
-        self,
-        image: Float[Tensor, "n 3 h w"],
-        target: Float[Tensor, "n 3 h w"],
-        mask: Bool[Tensor, "n h w"],
+        self, image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"], mask: Bool[Tensor, "n h w"]
     ) -> dict[str, Tensor]:
         """One value per image for each metric; nan where a region is empty."""
         options = self.options
-        image = image.clamp(0, 1) if options.clamp else image
+        image = image if options.is_release else image.clamp(0, 1)
         errors = squared_error(image, target)
         similarity = ssim_map(image, target, options.ssim_padding).mean(1)
         difference = flip_map(image, target) if {"image", "box"} & set(options.regions) else None

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
@@ -34,7 +34,6 @@ def render(
     near: float = 0.01,
     far: float = FAR,
     settings: RasterSettings | None = None,
-    region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
 ) -> Rendering:
     """Render ``B`` sets of Gaussians from cameras [B, T].
 
@@ -51,8 +50,6 @@ def render(
         near, far: metres (see ``gaussians.metre``); only Gaussians whose centre has ``near <= z <= far`` are
             drawn.
         settings: constants of the image; None for the defaults, or what the Gaussians were made for.
-        region: the box to draw (top, left, height, width) in pixels, one for all views or one for each.
-            Outside it the image is background and has no gradient; the CPU backend skips that work.
 
     Returns:
         Image [B, T, C, h, w], alpha and depth [B, T, 1, h, w]; depth is the expectation
@@ -72,13 +69,7 @@ def render(
     with torch.autocast(gaussians.means.device.type, enabled=False):
         gaussians, cameras = _in_metres(*_around_cameras(_in_one_dtype(gaussians), cameras))
         cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
-        options = (settings, float(near), float(far))
-        regions = None if region is None else _regions(region, cameras)
-        if backend == "cpu":
-            rendering = module.rasterize(gaussians, cameras, *options, regions)
-        else:
-            rendering = module.rasterize(gaussians, cameras, *options)
-            rendering = rendering if regions is None else _masked(rendering, regions)
+        rendering = module.rasterize(gaussians, cameras, settings, float(near), float(far))
         if metre is not None:
             metre = metre.to(rendering.depth)[:, None, None, None, None]
             rendering = dataclasses.replace(rendering, depth=rendering.depth * metre)
@@ -132,16 +123,12 @@ class Renderer(Options):
     """Upper limit of a Gaussian's alpha; gsplat applies it to opacities."""
 
     def __call__(
-        self,
-        gaussians: Gaussians,
-        cameras: Cameras,
-        background: Background | None = None,
-        region: Sequence[int] | Int[Tensor, "B T 4"] | None = None,
+        self, gaussians: Gaussians, cameras: Cameras, background: Background | None = None
     ) -> Rendering:
         """See :func:`render`; a ``background`` that is given here replaces the configured one."""
         background = self.background if background is None else background
         settings = made_for(gaussians, alpha_max=self.alpha_max)
-        return render(gaussians, cameras, self.backend, background, self.near, FAR, settings, region)
+        return render(gaussians, cameras, self.backend, background, self.near, FAR, settings)
 
 
 def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
@@ -221,7 +208,6 @@ def _in_metres(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Camer
 
 
 def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Tensor | float:
-    """The background as a number or a tensor that broadcasts with ``color``."""
     if isinstance(background, (int, float)):
         return background
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
@@ -234,28 +220,3 @@ def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Te
         )
         return tensor[:, None, None]
     return tensor
-
-
-def _regions(region: Sequence[int] | Tensor, cameras: Cameras) -> Int[Tensor, "B T 4"]:
-    """``region`` as one checked box (top, left, height, width) for each view."""
-    expected = "(top, left, height, width) inside the image, one box or [B, T, 4]"
-    boxes = torch.as_tensor(region)
-    is_whole = not boxes.is_floating_point() and not boxes.is_complex()
-    require(is_whole and boxes.shape in ((4,), (*cameras.shape, 4)), "region", expected, region)
-    top, left, height, width = boxes.unbind(-1)
-    fits = (top >= 0) & (left >= 0) & (height >= 0) & (width >= 0)
-    fits &= (top + height <= cameras.height) & (left + width <= cameras.width)
-    require(bool(fits.all()), "region", expected, region)
-    return boxes.expand(*cameras.shape, 4)
-
-
-def _masked(rendering: Rendering, regions: Int[Tensor, "B T 4"]) -> Rendering:
-    """A rendering on black with zeros outside the regions."""
-    device = rendering.image.device
-    rows = torch.arange(rendering.image.shape[-2], device=device)[:, None]
-    columns = torch.arange(rendering.image.shape[-1], device=device)
-    top, left, height, width = regions.to(device)[..., None, None].unbind(2)
-    inside = (rows >= top) & (rows < top + height) & (columns >= left) & (columns < left + width)
-    inside = inside[:, :, None]
-    values = {f.name: getattr(rendering, f.name) for f in dataclasses.fields(rendering)}
-    return Rendering(**{name: torch.where(inside, value, 0) for name, value in values.items()})

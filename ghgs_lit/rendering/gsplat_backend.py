@@ -17,11 +17,8 @@ class BackendUnavailable(InputError):
 
 
 def load():
-    """gsplat's function ``rasterization``.
-
-    Raises:
-        BackendUnavailable: no CUDA device, or gsplat cannot be imported.
-    """
+    """gsplat's function ``rasterization``. BackendUnavailable: no CUDA device, or gsplat cannot be
+    imported."""
     if not torch.cuda.is_available():
         raise BackendUnavailable(
             "renderer.backend=gsplat: needs a CUDA device, but torch.cuda.is_available() is false "

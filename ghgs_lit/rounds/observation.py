@@ -7,7 +7,9 @@ from torch import Tensor
 
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.rendering import render
+from ghgs_lit.rounds import cpu
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 #: Metres behind the rendered surface at which a Gaussian counts as hidden (tanh of the ratio).
@@ -34,9 +36,12 @@ def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
 
 
 def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[Tensor, "N V c"]:
-    views = batch.images.shape[1]
-    photo, mask = at_least_float32(batch.images), coverage(batch)[:, :, None]
-    maps = (photo, photo - rendering.image, mask, rendering.alpha, rendering.depth)
+    views, photo, mask = batch.images.shape[1], at_least_float32(batch.images), coverage(batch)
+    if is_supported(gaussians.means, gaussians.colors, photo, batch.cameras.extrinsics):
+        values = photo.new_empty(len(gaussians), views, CHANNELS)
+        cpu.compare(gaussians, batch.cameras, photo, mask, rendering, _BEHIND, values)
+        return values
+    maps = (photo, photo - rendering.image, mask[:, :, None], rendering.alpha, rendering.depth)
     found, z, can_see = looked_up(gaussians, batch.cameras, torch.cat(maps, 2))
     color, error, mask, alpha, depth = found.split((3, 3, 1, 1, 1), -1)
     behind = torch.tanh((z - depth) / _BEHIND)

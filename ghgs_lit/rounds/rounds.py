@@ -11,26 +11,32 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
+from ghgs_lit.bounds.rays import ray_directions
 from ghgs_lit.config.options import Count, Options, Width
-from ghgs_lit.geometry.photo_consistency import photo_consistency
-from ghgs_lit.geometry.projection import at_least_float32, unproject_maps
+from ghgs_lit.geometry.photo_consistency import consistency_of
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.kernels.pool import multiplies
+from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
 from ghgs_lit.rounds.observation import CHANNELS, observe
-from ghgs_lit.types import Batch, DepthBounds, DepthMaps, Gaussians, Points, Prediction
+from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
 
 #: Gaussians whose views go through the network at once.
 _AT_ONCE = 2048
+#: How far the depths that a round compares lie from the current one, in the first round: a share of the
+#: distance from near to far.
+REACH = 0.25
 #: Of :class:`Search`: how far from near to far a Gaussian is, and the distance between them.
 _PLACE = 2
 
@@ -46,6 +52,19 @@ class Search:
     place: Float[Tensor, "N 2"]
     down: Float[Tensor, " N"]
     up: Float[Tensor, " N"]
+
+
+class Rays(NamedTuple):
+    """Places of the Gaussians' pixels among those of all images, and a metre of depth along their rays."""
+
+    place: Int[Tensor, " N"]
+    direction: Float[Tensor, "N 3"]
+
+    @classmethod
+    def of(cls, raw: RawGaussians, batch: Batch) -> "Rays":
+        place = raw.image * batch.masks[0, 0].numel() + raw.pixel
+        with torch.autocast(raw.pixel.device.type, enabled=False):
+            return cls(place, ray_directions(batch.cameras).flatten(0, 3)[place])
 
 
 @dataclass(frozen=True)
@@ -93,8 +112,6 @@ class RoundsOptions(Options):
     """Width of the network."""
     depths: Count = 8
     """Number of depths around the current one at which a round compares the photographs."""
-    reach: float = Field(0.25, gt=0, le=1)
-    """How far these lie from it in the first round, as a share of the distance from near to far."""
     gains: bool = True
     """Photographs of cameras whose exposure differs are made alike first."""
     exchange: Width | None = 16
@@ -155,9 +172,10 @@ class Rounds(nn.Module):
             state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
         windows = None if self.exchange is None else Windows.of(state.raw, batch)
+        rays = Rays.of(state.raw, batch)
         for number in range(self._drawn() if self.training else self.count):
-            change, memory = self._round(states[-1], batch, memory, windows, 0.5**number)
-            states.append(_moved(states[-1], activate, batch, *change))
+            change, memory = self._round(states[-1], batch, rays, memory, windows, 0.5**number)
+            states.append(_moved(states[-1], activate, batch, rays, *change))
         return tuple(states)
 
     def _drawn(self) -> int:
@@ -165,24 +183,29 @@ class Rounds(nn.Module):
         return counts[int(torch.randint(len(counts), ()))]
 
     def _round(
-        self, state: State, batch: Batch, memory: Tensor, windows: Windows | None, size: float
+        self, state: State, batch: Batch, rays: Rays, memory: Tensor, windows: Windows | None, size: float
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """New depths and changes of raw attributes, and what the next round remembers."""
         gaussians = state.gaussians.detach()
         each = observe(gaussians, batch)
-        search = self._search(state, batch, size * self.options.reach)
+        search = self._search(state, batch, rays, size * REACH)
         rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
-        # In parts that fit a CPU's cache: half the time. Backward the number of operators counts for more.
-        count = len(memory)
-        most = count if torch.is_grad_enabled() else at_once(memory.device, _AT_ONCE, count)
-        parts = even_parts(count, most)
-        memory = torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
+        if multiplies(*rows, self.memory.weight):
+            memory = cpu.remembered(self.view, self.update, self.memory, *rows)
+        else:
+            memory = self._remembered_in_parts(*rows)
         if windows is not None:
             memory = self.exchange(memory, windows)
         change = float32_last(self.change, memory)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
         return (moved, size * change[:, 1:]), memory
+
+    def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
+        """:meth:`_remembered` of as much as a cache holds: half the time. Backward few operators matter."""
+        count, device = len(rows[0]), rows[0].device
+        parts = even_parts(count, count if torch.is_grad_enabled() else at_once(device, _AT_ONCE, count))
+        return torch.cat([self._remembered(*(row[part] for row in rows)) for part in parts])
 
     def _remembered(
         self, each: Float[Tensor, "n V c"], known: Float[Tensor, "n k"], memory: Float[Tensor, "n h"]
@@ -193,32 +216,33 @@ class Rounds(nn.Module):
         return torch.tanh(memory + self.memory(self.update(torch.cat((*seen, known, memory), -1))))
 
     @torch.no_grad()
-    def _search(self, state: State, batch: Batch, reach: float) -> Search:
-        maps, raw = state.depth_maps, state.raw
+    def _search(self, state: State, batch: Batch, rays: Rays, reach: float) -> Search:
+        maps = state.depth_maps
         depth, near, far = (
-            at_least_float32(z).detach() for z in (maps.depth, maps.bounds.near, maps.bounds.far)
+            at_least_float32(values).detach().flatten()[rays.place]
+            for values in (maps.depth, maps.bounds.near, maps.bounds.far)
         )
-        half = reach * (far - near)
+        thickness = far - near
+        half, share = reach * thickness, (depth - near) / torch.where(thickness > 0, thickness, 1)
         # Rounding may have put a depth a little outside its bounds.
         low, high = torch.minimum(torch.maximum(depth - half, near), depth), torch.minimum(depth + half, far)
         high = torch.maximum(high, depth)
-
-        def at(values: Float[Tensor, "B V *s H W"]) -> Float[Tensor, " N *s"]:
-            return values.flatten(0, 1).flatten(-2)[raw.image, ..., raw.pixel]
-
-        thickness = at(far - near)
-        share = at(depth - near) / torch.where(thickness > 0, thickness, 1)
-        matches = at(photo_consistency(batch, DepthBounds(low, high), self.options.depths))
-        return Search(matches, torch.stack((share, thickness), -1), at(depth - low), at(high - depth))
+        matches = consistency_of(batch, rays.place, low, high, self.options.depths)
+        return Search(matches, torch.stack((share, thickness), -1), depth - low, high - depth)
 
 
 def _moved(
-    state: State, activate: Activate, batch: Batch, moved: Float[Tensor, " N"], change: Float[Tensor, "N c"]
+    state: State,
+    activate: Activate,
+    batch: Batch,
+    rays: Rays,
+    moved: Float[Tensor, " N"],
+    change: Float[Tensor, "N c"],
 ) -> State:
     """The state with Gaussians moved by metres along their rays and raw attributes changed."""
-    raw, maps = state.raw.changed(change), state.depth_maps
-    depth, place = maps.depth.flatten(0, 1).flatten(1), (raw.image, raw.pixel)
-    depth = depth.index_put(place, depth[place] + moved).view_as(maps.depth)
+    raw, maps, pixels = state.raw.changed(change), state.depth_maps, state.points.pixels
+    depth = maps.depth.flatten().index_add(0, rays.place, moved).view_as(maps.depth)
     maps = dataclasses.replace(maps, depth=depth)
-    points = dataclasses.replace(state.points, pixels=unproject_maps(depth, batch.cameras))
+    pixels = pixels.flatten(0, 3).index_add(0, rays.place, moved[:, None] * rays.direction).view_as(pixels)
+    points = dataclasses.replace(state.points, pixels=pixels)
     return State(raw, activate(raw, batch, points, maps), points, maps)

@@ -7,6 +7,7 @@ from typing import Any
 
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
 
 #: What training writes below a run's directory, beside the logs of Hydra.
 WRITTEN = (
@@ -82,21 +83,17 @@ def _require_useful_cache(config: Mapping[str, Any]) -> None:
 def check_directory(directory: Path, config: Mapping[str, Any]) -> None:
     """Refuse to train where an earlier run would be lost; with ``overwrite`` remove it.
 
-    Args:
-        directory: that of the run.
-        config: ``resume`` and ``overwrite`` are read.
-
     Raises:
         InputError: there is a run, and this one does not go on from it.
     """
     kept = [*(directory / "checkpoints").glob("*.ckpt"), directory / "csv" / "metrics.csv"]
     earlier = next((path for path in [*kept, directory / "metrics.json"] if path.exists()), None)
     resume = config.get("resume")
-    if resume is not None and Path(resume).resolve().is_relative_to(directory.resolve()):
+    if resume is not None and resolved(resume).is_relative_to(directory.resolve()):
         return
     if config.get("overwrite"):
         source = config.get("init_from")
-        safe = source is None or not Path(source).resolve().is_relative_to(directory.resolve())
+        safe = source is None or not resolved(source).is_relative_to(directory.resolve())
         require(safe, "init_from", "a file outside the run that overwrite=true deletes", source)
         for path in (directory / name for name in WRITTEN):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)

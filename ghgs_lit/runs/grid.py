@@ -13,6 +13,7 @@ from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ghgs_lit.config import resolve
+from ghgs_lit.config.compose import saved_text
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
@@ -85,11 +86,7 @@ def combinations(
 
 
 def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:
-    """The different runs among the jobs, in order.
-
-    Args:
-        combos: the overrides of each job.
-        compose: composes the configuration of a job from its overrides.
+    """The different runs among the jobs, in order; ``compose`` makes a configuration of a job's overrides.
 
     Raises:
         InputError: a job's configuration is bad or lacks a value.
@@ -113,7 +110,7 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
     for item in planned:
         path = item.run.path / "config.yaml"
         if not path.exists():
-            write_text_atomically(path, OmegaConf.to_yaml(OmegaConf.create(item.config)))
+            write_text_atomically(path, saved_text(item.config))
     write_text_atomically(directory / "multirun.yaml", OmegaConf.to_yaml(config))
 
 
@@ -121,12 +118,8 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     """Launch runs until each one is done, here or elsewhere, or has failed.
 
     A job whose run another process works on returns ``BUSY``: it is launched again once that process has
-    finished or died.
-
-    Args:
-        planned: the runs of the grid.
-        launch: starts jobs, given their overrides and the number of the first.
-        batch: jobs that are launched at once; None for all.
+    finished or died. ``launch`` starts jobs, given their overrides and the number of the first; ``batch`` of
+    them at once, None: all.
     """
     todo = [item for item in planned if not item.run.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)

@@ -124,15 +124,7 @@ def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
 
 
 def trains_in_several_processes(config: Mapping[str, Any], launcher: str) -> bool:
-    """Whether a job of a sweep trains in several processes.
-
-    Args:
-        config: the job's configuration.
-        launcher: the name of Hydra's launcher.
-
-    Raises:
-        InputError: it does, and the launcher runs all jobs in one process.
-    """
+    """Whether a job of a sweep trains in several processes; InputError: Hydra's launcher runs all in one."""
     devices = config["trainer"].get("devices", 1)
     if devices in (1, "1", [0]):
         return False

@@ -24,11 +24,7 @@ def code_digest() -> str:
 
 
 class Journal:
-    """Rows of finished pieces by key; those that an earlier run with the same code wrote are there.
-
-    Args:
-        path: the file, which is made with the first piece.
-    """
+    """Rows of finished pieces by key; those that an earlier run with the same code wrote are there."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

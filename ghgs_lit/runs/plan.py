@@ -1,7 +1,6 @@
 """What a sweep will run, and what it has run, as tables on the terminal."""
 
 import datetime
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from tabulate import tabulate
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import is_multirun
+from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
 
@@ -36,10 +36,7 @@ def time_budget(config: Mapping[str, Any]) -> float | None:
         return None
     if isinstance(value, Mapping):
         return datetime.timedelta(**value).total_seconds()
-    parts = re.fullmatch(r"(\d+):(\d+):(\d+):(\d+)", str(value))
-    if parts is None:
-        raise InputError(f"trainer.max_time: expected days:hours:minutes:seconds; found {value!r}")
-    days, hours, minutes, seconds = map(int, parts.groups())
+    days, hours, minutes, seconds = map(int, value.split(":"))
     return datetime.timedelta(days, seconds, hours=hours, minutes=minutes).total_seconds()
 
 
@@ -61,12 +58,8 @@ def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | N
     return min((seconds for seconds in known if seconds is not None), default=None)
 
 
-def _clock(seconds: float | None) -> str:
-    return "unknown" if seconds is None else str(datetime.timedelta(seconds=round(seconds)))
-
-
 def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
-    return f"{config['trainer'].get('max_steps')} steps" if seconds is None else _clock(seconds)
+    return f"{config['trainer'].get('max_steps')} steps" if seconds is None else clock(seconds)
 
 
 def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
@@ -94,7 +87,7 @@ def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
     basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
     if measured:
         basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
-    known = _clock(None if None in left else sum(left))
+    known = "unknown" if None in left else clock(sum(left))
     reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
     print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)

@@ -21,13 +21,7 @@ def on_terminal() -> bool:
 
 
 class Lines:
-    """Prints a line once in a while, and appends the same lines to a file.
-
-    Args:
-        log: file that gets the lines; None: none.
-        printed: whether they are printed too.
-        every: seconds between two lines.
-    """
+    """Prints a line every so many seconds, unless not ``printed``, and appends it to the file ``log``."""
 
     def __init__(self, log: Path | None = None, printed: bool = True, every: float = EVERY) -> None:
         self.log, self.printed, self.every = log, printed, every
@@ -57,13 +51,7 @@ def clock(seconds: float) -> str:
 
 
 def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
-    """``items``, with a bar or with lines that say how many of them are done.
-
-    Args:
-        items: what is worked on; its length is shown where it has one.
-        text: what is done.
-        every: seconds between two lines.
-    """
+    """``items``, with a bar or, each ``every`` seconds, with a line that says how many of them are done."""
     if on_terminal():
         yield from bar(items, text, transient=True)
         return

@@ -1,1 +1,1 @@
-"""Making data: people, rigs of cameras, photographs, miniatures of data sets."""
+"""Making data: people, rigs of cameras, photographs, scans."""

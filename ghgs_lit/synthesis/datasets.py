@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Index, Options, Seed, Share, Size, Text, Workers
+from ghgs_lit.config.options import Index, Options, Share, Size, Text, Workers
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
 from ghgs_lit.data.layout import Rendered
 from ghgs_lit.data.reader import PHASES
@@ -33,6 +33,8 @@ from ghgs_lit.synthesis.jobs import (
 from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
 
+# Of built-in people: one population, whose numbers tell its people apart.
+_PEOPLE_SEED = 0
 # Of heights, yaws, lights and of the split by fraction of scans.
 _SEED = 0
 
@@ -106,15 +108,13 @@ class _Generated(_Renderable):
     """Number of people."""
     active: ActivePeople = ActivePeople()
     """Number of further people, in poses of sport and dance."""
-    people_seed: Seed = 0
-    """Seed of the people."""
     cache_dir: options.Path | None = None
     """Folder of the caches; null: $GHGS_CACHE or ~/.cache/ghgs_lit."""
 
     @property
     def root(self) -> str:
         """The cache's folder, which is named after everything that the photographs depend on."""
-        made_with = identity(self.camera_rig(), self.render, self.people_seed) | {"people": people_version()}
+        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED) | {"people": people_version()}
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         try:
@@ -138,16 +138,13 @@ class _Generated(_Renderable):
         return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people of ``splits`` that the cache lacks.
-
-        Raises:
-            InputError: the people of ``bench`` are not those of its definition (:mod:`.bench`).
-        """
+        """Render the people of ``splits`` that the cache lacks. InputError: the people of ``bench`` are not
+        those of its definition (:mod:`.bench`)."""
         if bench.SPLIT in splits:
             made_with = everything(self.camera_rig(), self.render)
-            bench.check_settings({"people_seed": self.people_seed, **made_with})
+            bench.check_settings({"people_seed": _PEOPLE_SEED, **made_with})
         names = {phase: self.subject_names(phase) for phase in splits}
-        self.render_into(Path(self.root), names, SyntheticSource(self.people_seed), self.people_seed)
+        self.render_into(Path(self.root), names, SyntheticSource(_PEOPLE_SEED), _PEOPLE_SEED)
         if bench.SPLIT in splits:
             bench.check_photographs(self.reader(bench.SPLIT))
 
@@ -211,11 +208,7 @@ class Scans(DataSet, _OnRing):
 
     @property
     def source_folder(self) -> Path:
-        """The folder of the scans.
-
-        Raises:
-            InputError: ``source`` is null.
-        """
+        """The folder of the scans. InputError: ``source`` is null."""
         return required_folder("data.source", "a folder of scans", self.source)
 
     def scans(self) -> PersonSource:

@@ -30,6 +30,7 @@ from ghgs_lit.data.layout import position_name
 from ghgs_lit.data.sampling import RING_VIEW, ViewNumber, subject_rng
 from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import naming
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
@@ -163,12 +164,7 @@ def render_people(
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
 
     Args:
-        root: folder of the rendered data set.
         names: names of the subjects of each phase.
-        source: loads them.
-        rig: the cameras, and how subjects are placed.
-        settings: what is rendered.
-        seed: seed of heights, yaws and lights.
         workers: number of processes (None: one for each core; 0: this one).
 
     Returns:
@@ -186,7 +182,7 @@ def render_people(
     missing = progress.complete.missing
     if not any(missing(phase, listed) for phase, listed in names.items()):
         return 0
-    with progress.lock():
+    with progress.lock(), naming(progress.root):
         progress.check_settings(identity(rig, settings, seed))  # another process may have been faster
         progress.clear_workspaces()
         progress.plan(names)

@@ -1,61 +1,68 @@
-"""``ghgs prepare task=miniature``: a small data set of built-in people in a published layout.
+"""``ghgs prepare task=miniature``: built-in people as a few scans of THuman2.0, with their fits.
 
-A folder that is written gets the marker ``miniature.json``, which lists its files, so that real data of the
-same names is never overwritten.
+Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2_scans`). Bodies
+are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and place the
+body correctly, but do not pose it. Folders that are written get the marker ``miniature.json``, which lists
+their files, so that real data of the same names is never overwritten.
 """
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+import pickle
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
-from ghgs_lit.data.dataset import DataSet, required_folder
-from ghgs_lit.data.humman.dataset import HuMMan
-from ghgs_lit.data.reader import PHASES
-from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from trimesh.caching import TrackedArray
+
+from ghgs_lit.data.dataset import DataSet
+from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.readers import read_json
-from ghgs_lit.synthesis.miniatures import humman, thuman2, zju_mocap
+from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis.people.generate import join
+from ghgs_lit.synthesis.people.mesh import TexturedMesh
 from ghgs_lit.synthesis.thuman2 import THuman2
+from ghgs_lit.synthesis.thuman2_scans import FIT_FOLDERS
 
 #: In each folder that a miniature was written to: which files are its own.
 MARKER = "miniature.json"
+# Id of the first scan of each phase.
+_FIRST = {"train": 0, "val": 426}
+POSE_SIZES = {"betas": 10, "body_pose": 63, "left_hand_pose": 12, "right_hand_pose": 12, "jaw_pose": 3}
+POSE_SIZES |= {"leye_pose": 3, "reye_pose": 3, "expression": 10}
 
 
-def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Write a small data set that the reader of ``dataset`` reads.
+def make_miniature(dataset: DataSet, people_of: Mapping[str, int], size: int, seed: int) -> Path:
+    """Write scans below ``data.source``, their fits into a folder beside it, and the split files.
 
     Args:
-        dataset: says which layout, and where it is written.
-        people: number of people of each phase.
-        size: longer side of the photographs in pixels.
-        seed: seed of the people.
+        people_of: how many, ``{train: n, val: n}``.
+        size: textures are scaled down to at most twice as many pixels a side.
 
     Returns:
-        The folders that were written.
+        The folder of the scans.
 
     Raises:
-        InputError: no layout is published for the data set, it has no folder, or files lie there that are not
-            a miniature's.
+        InputError: the data set has no scans, or files lie there that are not a miniature's.
     """
-    for kind, make in _MAKERS.items():
-        if isinstance(dataset, kind):
-            return make(dataset, people, size, seed)
-    raise InputError(f"task=miniature: expected a data set with a published layout; found {dataset.name}")
-
-
-def _root(dataset: DataSet) -> Path:
-    return required_folder("data.root", "a folder to write to", dataset.root)
+    if not isinstance(dataset, THuman2) or dataset.source is None:
+        found = dataset.name if not isinstance(dataset, THuman2) else "no data.source"
+        raise InputError(f"task=miniature: expected data=thuman2 data.source=<folder>; found {found}")
+    source = dataset.source_folder
+    with writing(source, fit_folder(source)):
+        return make_scans(source, people_of, size, seed)
 
 
 @contextlib.contextmanager
-def _writing(*folders: Path) -> Iterator[None]:
-    """Refuse folders that hold anything but a miniature; mark as its own what is written into them.
-
-    Raises:
-        InputError: a folder holds other files.
-    """
+def writing(*folders: Path) -> Iterator[None]:
+    """Mark as a miniature's what is written into folders. InputError: a folder holds anything but a
+    miniature."""
     for folder in folders:
         _check_own(folder)
     for folder in folders:
@@ -77,7 +84,6 @@ def _mark(folder: Path, files: list[str] | None) -> None:
 
 
 def _check_own(folder: Path) -> None:
-    """Refuse a folder with files that no miniature wrote."""
     marker = folder / MARKER
     found = _files(folder) if folder.is_dir() else []
     if marker.is_file():
@@ -93,36 +99,81 @@ def _check_own(folder: Path) -> None:
         )
 
 
-def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    chosen = []
-    for phase in PHASES:
-        chosen += [s for some in dataset.split.of(phase) for s in some.sequences][: people[phase]]
-    root = _root(dataset)
-    with _writing(root):
-        return zju_mocap.make(root, chosen, size, seed)
+def fit_folder(source: Path) -> Path:
+    """The folder of the fits, beside the scans in ``source``."""
+    return source.parent / FIT_FOLDERS[0]
 
 
-def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    root = _root(dataset)
-    with _writing(root, humman.body_models(root)):
-        return humman.make(root, dataset.split.val, people, size, seed)
+def names(people_of: Mapping[str, int]) -> dict[str, list[str]]:
+    """Ids of each phase: ``0000`` on for training, ``0426`` on for validation."""
+    for phase, count in people_of.items():
+        limit = 426 if phase == "train" else 100
+        require(0 <= count <= limit, f"miniature.people.{phase}", f"between 0 and {limit}", count)
+    return {phase: [f"{_FIRST[phase] + i:04d}" for i in range(count)] for phase, count in people_of.items()}
 
 
-def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Raw scans in ``source`` if it is given, else renders in ``root`` as the published scripts make them."""
-    if dataset.source is not None:
-        source = dataset.source_folder
-        with _writing(source, thuman2.fit_folder(source)):
-            return [thuman2.make_raw(source, people, size, seed)]
-    if dataset.root is None:
-        raise InputError("data.root: expected a folder for renders, or data.source for scans; found none")
-    root = _root(dataset)
-    with _writing(root):
-        return [thuman2.make(root, people, size, seed)]
+@dataclass(frozen=True)
+class Scan:
+    """A person as one mesh in a scan's frame, with the fit that maps the body [n, 3] to it; radians."""
+
+    mesh: TexturedMesh
+    body: np.ndarray
+    yaw: float
+    scale: float
+    translation: np.ndarray
 
 
-_MAKERS: dict[type[DataSet], Callable[..., list[Path]]] = {
-    HuMMan: _humman,
-    THuman2: _thuman2,
-    ZJUMoCap: _zju_mocap,
-}
+@lru_cache(maxsize=4)
+def scan_of(name: str, seed: int) -> Scan:
+    """Person number ``int(name)``, turned by a random yaw, in units that are not metres."""
+    person = people.generate(seed, int(name))
+    rng = subject_rng(seed, name)
+    yaw = float(rng.uniform(-np.pi, np.pi))
+    scale, translation = float(rng.uniform(0.5, 0.9)), rng.uniform(-0.3, 0.3, 3)
+    turn = Rotation.from_euler("y", yaw).as_matrix().T
+
+    def place(vertices: np.ndarray) -> np.ndarray:
+        return (vertices.astype(np.float64) @ turn) * scale + translation
+
+    mesh = join(list(person.parts))
+    moved = replace(mesh, vertices=place(mesh.vertices).astype(np.float32))
+    return Scan(moved, place(person.body_vertices), yaw, scale, translation)
+
+
+def make_scans(source: Path, people_of: Mapping[str, int], size: int, seed: int) -> Path:
+    """What :func:`make_miniature` writes; returns ``source``."""
+    listed = names(people_of)
+    for name in (name for phase in listed.values() for name in phase):
+        scan = scan_of(name, seed)
+        _write_obj(source / name, name, scan.mesh, 2 * size)
+        _write_fit(fit_folder(source) / name, scan, subject_rng(seed + 1, name))
+    for phase, phase_names in listed.items():
+        (source / f"split_{phase}.txt").write_text("".join(f"{name}\n" for name in phase_names))
+    return source
+
+
+def _write_obj(folder: Path, name: str, mesh: TexturedMesh, texture_size: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["mtllib material0.mtl", "usemtl material0"]
+    lines += [*_obj_lines("v", mesh.vertices), *_obj_lines("vt", mesh.uv)]
+    lines += ["f " + " ".join(f"{i}/{i}" for i in face) for face in mesh.faces + 1]
+    (folder / f"{name}.obj").write_text("\n".join(lines) + "\n")
+    (folder / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
+    texture = Image.fromarray(mesh.texture)
+    texture.thumbnail((texture_size, texture_size), Image.Resampling.BOX)
+    texture.save(folder / "material0.jpeg", quality=95)
+
+
+def _obj_lines(keyword: str, rows: np.ndarray) -> list[str]:
+    return [" ".join((keyword, *(f"{number:.6f}" for number in row))) for row in rows]
+
+
+def _write_fit(folder: Path, scan: Scan, rng: np.random.Generator) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    fit = {name: rng.normal(0, 0.1, (1, n)).astype(np.float32) for name, n in POSE_SIZES.items()}
+    fit["global_orient"] = np.array([[0, scan.yaw, 0]], np.float32)
+    fit["scale"] = np.float32(scan.scale)
+    fit["translation"] = scan.translation.astype(np.float32).view(TrackedArray)
+    with (folder / "smplx_param.pkl").open("wb") as stream:
+        pickle.dump(fit, stream)
+    (folder / "mesh_smplx.obj").write_text("\n".join(_obj_lines("v", scan.body)) + "\n")

@@ -39,7 +39,6 @@ class Lights:
     multiplies texture values as stored.
 
     Attributes:
-        count: number of lights.
         ambient: share of the light that comes from everywhere, 0 to 1.
         softness: s of the formula, 0 (Lambertian) to 1.
         exposure: mean brightness over all directions of the normal, about.
@@ -130,8 +129,6 @@ class Studio:
     alpha of its texture is below the part's ``alpha_cutoff``.
 
     Args:
-        person: whom to photograph.
-        lights: the lights.
         samples: ``samples`` x ``samples`` rays per pixel, 1 to 16.
 
     Raises:
@@ -164,11 +161,8 @@ class Studio:
         TriangleMesh(self._scene, self._vertices, self._faces)
 
     def shoot(self, cameras: Cameras) -> Photographs:
-        """Take a photograph with each of ``cameras`` (one leading dimension).
-
-        Raises:
-            InputError: a camera is not finite or has no focal length.
-        """
+        """Take a photograph with each of ``cameras`` (one leading dimension). InputError: a camera is not
+        finite or has no focal length."""
         intrinsics = cameras.intrinsics.double().numpy()
         extrinsics = cameras.extrinsics.double().numpy()
         size = (len(intrinsics), cameras.height, cameras.width)
@@ -263,7 +257,6 @@ class Studio:
         return solid
 
     def _textured(self, part: int, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Texture values [n, c] at hits on one part."""
         uv = np.einsum("nk,nkc->nc", weights, self._uv[self._faces[face]])
         return sample_texture(self._textures[part], uv)
 

@@ -166,7 +166,6 @@ class Rig:
         """The rig of one subject by ``variation``, and how its cameras deviate from it.
 
         Args:
-            person: the subject, placed.
             yaws: degrees [positions, 5] of all its views (:meth:`yaws`).
             aspect: width of the images over their height.
             rng: random numbers of the rig alone; all are drawn whatever varies.

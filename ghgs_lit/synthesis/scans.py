@@ -24,11 +24,7 @@ class ScanSource:
     folder: Path
 
     def names(self) -> list[str]:
-        """Ids of all scans, sorted.
-
-        Raises:
-            InputError: the folder is missing or holds no scans.
-        """
+        """Ids of all scans, sorted. InputError: the folder is missing or holds no scans."""
         if not self.folder.is_dir():
             raise InputError(f"{self.folder}: expected a folder of scans; found no such folder")
         names = sorted(p.name for p in self.folder.iterdir() if p.is_dir() and _mesh_file(p) is not None)
@@ -37,11 +33,8 @@ class ScanSource:
         return names
 
     def load(self, name: str) -> Person:
-        """One scan as stored, with its ``body_vertices.npy`` if it has one.
-
-        Raises:
-            InputError: the mesh is missing or unreadable, or a part has no texture.
-        """
+        """One scan as stored, with its ``body_vertices.npy`` if it has one. InputError: the mesh is missing
+        or unreadable, or a part has no texture."""
         folder = self.folder / name
         path = _mesh_file(folder) if folder.is_dir() else None
         if path is None:

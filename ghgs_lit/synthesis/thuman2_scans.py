@@ -51,11 +51,8 @@ class SmplxFit:
 
 
 def read_fit(path: Path) -> SmplxFit:
-    """The fit at ``path``; its pickle is read without running it.
-
-    Raises:
-        InputError: it is missing, no plain pickle, lacks a key, or a value is of another shape or not finite.
-    """
+    """The fit at ``path``; its pickle is read without running it. InputError: it is missing, no plain pickle,
+    lacks a key, or a value is of another shape or not finite."""
     content = load_pickle(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a dictionary; found {type(content).__name__}")
@@ -75,15 +72,9 @@ def read_fit(path: Path) -> SmplxFit:
 
 
 def find_fits(source: Path, fits: str | None) -> Path | None:
-    """The folder of the fits, None if there is none; each scan's own folder is looked into as well.
-
-    Args:
-        source: folder of the scans.
-        fits: the configured folder (None: one of :data:`FIT_FOLDERS` in or beside ``source``).
-
-    Raises:
-        InputError: the configured folder does not exist.
-    """
+    """The folder of the fits, None if there is none; each scan's own folder is looked into as well. ``fits``:
+    the configured folder (None: one of :data:`FIT_FOLDERS` in or beside ``source``). InputError: the
+    configured folder does not exist."""
     if fits is not None:
         folder = Path(fits).expanduser()
         if not folder.is_dir():
@@ -98,7 +89,6 @@ class THuman2Source:
     """Raw scans with their bodies.
 
     Attributes:
-        folder: folder of the scans.
         fits: folder of the fits (None: each scan's own folder).
         body_model: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
             ``smplx_param.pkl`` (None: read ``mesh_smplx.obj``, a part of the fits).
@@ -112,11 +102,8 @@ class THuman2Source:
         return ScanSource(self.folder).names()
 
     def fit(self, name: str) -> Path | None:
-        """The folder of one scan's fit; None if there are no fits at all.
-
-        Raises:
-            InputError: there are fits, but not of this scan.
-        """
+        """The folder of one scan's fit; None if there are no fits at all. InputError: there are fits, but not
+        of this scan."""
         if (self.folder / name / "smplx_param.pkl").exists():
             return self.folder / name
         if self.fits is None:
@@ -126,11 +113,8 @@ class THuman2Source:
         return self.fits / name
 
     def body(self, name: str) -> np.ndarray | None:
-        """Body vertices [n, 3] float64 in the scan's frame; None without fits.
-
-        Raises:
-            InputError: the fit is bad, or its vertices are neither stored nor computable.
-        """
+        """Body vertices [n, 3] float64 in the scan's frame; None without fits. InputError: the fit is bad, or
+        its vertices are neither stored nor computable."""
         folder = self.fit(name)
         if folder is None:
             return None
@@ -146,11 +130,8 @@ class THuman2Source:
         return _obj_vertices(mesh)
 
     def load(self, name: str) -> Person:
-        """One scan with its body, both as stored.
-
-        Raises:
-            InputError: the scan or its fit is bad, or the body does not lie in the scan.
-        """
+        """One scan with its body, both as stored. InputError: the scan or its fit is bad, or the body does
+        not lie in the scan."""
         scan, body = ScanSource(self.folder).load(name), self.body(name)
         if body is None:
             return scan
@@ -158,11 +139,7 @@ class THuman2Source:
         return Person(name, scan.parts, body.astype(np.float32))
 
     def check(self, name: str) -> None:
-        """Read everything that rendering a scan reads.
-
-        Raises:
-            InputError: a part of it is bad.
-        """
+        """Read everything that rendering a scan reads. InputError: a part of it is bad."""
         self.load(name)
         self.facing(name)
 
@@ -216,15 +193,8 @@ def _smplx_model(folder: Path) -> Any:
 
 
 def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Vertices [10475, 3] of the male SMPL-X model, before scale and translation.
-
-    Args:
-        folder: the model's files.
-        parameters: by name, [1, n].
-
-    Raises:
-        InputError: the package or the model files are missing.
-    """
+    """Vertices [10475, 3] of the male SMPL-X model, before scale and translation. ``parameters``: by name,
+    [1, n]. InputError: the package or the model files are missing."""
     import torch
 
     model = _smplx_model(folder)

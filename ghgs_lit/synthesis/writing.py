@@ -14,10 +14,7 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int =
     The mask has three equal channels: the authors' loader takes channel 0 of an image that has several.
 
     Args:
-        phase: folder of the phase.
         folder: name of the subject's position, ``<id>_<position>``.
-        number: number of the view at that position.
-        view: what to write.
         quality: of the JPEG, 1 to 100.
     """
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}

@@ -32,7 +32,7 @@ class BudgetedModule(L.LightningModule):
             it, beside the nodes of a model that was built of them. None: these alone.
 
     Attributes:
-        clock: marks where the parts of a step end; it runs where the callback ``StepTime`` starts it.
+        clock: marks where the parts of a step end; it runs where the callback ``Costs`` starts it.
         used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
     """
 

@@ -105,21 +105,27 @@ class RunProgress(ProgressBar):
             self._bar = None
 
 
-def _logs_now(trainer: L.Trainer) -> bool:
-    return trainer.global_step % trainer.log_every_n_steps == 0
+def resident_mb() -> float:
+    """Memory of this process in MiB: now on Linux, the maximum so far on other systems."""
+    pages = Path("/proc/self/statm")
+    if pages.exists():
+        return int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-class StepTimeOptions(Options):
-    """``time_ms/*``: milliseconds of each part of a step."""
+class CostsOptions(Options):
+    """``time_ms/*``: milliseconds of each part of a step; ``memory_mb/*``: of the process and of the GPU."""
 
-    def build(self) -> "StepTime":
-        return StepTime()
+    def build(self) -> "Costs":
+        return Costs()
 
 
-class StepTime(Callback):
-    """Logs the milliseconds of a step and of each of its parts, as means since the last log.
+class Costs(Callback):
+    """Logs milliseconds of a step and of its parts, and memory in MiB, each since the last log.
 
-    ``time_ms/01_data`` is the wait for data, ``time_ms/step`` the sum of all parts. Validation and the
+    Times are means, memory on CUDA is the peak of all tensors. ``time_ms/01_data`` is the wait for data,
+    ``time_ms/step`` the sum of all parts. Validation and the
     writing of checkpoints and logs are not counted; parts that a model does not have are left out.
     """
 
@@ -154,40 +160,17 @@ class StepTime(Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         pl_module.clock.end_step()
-        if _logs_now(trainer):
+        if trainer.global_step % trainer.log_every_n_steps == 0:
             names = {part: f"{number:02d}_{part}" for number, part in enumerate(PARTS, start=1)}
             means = pl_module.clock.means()
             pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
+            pl_module.log("memory_mb/process", resident_mb())
+            if pl_module.device.type == "cuda":
+                peak = torch.cuda.max_memory_allocated(pl_module.device)
+                pl_module.log("memory_mb/cuda_peak", peak / 2**20)
+                torch.cuda.reset_peak_memory_stats(pl_module.device)
 
     def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         pl_module.clock.stop()
         while self._hooks:
             self._hooks.pop().remove()
-
-
-def resident_mb() -> float:
-    """Memory of this process in MiB: now on Linux, the maximum so far on other systems."""
-    pages = Path("/proc/self/statm")
-    if pages.exists():
-        return int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-
-
-class MemoryOptions(Options):
-    """``memory_mb/*``: of the process and of the GPU."""
-
-    def build(self) -> "Memory":
-        return Memory()
-
-
-class Memory(Callback):
-    """Logs the memory of the process and, on CUDA, the peak of all tensors since the last log, in MiB."""
-
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        if not _logs_now(trainer):
-            return
-        pl_module.log("memory_mb/process", resident_mb())
-        if pl_module.device.type == "cuda":
-            pl_module.log("memory_mb/cuda_peak", torch.cuda.max_memory_allocated(pl_module.device) / 2**20)
-            torch.cuda.reset_peak_memory_stats(pl_module.device)

@@ -11,7 +11,7 @@ import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from ghgs_lit.config.options import Index, Options, Positive, Text
 from ghgs_lit.errors import require
@@ -83,16 +83,7 @@ class CheckpointOptions(Options):
     every_n_train_steps: Index | None = None
     """Steps between two checkpoints."""
     minutes: Positive | None = None
-    """Minutes between two checkpoints, in place of every_n_train_steps."""
-
-    @model_validator(mode="after")
-    def _by_steps_or_time(self) -> "CheckpointOptions":
-        self.require(
-            self.minutes is None or self.every_n_train_steps is None,
-            "minutes",
-            "null where every_n_train_steps is given",
-        )
-        return self
+    """Minutes between two checkpoints, beside every_n_train_steps."""
 
     def build(self) -> "Checkpoints":
         return Checkpoints(self)
@@ -108,9 +99,10 @@ class Checkpoints(ModelCheckpoint):
             auto_insert_metric_name=False,
             enable_version_counter=False,
             save_on_train_epoch_end=False,
-            train_time_interval=None if minutes is None else timedelta(minutes=minutes),
             **arguments,
         )
+        if minutes is not None:  # Lightning's arguments allow steps or time alone, its hook follows both
+            self._train_time_interval = timedelta(minutes=minutes)
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """Use ``<run>/checkpoints`` unless a folder is configured."""

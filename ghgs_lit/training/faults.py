@@ -5,22 +5,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
-import lightning.pytorch as L
 import torch
 from torch import Tensor, nn
 
 from ghgs_lit.model import STAGES
 from ghgs_lit.types import Batch, map_tensors
 
+#: What faults are told apart by; other modules belong to the model.
+_STAGES = (*STAGES, "renderer", "losses")
+
 
 @dataclass(frozen=True)
 class Step:
     """A forward and a backward pass, with all that it depends on beside the weights.
 
-    ``budget`` is that of :class:`~ghgs_lit.training.budgets.TokenBudgets`, ``autocast`` the dtype (None:
-    without), ``scale`` the factor of the loss (``16-mixed``).
+    ``budget`` is that of :func:`~ghgs_lit.training.budgets.drawn_budget`, ``scale`` the factor of the loss.
     """
 
     batch: Batch
@@ -30,13 +31,20 @@ class Step:
     scale: float = 1.0
 
 
+class Steps(Protocol):
+    """What runs steps: a :class:`ghgs_lit.training.GHGSModule`."""
+
+    model: nn.Module
+    renderer: Callable[..., Any]
+    losses: Callable[..., Any]
+
+    def forward_losses(self, step: Step) -> tuple[Any, Tensor, Any]:
+        """The prediction, the loss and its terms."""
+
+
 @dataclass(frozen=True)
 class Fault:
-    """The first value that is not finite, such as "3 of 9 values in the result of encoder (encoder.x)".
-
-    ``place`` is the tensor: a parameter, a field of the batch, or a module and the field of its result;
-    ``sample`` the subject, None where no subject alone is at fault.
-    """
+    """A value that is not finite; ``place`` is its tensor, ``sample`` the subject that is at fault alone."""
 
     values: str
     where: str
@@ -61,39 +69,30 @@ class _Faults(list[Fault]):
 
 
 def _stage_of(place: str) -> str:
-    """The stage that a module or parameter of the model belongs to."""
     first = place.split(".")[0]
-    return first if first in (*STAGES, "renderer", "losses") else "model"
+    return first if first in _STAGES else "model"
 
 
 def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
     """The floating-point tensors in ``value``, and what to call them."""
-    if isinstance(value, Tensor):
-        if value.is_floating_point():
-            yield name, value
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        for field in dataclasses.fields(value):
-            yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
-    elif isinstance(value, Mapping):
-        for key in value:
-            yield from _tensors(value[key], f"{name}.{key}")
+    if isinstance(value, Tensor) and value.is_floating_point():
+        yield name, value
     elif isinstance(value, (tuple, list)):
         for item in value:
             yield from _tensors(item, name)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _tensors(item, f"{name}.{key}")
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for field in dataclasses.fields(value):
+            yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
 
 
-def first_fault(module: L.LightningModule, step: Step) -> Fault | None:
-    """Run ``step`` again and look at every value: weights, batch, results of all modules, gradients.
+def first_fault(module: Steps, step: Step) -> Fault | None:
+    """Run ``step`` again and look at weights, batch, results of all modules and gradients, in this order.
 
-    A batch that is at fault is run again subject by subject, to name the one that is at fault alone.
-
-    Args:
-        module: a :class:`~ghgs_lit.training.GHGSModule` with the weights of the step; they and their
-            gradients are not changed.
-        step: what to run.
-
-    Returns:
-        The first fault in the order of computation; None where all values are finite.
+    A batch that is at fault is run again subject by subject, to name the one that is at fault alone. Weights
+    and their gradients are not changed. None: all values are finite.
     """
     fault = _search(module, step)
     if fault is None or fault.where == "weights of":
@@ -106,7 +105,7 @@ def first_fault(module: L.LightningModule, step: Step) -> Fault | None:
     return fault
 
 
-def _search(module: L.LightningModule, step: Step) -> Fault | None:
+def _search(module: Steps, step: Step) -> Fault | None:
     faults, model, device = _Faults(), module.model, step.batch.images.device.type
     for name, value in (*model.named_parameters(), *model.named_buffers()):
         faults.see("weights of", name, value)
@@ -132,7 +131,7 @@ def _search(module: L.LightningModule, step: Step) -> Fault | None:
     return faults[0] if faults else None
 
 
-def _watch(module: L.LightningModule, faults: _Faults, stack: ExitStack) -> None:
+def _watch(module: Steps, faults: _Faults, stack: ExitStack) -> None:
     """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
     model = module.model
     for name, part in model.named_modules():
@@ -143,9 +142,10 @@ def _watch(module: L.LightningModule, faults: _Faults, stack: ExitStack) -> None
     for name, parameter in model.named_parameters():
         if parameter.requires_grad:
             stack.callback(parameter.register_hook(partial(faults.see, "gradient from", name)).remove)
-    stages = [(model, name) for name in STAGES if hasattr(model, name)]
-    for owner, name in [*stages, (module, "renderer"), (module, "losses")]:
-        stage = getattr(owner, name)
+    for name in _STAGES:
+        owner = model if name in STAGES else module
+        if (stage := getattr(owner, name, None)) is None:
+            continue
         if isinstance(stage, nn.Module):
             hook = stage.register_forward_pre_hook(
                 lambda part, inputs, options, name=name: _own_views((inputs, options), name, faults),

@@ -20,13 +20,8 @@ class Guard:
     """Looks at each step of the optimizer once, and runs the step again only where it is not finite.
 
     All processes decide alike. A fault is saved as ``<run>/faults/step_<n>.pt`` (once for each stage), which
-    :mod:`ghgs_lit.training.replay` runs again.
-
-    Args:
-        limit: steps in a row that are skipped before the run stops; 0: it stops at the first.
-
-    Attributes:
-        skipped: steps that were skipped, in all sessions of the run.
+    :mod:`ghgs_lit.training.replay` runs again. ``limit`` steps in a row are skipped before the run stops;
+    ``skipped`` counts those of all sessions of the run.
     """
 
     def __init__(self, limit: int):
@@ -58,15 +53,10 @@ class Guard:
     def refuse(self, module: L.LightningModule, scale: float) -> None:
         """Name and save the fault, and drop the gradients, so that the optimizer changes nothing.
 
-        Args:
-            module: whose step it was.
-            scale: that the loss was multiplied by.
-
         Raises:
             DivergedError: more than ``limit`` steps in a row were not finite.
         """
-        trainer = module.trainer
-        line = self._explain(module, scale)
+        trainer, line = module.trainer, self._explain(module, scale)
         self._steps.clear()
         lines = [line]
         if trainer.world_size > 1:
@@ -87,8 +77,7 @@ class Guard:
         """The first fault of this process, and the file of its step, once for each stage; "" without one."""
         for step, _ in self._steps:
             step = dataclasses.replace(step, scale=scale)
-            fault = first_fault(module, step)
-            if fault is None:
+            if (fault := first_fault(module, step)) is None:
                 continue
             if fault.stage in self._saved:
                 return str(fault)

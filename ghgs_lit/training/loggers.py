@@ -169,12 +169,7 @@ def hyperparameters(
 ) -> dict[str, Value]:
     """What runs are compared by: options of config groups, the seed, and every changed value.
 
-    Keys that no number depends on are left out.
-
-    Args:
-        config: the configuration as plain data.
-        choices: option of each config group.
-        overrides: ``key=value`` of the command line.
+    Keys that no number depends on are left out. ``choices`` has the option of each config group.
     """
     found: dict[str, Value] = {
         group: name for group, name in choices.items() if name is not None and _matters(group)

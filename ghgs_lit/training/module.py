@@ -1,6 +1,6 @@
 """The LightningModule of training: steps and logging calls around the model."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,12 @@ from ghgs_lit.metrics import depth_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.budgets import TokenBudgets, token_budget
+from ghgs_lit.training.budgets import drawn_budget, token_budget
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
-from ghgs_lit.weights.checkpoint import read_checkpoint
+from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -49,7 +49,7 @@ class GHGSModule(BudgetedModule):
         losses: Losses,
         optimization: Optimization,
         config: Mapping[str, Any] | None = None,
-        token_budgets: TokenBudgets | None = None,
+        token_budgets: Sequence[str | int] | None = None,
     ):
         super().__init__(model, optimization, config)
         self.renderer = renderer
@@ -72,13 +72,16 @@ class GHGSModule(BudgetedModule):
         Raises:
             InputError: the checkpoint cannot be used, or a part is neither configured nor given.
         """
-        config = read_checkpoint(checkpoint_path)["config"]
+        checkpoint = read_checkpoint(checkpoint_path)
+        config = checkpoint["config"]
         for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():
             if name in parts:
                 continue
             place = f"{checkpoint_path}: config.{group}"
             require(group in config, place, f"options of it, or {name}=...", "nothing")
             parts[name] = build(config[group], group)
+            if state := model_state(checkpoint, f"{name}."):  # a loss with weights of its own
+                load_strictly(parts[name], state, checkpoint_path)
         model = GHGS.from_checkpoint(checkpoint_path, map_location or "cpu")
         return cls(model.train(), config=config, **parts)
 
@@ -89,12 +92,6 @@ class GHGSModule(BudgetedModule):
         rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
         self.clock.mark("render")
         return prediction, rendering
-
-    def draw_budget(self, batch_idx: int) -> str | int | None:
-        """The token budget of this step: the same in all processes, so that none waits for a larger one."""
-        part = batch_idx % self.trainer.accumulate_grad_batches
-        numbers = [self.config.get("seed", 0), self.global_step, part]
-        return None if self.token_budgets is None else self.token_budgets.draw(numbers)
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
         """The prediction of a step, its loss and the terms of it; random numbers are those of its seed."""
@@ -108,7 +105,12 @@ class GHGSModule(BudgetedModule):
     def _step(self, batch: Batch, batch_idx: int) -> Step:
         device = self.device.type
         autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
-        return Step(batch, self.step_seed(batch_idx), self.draw_budget(batch_idx), autocast)
+        budget = None
+        if self.token_budgets is not None:  # the same in all processes, so that none waits for a larger one
+            part = batch_idx % self.trainer.accumulate_grad_batches
+            numbers = [self.config.get("seed", 0), self.global_step, part]
+            budget = drawn_budget(self.token_budgets, numbers)
+        return Step(batch, self.step_seed(batch_idx), budget, autocast)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         step = self._step(batch, batch_idx)

@@ -47,10 +47,8 @@ class Optimization(Options):
     def optimizer(self, model: nn.Module, fused: bool = True) -> torch.optim.AdamW:
         """The optimizer of the parameters of ``model`` that are trained.
 
-        Args:
-            model: its parameters.
-            fused: PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
-                where gradients cannot be clipped any more.
+        ``fused`` is PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
+        where gradients cannot be clipped any more.
 
         Raises:
             InputError: ``freeze_until`` names no parameter.

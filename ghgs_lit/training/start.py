@@ -6,8 +6,10 @@ from typing import Any
 
 from torch import nn
 
+from ghgs_lit.config import build
 from ghgs_lit.config.keys import MAY_CHANGE_ON_RESUME, flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
 from ghgs_lit.training.checkpoints import check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
 from ghgs_lit.weights.switches import differences as differing_switches
@@ -20,20 +22,15 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
     """
     if config["resume"] is None or config["init_from"] is None:
         return
-    own = Path(config["resume"]).resolve().is_relative_to(directory.resolve())
+    own = resolved(config["resume"]).is_relative_to(directory.resolve())
     require(own, "init_from", "null where resume is given", config["init_from"])
 
 
 def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """Check that a run can resume from a checkpoint.
-
-    Args:
-        path: the checkpoint.
-        model: the model of this run; it gets the weights of the checkpoint.
-        config: the configuration of this run.
+    """Check that a run can resume from a checkpoint, whose weights ``model`` gets.
 
     Returns:
-        The step of the checkpoint, and one line for each setting that this run changes.
+        The step of the checkpoint, and one line for each setting that ``config`` changes.
 
     Raises:
         InputError: not a checkpoint of a training run, of another model (names the tensor), or changed
@@ -48,17 +45,25 @@ def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) 
             )
     check_training_state(path, checkpoint)
     load_strictly(model, model_state(checkpoint), path)
-    _check_optimizer(path, checkpoint, config)
+    _check_optimizer(path, checkpoint, model, config)
     return checkpoint["global_step"], differences(checkpoint["config"], config)
 
 
-def _check_optimizer(path: str | Path, checkpoint: Mapping[str, Any], config: Mapping[str, Any]) -> None:
-    """Refuse to go on with Muon from the averages of AdamW, and the other way round."""
+def _check_optimizer(
+    path: str | Path, checkpoint: Mapping[str, Any], model: nn.Module, config: Mapping[str, Any]
+) -> None:
+    """Refuse to go on with Muon from the averages of AdamW, the other way round, or from other groups."""
     states = checkpoint["optimizer_states"]
     by_muon = any("orthogonal" in group for state in states for group in state["param_groups"])
     key = "optimizer.matrix_scale"
     scale = lookup(config, key)
     require(by_muon == (scale is not None), key, f"{'a number' if by_muon else 'null'}, as in {path}", scale)
+    if "kind" in (node := config.get("optimizer") or {}):
+        own = [len(group["params"]) for group in build(node, "optimizer").optimizer(model).param_groups]
+        for state in states:
+            found = [len(group.get("params", ())) for group in state["param_groups"]]
+            place = f"{path}: optimizer_states.param_groups"
+            require(found == own, place, f"as many groups and parameters as this run has, {own}", found)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -77,8 +82,6 @@ def initialize(
     """Load the weights at ``path`` that fit into ``model``.
 
     Args:
-        model: gets the weights.
-        path: a checkpoint of this project.
         strict: every tensor must fit.
         random_frozen: parameters that do not learn may stay as initialised.
 
@@ -141,13 +144,7 @@ def switched(config: Mapping[str, Any]) -> list[str]:
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:
-    """A text of at most 22 lines: the number of loaded tensors and the lines of the others.
-
-    Args:
-        lines: what :func:`initialize` returned.
-        path: where the weights are from.
-        written: file that gets all lines.
-    """
+    """At most 22 of the ``lines`` of :func:`initialize`, those of loaded tensors counted; a file gets all."""
     written.write_text("\n".join(lines) + "\n")
     others = [line for line in lines if not line.startswith("loaded")]
     loaded = len(lines) - len(others)

@@ -45,10 +45,7 @@ class TrainerOptions(Options):
     """true: only deterministic operations, where PyTorch has them."""
 
     def build(self, **arguments: Any) -> L.Trainer:
-        """The Trainer.
-
-        Args:
-            arguments: of the Trainer, beside the options.
+        """The Trainer, with further ``arguments`` of it.
 
         Raises:
             InputError: the Trainer refuses its options, or the strategy divides parameters among processes.

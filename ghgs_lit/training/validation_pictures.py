@@ -13,13 +13,11 @@ from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.recalibration.inspection import attention_of
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import save_png, sheet
 
-#: Maximum number of points of each cloud.
-CLOUD_POINTS = 6000
 #: How TensorBoard shows clouds: points of two centimetres through a perspective camera.
 CLOUD_VIEW = {
     "camera": {"cls": "PerspectiveCamera", "fov": 40},
@@ -27,15 +25,40 @@ CLOUD_VIEW = {
 }
 
 
-class _FirstSubjects(Callback):
-    """Calls :meth:`show` for the first ``subjects`` subjects of each validation, in one process."""
+class PicturesOptions(Options):
+    """Pictures of the first subjects of each validation; of the first one also attention and point clouds."""
 
-    def __init__(self, subjects: int):
-        self.subjects = subjects
+    group = "callbacks.pictures"
+    subjects: Index = 2
+    """Number of subjects; 0: none."""
+    token: tuple[Index, Index, Index] | None = None
+    """Whose attention is drawn: view, row and column on the grid of tokens of padded photographs; null: the
+    middle of the subject in its first view."""
+
+    def build(self) -> "Pictures":
+        return Pictures(self)
+
+
+class Pictures(Callback):
+    """``sheet/<subject>``, ``attention/<subject>`` and, in TensorBoard's mesh tab, ``<subject>/points``.
+
+    A sheet has inputs, depths, targets, renders and errors. Attention is that of one token of the
+    recalibration. Clouds are the predicted points and the body's vertices.
+    """
+
+    def __init__(self, options: PicturesOptions):
+        self.options = options
         self._left = 0
+        self._hook, self._seen = None, None
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._left = 0 if trainer.sanity_checking else self.subjects
+        self._left = 0 if trainer.sanity_checking else self.options.subjects
+        stage = getattr(pl_module.model, "recalibration", None)
+        if self._left and isinstance(stage, Recalibration):
+            self._hook = stage.register_forward_pre_hook(self._see)
+
+    def _see(self, stage: Recalibration, inputs: tuple) -> None:
+        self._seen = (stage, *inputs)
 
     @rank_zero_only
     def on_validation_batch_end(
@@ -46,16 +69,36 @@ class _FirstSubjects(Callback):
         batch: Batch,
         *args: Any,
     ) -> None:
+        prediction, image = outputs["prediction"], outputs["rendering"].image
         for element in range(min(self._left, len(batch.images))):
-            name = batch.subjects[element] if batch.subjects else f"subject_{self.subjects - self._left}"
-            self.show(trainer, outputs, batch, element, name)
+            number = self.options.subjects - self._left
+            name = batch.subjects[element] if batch.subjects else f"subject_{number}"
+            picture = sheet(batch, image, element, prediction.depth, prediction.depth_valid)
+            _publish(trainer, f"sheet/{name}", picture, name)
+            if number == 0:
+                self._show_attention(trainer, batch, element, name)
+                _show_clouds(trainer, batch, prediction, element, name)
             self._left -= 1
+        self._forget()
 
-    def show(
-        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
-    ) -> None:
-        """Draw subject ``element`` of ``batch``; ``outputs`` are those of the validation step."""
-        raise NotImplementedError
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._forget()
+
+    def _forget(self) -> None:
+        if self._hook is not None:
+            self._hook.remove()
+        self._hook, self._seen = None, None
+
+    def _show_attention(self, trainer: L.Trainer, batch: Batch, element: int, name: str) -> None:
+        if self._seen is None:
+            return
+        stage, tokens, points = self._seen
+        token = chosen_token(tokens, points, element, self.options.token)
+        attention = None if token is None else attention_of(stage, tokens, points, token)
+        if attention is not None:
+            padding = pad_to_patches(batch.masks, tokens.patch_size)
+            picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
+            _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
 
 
 def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> None:
@@ -69,114 +112,14 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
             logger.log_image(tag, [picture])
 
 
-class PicturesOptions(Options):
-    """Inputs, depths, targets, renders and errors side by side."""
-
-    group = "callbacks.pictures"
-    subjects: Index = 2
-    """Number of subjects, the first of each validation; 0: none."""
-
-    def build(self) -> "Pictures":
-        return Pictures(self.subjects)
-
-
-class Pictures(_FirstSubjects):
-    """Inputs, depths, targets, renders and errors side by side: ``sheet/<subject>``."""
-
-    def show(
-        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
-    ) -> None:
-        prediction = outputs["prediction"]
-        picture = sheet(batch, outputs["rendering"].image, element, prediction.depth, prediction.depth_valid)
-        _publish(trainer, f"sheet/{name}", picture, name)
-
-
-class AttentionOptions(Options):
-    """What one token attends to in the recalibration."""
-
-    group = "callbacks.attention"
-    subjects: Index = 1
-    """Number of subjects; 0: none."""
-    token: tuple[Index, Index, Index] | None = None
-    """View, row and column on the grid of tokens; null: the middle of the subject in its first view."""
-
-    def build(self) -> "Attention":
-        return Attention(self)
-
-
-class Attention(_FirstSubjects):
-    """What one token attends to, drawn on the views: ``attention/<subject>``.
-
-    The token's place is on the grid of padded photographs, where the model pads.
-    """
-
-    def __init__(self, options: AttentionOptions):
-        super().__init__(options.subjects)
-        self.token = options.token
-        self._hook, self._seen = None, None
-
-    def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        super().on_validation_epoch_start(trainer, pl_module)
-        stage = getattr(pl_module.model, "recalibration", None)
-        if self._left and isinstance(stage, Recalibration):
-            self._hook = stage.register_forward_pre_hook(self._see)
-
-    def on_validation_batch_start(self, *args: Any) -> None:
-        self._seen = None
-
-    def _see(self, stage: Recalibration, inputs: tuple) -> None:
-        self._seen = (stage, *inputs)
-
-    def show(
-        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
-    ) -> None:
-        if self._seen is None:
-            return
-        stage, tokens, points = self._seen
-        token = chosen_token(tokens, points, element, self.token)
-        attention = None if token is None else attention_of(stage, tokens, points, token)
-        if attention is not None:
-            padding = pad_to_patches(batch.masks, tokens.patch_size)
-            picture = attention_sheet(padding.pad_batch(batch) if padding else batch, tokens, attention)
-            _publish(trainer, f"attention/{name}", picture, f"{name}_attention")
-        if self._left == 1:
-            self._forget()
-
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._forget()
-
-    def _forget(self) -> None:
-        if self._hook is not None:
-            self._hook.remove()
-        self._hook, self._seen = None, None
-
-
-class PointCloudOptions(Options):
-    """Predicted points and bodies in TensorBoard."""
-
-    group = "callbacks.point_clouds"
-    subjects: Index = 1
-    """Number of subjects; 0: none."""
-
-    def build(self) -> "PointClouds":
-        return PointClouds(self.subjects)
-
-
-class PointClouds(_FirstSubjects):
-    """Predicted points and the body's vertices in TensorBoard's mesh tab: ``<subject>/points`` and so on."""
-
-    def show(
-        self, trainer: L.Trainer, outputs: dict[str, Any], batch: Batch, element: int, name: str
-    ) -> None:
-        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-        if not loggers:
-            return
-        for kind, (positions, colors) in clouds(batch, outputs["prediction"], element, CLOUD_POINTS).items():
-            for logger in loggers:
-                logger.experiment.add_mesh(
-                    f"{name}/{kind}",
-                    positions[None],
-                    (255 * colors[None]).byte(),
-                    config_dict=CLOUD_VIEW,
-                    global_step=trainer.global_step,
-                )
+def _show_clouds(trainer: L.Trainer, batch: Batch, prediction: Prediction, element: int, name: str) -> None:
+    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    for kind, (positions, colors) in clouds(batch, prediction, element).items() if loggers else ():
+        for logger in loggers:
+            logger.experiment.add_mesh(
+                f"{name}/{kind}",
+                positions[None],
+                (255 * colors[None]).byte(),
+                config_dict=CLOUD_VIEW,
+                global_step=trainer.global_step,
+            )

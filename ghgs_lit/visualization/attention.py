@@ -17,25 +17,14 @@ _QUERY = (255, 60, 220)
 def chosen_token(
     tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
 ) -> int | None:
-    """Index of a packed token that has a point.
-
-    Args:
-        tokens: packed tokens of a batch.
-        points: their points.
-        element: index of the subject in the batch.
-        at: ``(view, row, column)`` on the grid of tokens (None: the middle of the subject in its first view).
-
-    Returns:
-        The token of that view that is nearest to the place; None where no token of the view has a point.
-
-    Raises:
-        InputError: ``at`` is outside the grid.
-    """
+    """Index of a packed token that has a point. ``at``: ``(view, row, column)`` on the grid of tokens (None:
+    the middle of the subject in its first view). Returns: The token of that view that is nearest to the
+    place; None where no token of the view has a point. InputError: ``at`` is outside the grid."""
     views, height, width = tokens.grid[1:]
     if at is not None:
         expected = f"view, row, column below {(views, height, width)}"
         inside = all(0 <= n < end for n, end in zip(at, (views, height, width), strict=True))
-        require(inside, "callbacks.attention.token", expected, list(at))
+        require(inside, "callbacks.pictures.token", expected, list(at))
     view = 0 if at is None else at[0]
     candidates = ((tokens.image == element * views + view) & points.tokens_valid).nonzero()[:, 0]
     if not len(candidates):
@@ -54,8 +43,6 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 
     Args:
         batch: gives the photographs, padded to whole patches.
-        tokens: packed tokens of the batch.
-        attention: the query, its neighbours and their weights.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views

@@ -12,19 +12,10 @@ Cloud = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]
 
 
 def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000) -> dict[str, Cloud]:
-    """Point clouds of one subject.
-
-    Args:
-        batch: colours, masks and bodies.
-        prediction: the predicted points.
-        element: index of the subject in the batch.
-        limit: maximum number of points and of vertices.
-
-    Returns:
-        Positions in metres and colours in [0, 1] by name: ``points``, unprojected pixels in their colours;
-        ``body``, vertices of the body where the data has them; ``points_and_body``, both, whose distance the
-        Chamfer term measures. Clouds without points are left out.
-    """
+    """Point clouds of one subject. ``limit``: maximum number of points and of vertices. Returns: Positions in
+    metres and colours in [0, 1] by name: ``points``, unprojected pixels in their colours; ``body``, vertices
+    of the body where the data has them; ``points_and_body``, both, whose distance the Chamfer term measures.
+    Clouds without points are left out."""
     valid = prediction.points.valid[element] & batch.masks[element]
     found = {
         "points": (prediction.points.pixels[element][valid], batch.images[element].movedim(1, -1)[valid])

@@ -37,7 +37,6 @@ def colorize(values: Tensor, low: float, high: float, name: str, valid: Tensor |
     Args:
         values: what is shown [h, w].
         low, high: values of the first and the last colour.
-        name: the palette.
         valid: pixels [h, w] that are not black (None: all).
     """
     values = values.detach().float().cpu()
@@ -133,7 +132,6 @@ def sheet(
         batch: inputs, and targets where there are renders of them.
         image: renders of the targets [B, T, 3, h, w], or of the inputs where there are none, which then stand
             below the inputs with their errors (None: no renders).
-        element: index of the subject in the batch.
         depth: predicted depths [B, V, H, W], metres (None: no row of them).
         depth_valid: where they are defined [B, V, H, W] (None: in the masks).
     """

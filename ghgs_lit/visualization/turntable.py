@@ -71,8 +71,6 @@ def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Ca
     of their box, look straight at it, and have a wider lens where the first camera's would cut them off.
 
     Args:
-        cameras: the given cameras [V].
-        frames: the number of cameras.
         points: of the subject [n, 3], n may be 0; None: they turn about where the optical axes meet.
     """
     center = look_at_point(cameras) if points is None else center_of(points, cameras)

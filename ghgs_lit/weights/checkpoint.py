@@ -136,12 +136,12 @@ def describe(content: Any) -> str:
     return ", ".join(names[: 4 if more else 5]) + more if names else "an empty mapping"
 
 
-def model_state(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
+def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> dict[str, Tensor]:
     """The tensors of the model alone; a LightningModule's checkpoint holds those of losses too."""
     return {
-        key.removeprefix(STATE_PREFIX): value
+        key.removeprefix(prefix): value
         for key, value in checkpoint["state_dict"].items()
-        if key.startswith(STATE_PREFIX)
+        if key.startswith(prefix)
     }
 
 

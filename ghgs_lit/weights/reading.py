@@ -10,13 +10,13 @@ import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
-
-import torch
-from safetensors import SafetensorError, safe_open
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from ghgs_lit.errors import InputError
+
+if TYPE_CHECKING:  # a missing file is refused before PyTorch is imported
+    import torch
+    from torch import Tensor
 
 _WEB_PAGE = "a web page; the address asked for a login or redirected"
 #: Results of failed downloads: the first bytes, and what they mean.
@@ -53,7 +53,7 @@ def open_file(path: str | Path, map_location: Any = "cpu") -> Any:
         InputError: it has another format, is truncated, or holds code.
     """
     path = file_of(path)
-    start = _first_bytes(path)
+    start = require_weights(path)
     if start.startswith(ZIP):
         if not zipfile.is_zipfile(path):
             raise _unfit(path, "the beginning of a PyTorch file whose end is missing (truncated)")
@@ -69,7 +69,9 @@ def _unfit(path: Path, found: str) -> InputError:
     return InputError(f"{path}: expected weights as safetensors or a PyTorch file; found {found}")
 
 
-def _first_bytes(path: Path) -> bytes:
+def require_weights(path: str | Path) -> bytes:
+    """The first bytes of a file that may hold weights; raises as :func:`open_file` does."""
+    path = file_of(path)
     if path.is_dir():
         raise _unfit(path, "a directory")
     if not path.is_file():
@@ -85,6 +87,8 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def _open_torch(path: Path, map_location: Any, mmap: bool) -> Any:
+    import torch
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about foreign pickles, which are refused below
@@ -101,7 +105,9 @@ def _open_torch(path: Path, map_location: Any, mmap: bool) -> Any:
         raise _unfit(path, found) from error
 
 
-def _open_safetensors(path: Path, map_location: Any) -> dict[str, Tensor]:
+def _open_safetensors(path: Path, map_location: Any) -> "dict[str, Tensor]":
+    from safetensors import SafetensorError, safe_open
+
     try:
         with safe_open(path, "pt", device=str(map_location)) as file:
             return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -114,8 +120,9 @@ def _open_safetensors(path: Path, map_location: Any) -> dict[str, Tensor]:
 
 
 def cast(
-    open_tensors: Callable[[], Mapping[str, Tensor]], dtype_of: Callable[[str, torch.dtype], torch.dtype]
-) -> dict[str, Tensor]:
+    open_tensors: "Callable[[], Mapping[str, Tensor]]",
+    dtype_of: "Callable[[str, torch.dtype], torch.dtype]",
+) -> "dict[str, Tensor]":
     """The tensors of a mapped file, converted to the precision that ``dtype_of`` chooses.
 
     Tensors that have it already stay mapped. Pages of a mapping count as memory once they were read, so the

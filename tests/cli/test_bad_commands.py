@@ -35,6 +35,12 @@ def files(tmp_path_factory):
     torch.save([1, 2], places["list"])
     torch.save({"weight": torch.zeros(2)}, places["tensors"])
     torch.save({"state_dict": {}, "config": {}, "format_version": 99}, places["newer"])
+    places |= {"loop": folder / "loop", "yaml": folder / "yaml"}
+    places["loop"].symlink_to(folder / "back")
+    (folder / "back").symlink_to(places["loop"])
+    (places["yaml"] / "views").mkdir(parents=True)
+    (places["yaml"] / "views" / "cut.yaml").write_text("name: cut\ntraining_counts: [3\n")
+    (places["yaml"] / "views" / "tagged.yaml").write_text("name: !!python/object/apply:os.getcwd []\n")
     (places["broken"] / "run").mkdir(parents=True)
     (places["broken"] / "run" / "metrics.json").write_text("{")
     return places
@@ -77,16 +83,15 @@ def test_a_bad_command_gets_its_exit_code_and_one_line(
         assert part.format(**names) in text
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT])
 @pytest.mark.parametrize(
-    "command",
+    ("command", "number"),
     [
-        "train",
-        "evaluate data=synthetic",
-        "predict checkpoint={ckpt} data=synthetic",
-        "import out=x.ckpt",
-        "export checkpoint={ckpt} vggt=x.pt",
-        "table runs={empty}",
+        ("train", errno.ENOSPC),
+        ("evaluate data=synthetic", errno.EROFS),
+        ("predict checkpoint={ckpt} data=synthetic", errno.EACCES),
+        ("import out=x.ckpt", errno.EDQUOT),
+        ("export checkpoint={ckpt} vggt=x.pt", errno.ENOSPC),
+        ("table runs={empty}", errno.EROFS),
     ],
 )
 def test_a_disk_that_refuses_a_file_is_one_line_with_its_path(

@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import open_dict
 
 from ghgs_lit.cli import inputs
-from ghgs_lit.cli.main import _for_hydra
+from ghgs_lit.cli.application import _for_hydra
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.keys import lookup
 from ghgs_lit.errors import InputError

@@ -10,8 +10,9 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from ghgs_lit.cli import application
 from ghgs_lit.cli import main as cli
-from ghgs_lit.cli.main import discard_unused
+from ghgs_lit.cli.application import discard_unused
 from ghgs_lit.cli.messages import flags_first
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import compose, conf_dir
@@ -39,7 +40,7 @@ def test_help_shows_an_example_for_every_verb_and_only_built_verbs(monkeypatch, 
     for verb, (_, example) in cli.VERBS.items():
         assert example in out
         assert (conf_dir() / f"{verb}.yaml").is_file()
-        assert callable(importlib.import_module(cli.module_of(verb)).run)
+        assert callable(importlib.import_module(application.module_of(verb)).run)
 
 
 @pytest.mark.parametrize("argv", [(), ("paint",)])
@@ -85,7 +86,7 @@ def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_pat
         def run(cfg):
             raise KeyError("bug")
 
-    monkeypatch.setitem(sys.modules, cli.module_of("train"), Module)
+    monkeypatch.setitem(sys.modules, application.module_of("train"), Module)
     with pytest.raises(KeyError, match="bug"):
         call(monkeypatch, capsys, "train", f"hydra.run.dir={tmp_path}")
 
@@ -93,7 +94,7 @@ def test_an_error_inside_a_verb_keeps_its_traceback(monkeypatch, capsys, tmp_pat
 def test_a_bad_value_is_refused_before_the_verb_is_imported(monkeypatch, capsys, tmp_path):
     """The check must not wait for PyTorch, and nothing may be rendered or downloaded before it."""
     # An import of what is None in sys.modules fails.
-    monkeypatch.setitem(sys.modules, cli.module_of("prepare"), None)
+    monkeypatch.setitem(sys.modules, application.module_of("prepare"), None)
     code, _, err = call(monkeypatch, capsys, "prepare", "data.size=100000", f"hydra.run.dir={tmp_path}")
     assert code == 1
     assert "data.size: expected an integer >= 1 and <= 8192" in err
@@ -181,20 +182,19 @@ def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):
             seen["argv"] = list(sys.argv)
 
     monkeypatch.setattr("sys.argv", ["ghgs", "seed=1"])
-    monkeypatch.setitem(sys.modules, cli.module_of("train"), Module)
-    cli.Verb("train", ("ghgs", "train", "seed=1"))(compose("train"))
+    monkeypatch.setitem(sys.modules, application.module_of("train"), Module)
+    application.Verb("train", ("ghgs", "train", "seed=1"))(compose("train"))
     assert seen["argv"] == ["ghgs", "train", "seed=1"]
 
 
-def test_a_verb_prints_the_path_of_its_configuration_and_on_request_all_of_it(monkeypatch, capsys, tmp_path):
+def test_a_verb_prints_the_path_of_its_configuration(monkeypatch, capsys, tmp_path):
     """A sweep of many runs must not print thousands of lines of configuration; the file has it all."""
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
-    config = {"print_config": False, "optimizer": {"lr": 0.25}}
+    config = {"optimizer": {"lr": 0.25}}
     write_config(config, tmp_path)
     assert capsys.readouterr().out == f"config: {tmp_path / 'config.yaml'} (no overrides)\n"
     assert OmegaConf.load(tmp_path / "config.yaml") == config
-    write_config({**config, "print_config": True}, tmp_path)
-    assert "lr: 0.25" in capsys.readouterr().out
+    write_config(config, tmp_path)  # its own file
 
 
 def test_flags_may_stand_anywhere():
@@ -247,7 +247,7 @@ def test_a_run_with_anything_else_stays(monkeypatch, tmp_path):
     assert (tmp_path / "run" / "notes.txt").is_file()
     file = tmp_path / "old" / "config.yaml"
     file.parent.mkdir()
-    file.write_text("print_config: false")
+    file.write_text("seed: 1")
     os.utime(file, (0, 0))
     discard_unused(file.parent, "table", 1.0)
     assert file.is_file()

@@ -12,6 +12,7 @@ from imageio_ffmpeg import read_frames
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation
 
+from ghgs_lit.cli.predict import moved_line
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.figures import PARTS, Figure
 from tests.helpers.models import config, make_model
@@ -68,12 +69,20 @@ def test_cameras_are_corrected_where_asked(here, checkpoint, capsys):
     )
     assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splat", *run) == 0
     report = json.loads((here / "splat" / "report.json").read_text())
-    moved = report["refine_cameras"]
-    assert len(moved) == 4
+    assert list(report["refine_cameras"]) == report["views"]
+    moved = list(report["refine_cameras"].values())
     assert 0 < max(moved) < 3
     assert f"refine_cameras: moved by {moved[0]:.2f}, {moved[1]:.2f}," in capsys.readouterr().out
     assert report["seconds"]["refine_cameras"] > 0
     assert inside_the_figure(here / "splat" / "gaussians.ply", 1000.0) > 0.95
+
+
+def test_a_camera_that_moved_alone_is_named():
+    """One of four was bumped: which one, and by how much."""
+    line = moved_line({"front": 0.0, "left": 5.234, "back": 0.0, "right": 0.0})
+    assert line == "refine_cameras: moved by 0.00, 5.23, 0.00, 0.00 pixels: left beside the others"
+    assert moved_line({"front": 1.0, "left": 2.0}) == "refine_cameras: moved by 1.00, 2.00 pixels"
+    assert moved_line({"front": 0.0, "left": 0.0}) == "refine_cameras: moved by 0.00, 0.00 pixels"
 
 
 def test_masks_are_refined_where_asked(here, checkpoint, capsys):

@@ -7,8 +7,8 @@ import pkgutil
 
 import pytest
 
-import ghgs_lit
-from ghgs_lit.config import build
+import ghgs_lit.heads
+from ghgs_lit.config import build, registry
 from ghgs_lit.config.options import Options
 from ghgs_lit.config.registry import KINDS, NAMED, class_of, read_node, register
 from ghgs_lit.errors import InputError
@@ -31,10 +31,10 @@ def everything_callable():
                 yield f"{info.name}.{name}"
 
 
-EXTRA = {"data": {"views": {"name": "v3"}, "targets": {"name": "cameras"}}, "logger": {"save_dir": "."}}
+EXTRA = {"data": {"views": {}, "targets": {"name": "cameras"}}, "logger": {"save_dir": "."}}
 
 #: What nodes without kinds must have.
-NAMES = {"views": {"name": "v3"}, "targets": {"name": "release"}}
+NAMES = {"views": {}, "targets": {"name": "release"}}
 
 
 def key_of(group):
@@ -114,6 +114,22 @@ def test_kinds_of_the_users_own(monkeypatch):
         register("bounds", "hull")(Sphere)
     with pytest.raises(InputError, match=r"register: expected one of .*; found 'shape'"):
         register("shape", "sphere")
+
+
+def test_a_file_of_a_room_registers_its_kinds(monkeypatch, tmp_path):
+    """Another depth head is one file beside the others: no list names it."""
+    (tmp_path / "flat.py").write_text(
+        "from ghgs_lit.config import register\n"
+        "from ghgs_lit.config.options import Options\n\n\n"
+        '@register("depth_head", "flat")\n'
+        "class Flat(Options):\n"
+        "    metres: float = 2.0\n"
+    )
+    monkeypatch.setattr("ghgs_lit.config.registry._REGISTERED", {})
+    monkeypatch.setattr("ghgs_lit.heads.__path__", [*ghgs_lit.heads.__path__, str(tmp_path)])
+    registry._import_room.cache_clear()
+    assert read_node({"kind": "flat", "metres": 3}, "depth_head").metres == 3.0
+    assert registry.kinds_of("depth_head") == ["dpt", "flat"]
 
 
 def test_a_node_without_a_kind_names_those_that_there_are():

@@ -20,7 +20,7 @@ from tests.helpers.verbs import ghgs
 TEMPLATE = Path(__file__).parents[2] / "docs" / "template"
 CAMERAS, SIZE = 8, 60
 KEYS = {
-    "views": {"name": "v3", "training_counts": [3], "evaluation_count": 3},
+    "views": {"training_counts": [3], "evaluation_count": 3},
     "targets": {"name": "cameras", "view": 0, "training_views": [0]},
 }
 

@@ -13,7 +13,7 @@ from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
 
 RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "uneven"}
 IMPERFECT = {
-    "exposure": 0.5, "white_balance": 0.2, "mask_offset": 1.5, "mask_ragged": 1.0, "mask_hole": 0.2,
+    "exposure": 0.5, "white_balance": 0.2, "mask_offset": 1.5, "mask_ragged": 1.0,
     "mask_hole_chance": 0.5, "calibration": 2.0,
 }  # fmt: skip
 EVERYTHING = IMPERFECT | {"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
@@ -147,7 +147,7 @@ def differing(a, b) -> set[str]:
         (("white_balance",), {"images"}),
         (("mask_offset",), {"images", "masks", "alpha"}),
         (("mask_ragged",), {"images", "masks", "alpha"}),
-        (("mask_hole", "mask_hole_chance"), {"images", "masks", "alpha"}),
+        (("mask_hole_chance",), {"images", "masks", "alpha"}),
         (("calibration",), {"cameras.intrinsics", "cameras.extrinsics"}),
     ],
 )
@@ -249,7 +249,7 @@ def test_shipped_variation_is_built():
         ({"chance": 1.5}, "augmentation.chance: expected a number >= 0 and <= 1; found 1.5"),
         ({"background": 2}, "augmentation.background: expected a number >= 0 and <= 1; found 2"),
         ({"calibration": -1}, "augmentation.calibration: expected a number >= 0; found -1"),
-        ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole"),
+        ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole_chance"),
     ],
 )
 def test_impossible_values_are_refused(root, values, message):

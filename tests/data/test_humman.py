@@ -17,8 +17,8 @@ from ghgs_lit.data.humman.smpl import read_model, read_parameters
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.miniatures import humman
-from ghgs_lit.synthesis.miniatures.smpl import stand_in
+from scripts.miniatures import humman
+from scripts.miniatures.smpl import stand_in
 from tests.helpers.captures import blob, build_data, centroid, inside, make_miniature, project
 
 TEST = "p000455_a000986"

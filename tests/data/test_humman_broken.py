@@ -15,8 +15,8 @@ from PIL import Image
 
 from ghgs_lit.data.humman.dataset import check_world
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
-from ghgs_lit.synthesis.miniatures import humman
-from ghgs_lit.synthesis.miniatures.smpl import stand_in
+from scripts.miniatures import humman
+from scripts.miniatures.smpl import stand_in
 from tests.helpers.captures import (
     Malice,
     blank,

@@ -18,7 +18,7 @@ from ghgs_lit.errors import InputError
 from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
 
 FULL = tuple(range(16))
-RANDOM = ViewProtocol(name="random")
+RANDOM = ViewProtocol()
 MIDWAY = {"name": "midway", "per_subject": "all"}
 
 
@@ -53,7 +53,7 @@ def test_even_positions_are_the_protocols():
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_uneven_views_stay_around_the_subject(count):
     """Neighbours are a position or more apart; no camera is further than one from where it is even."""
-    protocol = ViewProtocol(name="uneven", training_counts=(count,), training="uneven")
+    protocol = ViewProtocol(training_counts=(count,), training="uneven")
     draws = [protocol.draw(FULL, count, 16, np.random.default_rng(seed)) for seed in range(80)]
     gaps = {tuple(np.diff([*positions, positions[0]]) % 16) for positions in draws}
     assert all(len(set(positions)) == count for positions in draws)
@@ -63,7 +63,7 @@ def test_uneven_views_stay_around_the_subject(count):
 
 def test_uneven_views_need_room():
     """Positions that are closer than 3 could meet."""
-    protocol = ViewProtocol(name="uneven", training_counts=(4,), training="uneven")
+    protocol = ViewProtocol(training_counts=(4,), training="uneven")
     with pytest.raises(InputError, match=r"views\.training: expected any or even for 4 views of 8 positions"):
         TrainingSampler({"a": tuple(range(8))}, protocol, TargetProtocol(name="release"), 8, 1, 0)
 
@@ -293,7 +293,7 @@ def test_fewer_views_than_asked(root, tmp_path):
         InputError, match=r"targets.per_subject: expected at most the 4 inputs, or all; found 5"
     ):
         module(root).evaluation_loader(4, {"name": "midway", "per_subject": 5})
-    listed = module(tmp_path, evaluation_positions={3: [0, 4, 9]}, batch_size=1)
+    listed = module(tmp_path, evaluation_positions=[[0, 4, 9]], batch_size=1)
     assert next(iter(listed.evaluation_loader(3))).views == (("000/0", "004/0", "009/0"),)
 
 

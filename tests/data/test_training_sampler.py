@@ -11,7 +11,7 @@ from ghgs_lit.data.sampling import (
 )
 
 FULL = tuple(range(16))
-RANDOM = ViewProtocol(name="random")
+RANDOM = ViewProtocol()
 MIDWAY = {"name": "midway", "per_subject": "all"}
 
 
@@ -70,7 +70,7 @@ def test_processes_share_out_one_sequence():
 
 def test_even_training_views_keep_their_spacing():
     """views.training=even turns the ring but keeps the distances."""
-    even = sampler(ViewProtocol(name="v5", training_counts=(5,), training="even"))
+    even = sampler(ViewProtocol(training_counts=(5,), training="even"))
     starts = set()
     for step in range(60):
         positions = [position for position, _ in even.batch(step)[0].inputs]
@@ -89,7 +89,7 @@ def test_seeds_choose_photographs_as_well_as_the_order_of_subjects():
     assert drawn(0) == drawn(0)
     pairs = list(zip(drawn(0), drawn(1), strict=True))
     assert sum(len(a.inputs) != len(b.inputs) for a, b in pairs) > 5
-    fixed = ViewProtocol(name="v4", training_counts=(4,))
+    fixed = ViewProtocol(training_counts=(4,))
     inputs = [{sampler(fixed, seed=s, **one).batch(t)[0].inputs for t in range(20)} for s in range(2)]
     assert not inputs[0] & inputs[1]
     names = [[d.subject for t in range(20) for d in sampler(seed=s).batch(t)] for s in range(2)]

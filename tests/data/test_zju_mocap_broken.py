@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ghgs_lit.data.pickles import load_npy
-from ghgs_lit.synthesis.miniatures import zju_mocap
+from scripts.miniatures import zju_mocap
 from tests.helpers.captures import (
     Malice,
     blank,

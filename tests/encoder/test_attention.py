@@ -6,10 +6,10 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.encoder import cpu
-from ghgs_lit.encoder.cpu import attention
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES, WIDTH
-from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
+from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.compile import processor_features
+from ghgs_lit.kernels.tile import PANEL, ROWS
 from tests.helpers.processes import run_python
 
 HALF = pytest.param(
@@ -136,7 +136,7 @@ def test_inputs_whose_numbers_lie_apart():
 
 def test_what_the_kernel_is_asked_for(monkeypatch):
     """The kernel is used only where it is supported and faster."""
-    monkeypatch.setattr(attention, "_features", lambda: {"avx2", "fma", "avx512bf16"})
+    monkeypatch.setattr(pool, "features", lambda: {"avx2", "fma", "avx512bf16"})
     q, _, v = scene(1, 4, 1024, 32, torch.float32)
     assert not cpu.is_supported(q, v)  # a gradient may be needed
     with torch.no_grad():
@@ -147,7 +147,7 @@ def test_what_the_kernel_is_asked_for(monkeypatch):
         assert not cpu.is_supported(q, v.half())
         assert not cpu.is_supported(q, v.bfloat16())  # the processor has no products for it
         assert not cpu.is_supported(q.to("meta"), v.to("meta"))
-        monkeypatch.setattr(attention, "_features", lambda: {"avx2"})
+        monkeypatch.setattr(pool, "features", lambda: {"avx2"})
         assert not cpu.is_supported(q, v)
 
 
@@ -164,7 +164,7 @@ NARROW = """
 import torch
 import torch.nn.functional as F
 from ghgs_lit.encoder import cpu
-from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
+from ghgs_lit.kernels.tile import PANEL, ROWS
 
 assert (ROWS, PANEL) == (6, 16)
 for n, heads, queries, keys, width in ((1, 1, 1, 1, 32), (2, 3, 7, 7, 64), (1, 2, 299, 333, 96)):

@@ -216,7 +216,7 @@ def test_weights_can_be_assigned_to_a_model_without_storage():
 )
 def test_special_tokens_are_drawn_near_zero(vit):
     """As published, and the semantic branch's token as wide as the weights of its blocks."""
-    semantic = {"width": 32, "depth": 1, "heads": 2, "channels": 8, "parts": 5}
+    semantic = {"width": 32, "depth": 1, "heads": 2, "channels": 8}
     torch.manual_seed(0)
     encoder = make_encoder(**{**SMALL, "vit": vit, "semantic": semantic})
     tokens = {

@@ -17,7 +17,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.heads.activations import split_activated
-from ghgs_lit.heads.dpt import DPTOptions
+from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
 from tests.helpers.encoders import make_encoder
@@ -119,8 +119,9 @@ def test_rotary_positions(name, dtype):
 def test_dpt(name, dtype):
     """The DPT head reproduces the published numbers."""
     case, groups = CASES[name], _load(name)
-    options = {key: case["options"][key] for key in ("features", "out_channels")}
-    head = DPTOptions(**options).build(case["options"]["dim_in"], case["options"]["output_dim"])
+    options = case["options"]
+    widths = options["features"], options["out_channels"]
+    head = DPTHead(options["dim_in"], options["output_dim"], widths=widths)
     head.load_state_dict(groups["state"])
     head.to(dtype)
     inputs = _inputs(groups, dtype)
@@ -176,7 +177,7 @@ def test_published_names_and_shapes():
             layers=(4, 11, 17, 23),
             trainable="none",
         )
-        heads = {"pos_head": DPTOptions().build(2048, 2), "decoder": DPTOptions().build(2048, 32)}
+        heads = {"pos_head": DPTHead(2048, 2), "decoder": DPTHead(2048, 32)}
     for name, module in {"aggregator": encoder.aggregator, **heads}.items():
         shapes = {key: list(value.shape) for key, value in module.state_dict().items()}
         assert shapes == published[name]

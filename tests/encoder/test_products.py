@@ -25,10 +25,11 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def convolutions(monkeypatch):
-    """Compute products of any size as convolutions, on any machine."""
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "_LARGE", 0)
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "_PIXELS", 0)
-    monkeypatch.setattr(ghgs_lit.kernels.linear, "prefers_convolution", lambda _: True)
+    """Compute products of any size by oneDNN, with a gradient as convolutions, on any machine."""
+    monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", True)
+    for limit in ("_SMALL", "_LARGE", "_PIXELS"):
+        monkeypatch.setattr(ghgs_lit.kernels.linear, limit, 0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def kernels(monkeypatch):
     """Use the attention kernel for any size, also where the processor lacks features that make it fast."""
     features = processor_features() | {"avx2", "fma"}
     monkeypatch.setattr("ghgs_lit.encoder.cpu.attention._LARGE", 0)
-    monkeypatch.setattr("ghgs_lit.encoder.cpu.attention._features", lambda: features)
+    monkeypatch.setattr("ghgs_lit.kernels.pool.features", lambda: features)
     calls, attend = [], cpu.attend
     monkeypatch.setattr(cpu, "attend", lambda *args: calls.append(1) or attend(*args))
     yield
@@ -59,6 +60,37 @@ def test_product_is_the_linear_layer(convolutions, monkeypatch, shape, bias):
     upstream = torch.randn(expected.shape, generator=g)
     for mine, own in zip(*(torch.autograd.grad(y, inputs, upstream) for y in (found, expected)), strict=True):
         torch.testing.assert_close(mine, own)
+
+
+@pytest.mark.parametrize("shape", [(7, 12), (2, 5, 12), (1, 12)])
+@pytest.mark.parametrize("bias", [False, True])
+@torch.no_grad()
+def test_product_without_a_gradient_is_the_linear_layer(convolutions, shape, bias):
+    g = torch.Generator().manual_seed(0)
+    x, weight, b = (torch.randn(s, generator=g) for s in (shape, (9, 12), (9,)))
+    found, expected = (f(x.mT.contiguous().mT, weight, b if bias else None) for f in (linear, F.linear))
+    torch.testing.assert_close(found, expected)
+
+
+def test_which_products_are_onednns(monkeypatch):
+    """Those of a processor with wide vectors, but for tiny ones, in float32, in training with two threads."""
+    monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", True)
+    threads, x, weight = torch.get_num_threads(), torch.empty(1000, 512), torch.empty(64, 512)
+    prefers = ghgs_lit.kernels.linear.prefers_onednn
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            assert prefers(x, weight) == (count > 1)
+            with torch.no_grad():
+                assert prefers(x, weight)
+                assert not prefers(x[:10], weight)
+                assert not prefers(x.double(), weight.double())
+                assert not prefers(x.to("meta"), weight.to("meta"))
+    finally:
+        torch.set_num_threads(threads)
+    monkeypatch.setattr(ghgs_lit.kernels.linear, "_WIDE_PRODUCTS", False)
+    with torch.no_grad():
+        assert not prefers(x, weight)
 
 
 @pytest.mark.parametrize(("rows", "calls"), [(11, 5), (12, 1), (40, 1)])

@@ -10,7 +10,7 @@ from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.training import Optimization
 from tests.helpers.encoders import make_encoder
 
-BRANCH = {"width": 16, "depth": 2, "heads": 2, "channels": 8, "parts": 6}
+BRANCH = {"width": 16, "depth": 2, "heads": 2, "channels": 8}
 SMALL = {"width": 32, "heads": 2, "depth": 1, "layers": (0,), "vit": {"kind": "stem", "channels": 8}}
 
 
@@ -111,7 +111,7 @@ def test_the_branch_does_not_learn_and_the_rest_does():
         assert (parameter.grad is None) == name.startswith("semantic."), name
     trained = Optimization(lr=1e-3).optimizer(encoder).param_groups[0]["params"]
     assert {id(p) for p in trained} == {id(p) for n, p in encoder.named_parameters() if "semantic." not in n}
-    assert encoder.dim_semantic == 6
+    assert encoder.dim_semantic == 16
 
 
 def test_a_cached_feature_is_not_that_of_another_mask(tmp_path):
@@ -131,7 +131,7 @@ def test_a_cached_feature_is_not_that_of_another_mask(tmp_path):
         ({"heads": 3}, "encoder.semantic.width: expected a multiple of 4"),
         (
             {"chanels": 8},
-            "encoder.semantic key: expected one of channels, depth, heads, parts, width; found 'chanels'",
+            "encoder.semantic key: expected one of channels, depth, heads, width; found 'chanels'",
         ),
     ],
 )

@@ -186,7 +186,7 @@ def test_protocols_are_measured_side_by_side_on_their_own_targets(boxes, tmp_pat
 
 def test_all_protocols_are_measured_from_one_prediction_with_equal_numbers(boxes, tmp_path):
     """A subject is predicted once for each number of views; rows and pictures are those of each protocol."""
-    views = {"name": "v3", "training_counts": [3], "evaluation_count": 3}
+    views = {"training_counts": [3], "evaluation_count": 3}
     data = rendered(boxes, views, {"name": "release"}, size=42)
     protocols = {name: {"name": name} for name in ("midway", "release")}
     protocols["midway"]["per_subject"] = 2

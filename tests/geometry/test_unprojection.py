@@ -19,7 +19,7 @@ def release_token_points(inverse, cameras, dtype):
     _, views = depth.shape[:2]
     maps = DepthMaps(depth, torch.ones_like(depth, dtype=torch.bool), torch.ones_like(depth))
     batch = Batch(torch.zeros(1, views, 3, 518, 518), maps.valid, padded)
-    points = Unprojection(tokens="release", border=3)(maps, make_tokens(batch), batch).tokens
+    points = Unprojection(tokens="release")(maps, make_tokens(batch), batch).tokens
     assert points.dtype == dtype
     return points.reshape(views, 37, 37, 3)
 

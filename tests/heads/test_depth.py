@@ -8,7 +8,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.geometry.unprojection import Unprojection
 from ghgs_lit.heads.depth import BOUNDED, DepthHead, DepthHeadOptions, inverse_linear
-from ghgs_lit.heads.dpt import DPTOptions
+from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.types import Cameras, Tokens
 from tests.helpers.scenes import fixture, make_batch, ring
 
@@ -32,8 +32,7 @@ def predict(head, batch, bounds=None):
 
 def make_head(**options):
     torch.manual_seed(1)
-    dpt = {"features": 16, "out_channels": [16, 16, 16, 16]}
-    return DepthHead(DepthHeadOptions(dpt=dpt, **options), 64)
+    return DepthHead(DepthHeadOptions(**options), 64)
 
 
 def square_cameras(name, dtype, size):
@@ -129,7 +128,7 @@ def test_the_releases_parameterization_has_either_sign_and_no_bounds():
 
 def test_widths_follow_the_published_ones():
     """Published weights must fit the default widths."""
-    head = DPTOptions().build(2048, 2)
+    head = DPTHead(2048, 2)
     shapes = [tuple(p.weight.shape[:2]) for p in head.projects]
     assert shapes == [(256, 2048), (512, 2048), (1024, 2048), (1024, 2048)]
     assert head.scratch.output_conv1.weight.shape[:2] == (128, 256)

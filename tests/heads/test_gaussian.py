@@ -21,8 +21,7 @@ HEADERS = ("offset_header", "scale_header", "rot_header", "opacity_header")
 
 def make_head(**options):
     torch.manual_seed(4)
-    dpt = {"features": 16, "out_channels": [16, 16, 16, 16]}
-    return GaussianHead(GaussianHeadOptions(dpt=dpt, **options), 64)
+    return GaussianHead(GaussianHeadOptions(**options), 64)
 
 
 def run(head, batch, masks=None, pixels="subject"):
@@ -208,8 +207,7 @@ def test_attributes_are_wide_under_autocast():
         ({"attributes": {"thickness_start": 5.0}}, "gaussian_head.attributes.thickness_start"),
         ({"attributes": {"inward": -1.0}}, "gaussian_head.attributes.inward"),
         ({"axes": "camera"}, "gaussian_head.axes"),
-        ({"attributes": {"opacity_start": 1.0}}, "gaussian_head.attributes.opacity_start"),
-        ({"attributes": {"offset_limit": -1.0}}, "gaussian_head.attributes.offset_limit"),
+        ({"attributes": {"opacity_floor": 0.8}}, "gaussian_head.attributes.opacity_floor"),
     ],
 )
 def test_impossible_options_are_refused(options, key):

@@ -15,7 +15,7 @@ from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.scans import ScanSource
 
-V4 = {"name": "v4", "training_counts": [4], "evaluation_count": 4}
+V4 = {"training_counts": [4], "evaluation_count": 4}
 RELEASE = {"name": "release", "training_views": [2, 3, 4]}
 RIG = Rig()
 TINY = RenderOptions(size=42, samples=2)

@@ -21,9 +21,7 @@ from ghgs_lit.metrics.functional import box_of, ssim_map
 from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
-RELEASE = MetricsOptions(
-    protocol="release", regions=("image",), ssim_padding="zeros", clamp=False, lpips="off"
-)
+RELEASE = MetricsOptions(protocol="release", regions=("image",), lpips="off")
 
 
 def _images(n=3, h=30, w=41, seed=0):
@@ -270,11 +268,7 @@ def test_lpips_sees_what_its_protocol_says():
     for protocol, signed, expected in (
         (MetricsOptions().build(), True, overshooting.clamp(0, 1)),
         # The authors' evaluation: neither clamped nor mapped to [-1, 1].
-        (
-            RELEASE.replace(lpips="require", lpips_signed=False).build(),
-            False,
-            overshooting,
-        ),
+        (RELEASE.replace(lpips="require").build(), False, overshooting),
     ):
         values = protocol(overshooting, target, mask)["lpips"]
         network = protocol.lpips.network

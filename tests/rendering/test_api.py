@@ -132,13 +132,6 @@ def test_inputs_that_do_not_fit():
         render(gaussians, type(views)(skewed, views.extrinsics, 20, 30), "cpu")
 
 
-@pytest.mark.parametrize("region", [(0, 0, 21, 30), (-1, 0, 5, 5), (0, 0, 5), (0.0, 0.0, 5.0, 5.0)])
-def test_regions_that_do_not_fit(region):
-    """A region outside the image or of a wrong form is refused."""
-    with pytest.raises(InputError, match="region"):
-        render(cloud(5), camera_ring(2, 20, 30), "cpu", region=region)
-
-
 def test_gaussians_are_drawn_with_the_constants_that_they_were_made_for():
     """Unless settings say otherwise."""
     views = Cameras(torch.tensor([[[[20.0, 0, 5], [0, 20, 5], [0, 0, 1]]]]), torch.eye(4)[None, None], 10, 10)

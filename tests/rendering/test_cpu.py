@@ -130,31 +130,6 @@ def test_hundreds_of_opaque_layers():
     )
 
 
-@pytest.mark.parametrize(
-    "region", [(5, 9, 20, 30), (0, 0, 45, 70), (16, 16, 16, 16), (44, 3, 1, 2), (4, 4, 0, 9)]
-)
-def test_a_region_is_the_same_image_cut_out(region):
-    """A region draws the same bits inside and background outside, also in gradients."""
-    gaussians, views = cloud(150, size=0.1), camera_ring(2, 45, 70)
-    assert_cpu_matches_reference(gaussians, views, region=region, background=(0.1, 0.2, 0.7))
-    top, left, height, width = region
-    whole, part = (render(gaussians, views, "cpu", region=box) for box in (None, region))
-    box = (..., slice(top, top + height), slice(left, left + width))
-    for name in ("image", "alpha", "depth"):
-        wanted = torch.zeros_like(getattr(whole, name))
-        wanted[box] = getattr(whole, name)[box]
-        assert torch.equal(getattr(part, name), wanted)
-
-
-def test_a_region_for_each_view():
-    """Each view can have its own region."""
-    gaussians, views = cloud(100, size=0.1, splits=(60, 40)), camera_ring(2, 30, 40, batch=2)
-    boxes = torch.tensor([[[0, 0, 10, 10], [5, 5, 20, 30]], [[1, 2, 0, 0], [0, 0, 30, 40]]])
-    assert_cpu_matches_reference(gaussians, views, region=boxes)
-    alone = render(gaussians[1], views[1:, 1:], "cpu")
-    assert torch.equal(render(gaussians, views, "cpu", region=boxes).image[1, 1], alone.image[0, 0])
-
-
 def test_inputs_of_any_layout_and_dtype():
     """Strided, float64 and bfloat16 inputs are converted, and gradients come back in their dtype."""
     plain, views = cloud(40), camera_ring(1, 24, 24)

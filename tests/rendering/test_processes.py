@@ -13,7 +13,7 @@ import torch
 from ghgs_lit.kernels import pool
 from ghgs_lit.rendering import render
 from ghgs_lit.rendering.cpu import backend
-from tests.helpers.processes import run_python
+from tests.helpers.processes import run_prepared, run_python
 from tests.helpers.splats import FIELDS, body, camera_ring, with_gradients
 
 
@@ -93,7 +93,7 @@ class _Renderings(torch.utils.data.Dataset):
 def test_training_in_four_workers_of_a_data_loader():
     """Rendering with gradients works in worker processes."""
     # In a process of its own: where a backward pass ran on another device, PyTorch refuses one after a fork.
-    run_python("from tests.rendering.test_processes import train_in_workers; train_in_workers()")
+    run_prepared(train_in_workers)
 
 
 def train_in_workers():
@@ -120,27 +120,18 @@ def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
     assert sum("256 bits" in str(warning.message) for warning in caught) == warned
 
 
-_SUM = """
-import torch
-from tests.helpers.splats import body, camera_ring, with_gradients
-from ghgs_lit.rendering import render
-from ghgs_lit.rendering.cpu import backend
-gaussians = with_gradients(body(300, 24))
-image = render(gaussians, camera_ring(1, 24, 24), "cpu").image
-image.square().sum().backward()
-print(float(image.detach().sum()), float(gaussians.scales.grad.norm()))
-"""
+def sums() -> tuple[float, float]:
+    """Of an image, and of a gradient's squares."""
+    gaussians = with_gradients(body(300, 24))
+    image = render(gaussians, camera_ring(1, 24, 24), "cpu").image
+    image.square().sum().backward()
+    return float(image.detach().sum()), float(gaussians.scales.grad.norm())
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="takes x86 vectors away")
 def test_the_same_image_without_wide_vectors():
     """A processor with 128-bit vectors only gives the same image (the first run compiles for a while)."""
-
-    def run(**variables):
-        done = run_python(_SUM, **variables)
-        return [float(number) for number in done.stdout.split()], done.stderr
-
-    wanted, _ = run()
-    found, said = run(NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
-    assert found == pytest.approx(wanted, rel=1e-5)
-    assert said.count("no vectors of 256 bits") == 1
+    code = "from tests.rendering.test_processes import sums; print(*sums())"
+    done = run_python(code, NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
+    assert [float(number) for number in done.stdout.split()] == pytest.approx(sums(), rel=1e-5)
+    assert done.stderr.count("no vectors of 256 bits") == 1

@@ -114,8 +114,6 @@ def test_half_precision_gives_finite_values():
 
 
 def test_options_are_checked():
-    with pytest.raises(InputError, match=r"rounds\.reach"):
-        GHGS.from_config(config(*RECURRENT, "rounds.reach=0"))
     with pytest.raises(InputError, match=r"rounds\.exchange: expected an integer >= 1 and <= 65536 or null"):
         RoundsOptions(exchange=0)
     resolve(compose("train", ["model=recurrent", "encoder=vggt_nano", "rounds.exchange=null"]))
@@ -180,9 +178,10 @@ def test_each_round_changes_half_as_much_as_the_one_before():
     assert float(moved[2] / moved[0]) == pytest.approx(0.25, rel=0.05)
 
 
-def test_depths_are_compared_between_near_and_far_only():
+def test_depths_are_compared_between_near_and_far_only(monkeypatch):
     """However far a round may search."""
-    batch, wild = make_batch(1, 4), model("rounds.reach=1", kick=30.0)
+    monkeypatch.setattr("ghgs_lit.rounds.rounds.REACH", 1.0)
+    batch, wild = make_batch(1, 4), model(kick=30.0)
     wild.rounds.count = 1
     with torch.no_grad():
         maps = wild(batch).rounds[1]

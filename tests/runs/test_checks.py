@@ -57,7 +57,7 @@ def test_a_partly_frozen_encoder_needs_weights_too():
 
 def test_a_semantic_branch_needs_weights():
     """It does not learn in training, so that it would stay random."""
-    branch = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8, parts: 16}"
+    branch = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8}"
     with pytest.raises(InputError, match="init_from: expected a checkpoint of `ghgs pretext`"):
         check_config(config(branch))
     check_config(config(branch, "init_from=pretext.ckpt"))

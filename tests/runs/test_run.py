@@ -1,7 +1,6 @@
 """The directory of one run: its results, its sessions, its lock."""
 
 import json
-import multiprocessing
 import os
 import signal
 import socket
@@ -16,8 +15,7 @@ from tests.helpers.jobs import (
     hold_run,
     write_finished_run,
 )
-
-SPAWN = multiprocessing.get_context("spawn")
+from tests.helpers.processes import PREPARED
 
 
 def test_results_that_are_not_whole_are_no_results(tmp_path):
@@ -58,7 +56,7 @@ def test_figures_that_are_no_finite_numbers_are_refused(tmp_path, part, value):
 
 def test_a_kill_while_writing_results_leaves_nothing_behind(tmp_path):
     """The half-written file of a killed process is removed by the next one, and is no result."""
-    child = SPAWN.Process(target=os.getpid)
+    child = PREPARED.Process(target=os.getpid)
     child.start()
     child.join()
     half = tmp_path / f".metrics.json.{socket.gethostname()}.{child.pid}.tmp"
@@ -84,8 +82,8 @@ def test_a_session_that_was_killed_while_it_was_noted(tmp_path):
 
 def test_a_lock_ends_with_its_process_and_not_before(tmp_path):
     """A killed process must not block its run, nor may a forked child that outlives it."""
-    ready = SPAWN.Event()
-    holder = SPAWN.Process(target=hold_run, args=(tmp_path, ready))
+    ready = PREPARED.Event()
+    holder = PREPARED.Process(target=hold_run, args=(tmp_path, ready))
     holder.start()
     assert ready.wait(30)
     run = RunDirectory(tmp_path)

@@ -72,7 +72,6 @@ def synthetic(tmp_path, *overrides):
     [
         ("data.rig.height=1.8", r"data\.rig\.height: expected None, with which split=bench"),
         ("data/rig=varied", r"data\.rig\.\S+: expected"),
-        ("data.people_seed=3", r"data\.people_seed: expected 0"),
         ("data.size=42", r"data\.size: expected 56 pixels or more with split=bench; found 42"),
         ("data.render.samples=1", r"data\.render\.samples: expected 3"),
     ],

@@ -1,6 +1,6 @@
 """Rendering jobs: killed half-way, started twice, in several processes, with other settings."""
 
-import multiprocessing
+import errno
 import os
 import signal
 import subprocess
@@ -14,13 +14,13 @@ import pytest
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis import jobs, people
 from ghgs_lit.synthesis.jobs import SyntheticSource, render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
+from tests.helpers.processes import PREPARED
 
 SMALL = TINY.replace(positions=(0, 4, 8), views=(0, 3))
-SPAWN = multiprocessing.get_context("spawn")
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -80,7 +80,7 @@ def render_and_die(root: Path, scans: Path, moves: int) -> None:
 def test_a_killed_run_leaves_nothing_that_looks_whole_and_goes_on(scans, reference, tmp_path):
     """Killed in the middle of moving the second subject to its place."""
     root = tmp_path / "out"
-    process = SPAWN.Process(target=render_and_die, args=(root, scans, 25))
+    process = PREPARED.Process(target=render_and_die, args=(root, scans, 25))
     process.start()
     process.join()
     assert process.exitcode == -signal.SIGKILL
@@ -108,8 +108,8 @@ def render_at_once(barrier, root: Path, scans: Path, log: Path) -> None:
 
 def test_two_processes_at_once_share_the_work(scans, reference, tmp_path):
     """Two runs on one folder neither collide nor render twice."""
-    barrier, root, log = SPAWN.Barrier(2), tmp_path / "out", tmp_path / "log"
-    processes = [SPAWN.Process(target=render_at_once, args=(barrier, root, scans, log)) for _ in range(2)]
+    barrier, root, log = PREPARED.Barrier(2), tmp_path / "out", tmp_path / "log"
+    processes = [PREPARED.Process(target=render_at_once, args=(barrier, root, scans, log)) for _ in range(2)]
     for process in processes:
         process.start()
     for process in processes:
@@ -147,18 +147,17 @@ def lives(pid: int) -> bool:
     return state.strip()[:1] not in ("", "Z")
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGTERM, signal.SIGKILL])
-def test_workers_end_with_the_process_that_started_them(scans, tmp_path, signal_number):
+def test_workers_end_with_the_process_that_started_them(scans, tmp_path):
     """A killed run leaves no processes behind."""
     log = tmp_path / "log"
-    process = SPAWN.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
+    process = PREPARED.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
     process.start()
     limit = time.monotonic() + 60
     while not (log.exists() and len(log.read_text().split()) == 2) and time.monotonic() < limit:
         time.sleep(0.05)
     workers = [int(pid) for pid in log.read_text().split()]
     assert all(map(lives, workers))
-    os.kill(process.pid, signal_number)
+    process.kill()
     process.join()
     while any(map(lives, workers)) and time.monotonic() < limit:
         time.sleep(0.05)
@@ -221,6 +220,18 @@ def test_a_bad_person_stops_the_run_and_the_good_ones_stay(scans, reference, tmp
     assert not list((root / "rendering").glob("tmp/*"))
     assert render_people(root, names, ScanSource(scans), RIG, SMALL, 0, workers=0) == 3
     assert contents(root) == reference
+
+
+def test_a_full_disk_names_the_folder_of_the_data_set(scans, tmp_path, monkeypatch):
+    """The system names no file, and the command line then named the run's directory, which had space."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(jobs, "write_view", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        render_people(tmp_path / "out", {"train": ["s0"]}, ScanSource(scans), RIG, SMALL, 0, workers=0)
+    assert caught.value.filename == str(tmp_path / "out")
 
 
 def test_other_settings_and_other_folders_are_refused(scans, tmp_path):

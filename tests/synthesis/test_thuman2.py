@@ -15,13 +15,14 @@ from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.miniatures import thuman2 as miniature
+from ghgs_lit.synthesis.miniature import POSE_SIZES, make_scans, scan_of
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.thuman2 import THuman2
 from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
 from ghgs_lit.types import Cameras
+from scripts.miniatures import thuman2 as miniature
 from tests.helpers.captures import stored
 from tests.helpers.people import V4
 
@@ -38,7 +39,7 @@ def rendered(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory):
-    return miniature.make_raw(tmp_path_factory.mktemp("raw") / "THuman2.0_Release", COUNT, 64, 0)
+    return make_scans(tmp_path_factory.mktemp("raw") / "THuman2.0_Release", COUNT, 64, 0)
 
 
 def module(root=None, **changes):
@@ -48,7 +49,7 @@ def module(root=None, **changes):
 def seen_by(view, scan=None) -> np.ndarray:
     """The mask of the miniature's person 0000 from the camera that was read."""
     rng = subject_rng(0, "0000")
-    scan = miniature._scan("0000", 0)
+    scan = scan_of("0000", 0)
     person = Rig().place(Person("0000", (scan.mesh,), None), rng)
     height, width = view.mask.shape
     cameras = Cameras(
@@ -149,7 +150,7 @@ def test_the_first_camera_faces_the_person(raw):
     """global_orient of the fit turns the ring: a person that looks elsewhere is still seen from the front."""
     source = THuman2Source(raw, find_fits(raw, None))
     for name in ("0000", "0426"):
-        scan = miniature._scan(name, 0)
+        scan = scan_of(name, 0)
         assert (source.facing(name) - np.degrees(scan.yaw)) % 360 == pytest.approx(0, abs=1e-3) or (
             source.facing(name) - np.degrees(scan.yaw)
         ) % 360 == pytest.approx(360, abs=1e-3)
@@ -220,7 +221,7 @@ def test_fits_of_smpl_call_the_translation_transl(raw, tmp_path):
     content = pickle.loads(path.read_bytes())  # our own file
     assert type(content["translation"]).__name__ == "TrackedArray"
     assert {k: v.shape for k, v in content.items() if k != "scale"} == {
-        **{k: (1, n) for k, n in miniature.POSE_SIZES.items()},
+        **{k: (1, n) for k, n in POSE_SIZES.items()},
         "global_orient": (1, 3),
         "translation": (3,),
     }

@@ -13,8 +13,9 @@ from PIL import Image
 
 from ghgs_lit.data.check import inspect, show, split_line, write
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.miniatures import thuman2 as miniature
+from ghgs_lit.synthesis.miniature import make_scans
 from ghgs_lit.synthesis.thuman2 import THuman2
+from scripts.miniatures import thuman2 as miniature
 from tests.data.test_pickles import Call
 from tests.helpers.people import V4
 
@@ -28,7 +29,7 @@ def sound(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sound")
     count = {"train": 1, "val": 1}
     miniature.make(folder / "root", count, SIZE, 0, vids=(0, 3), positions=4)
-    miniature.make_raw(folder / "raw" / "THuman2.0_Release", count, 32, 0)
+    make_scans(folder / "raw" / "THuman2.0_Release", count, 32, 0)
     return folder
 
 

@@ -7,10 +7,11 @@ import lightning.pytorch as L
 import pytest
 import torch
 
+from ghgs_lit.config.verbs import Train
 from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.budgets import TokenBudgets, token_budget
+from ghgs_lit.training.budgets import drawn_budget, token_budget
 from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model
 from tests.helpers.scenes import make_batch
@@ -54,13 +55,17 @@ def test_budgets_need_features_of_their_own(tmp_path):
 
 def test_the_draw_is_even_and_depends_on_all_numbers():
     """A step, a seed or a part of an accumulated step that does not count would repeat a budget."""
-    budgets = TokenBudgets(["all", "window", 0, 0])
-    drawn = [[budgets.draw([seed, step, part]) for step in range(400)] for seed in (0, 1) for part in (0, 1)]
+    budgets = ["all", "window", 0, 0]
+    drawn = [
+        [drawn_budget(budgets, [seed, step, part]) for step in range(400)]
+        for seed in (0, 1)
+        for part in (0, 1)
+    ]
     shares = Counter(drawn[0])
     assert set(shares) == {"all", "window", 0}
     assert 160 < shares[0] < 240
     assert len({tuple(row) for row in drawn}) == 4
-    assert drawn[0] == [budgets.draw([0, step, 0]) for step in range(400)]
+    assert drawn[0] == [drawn_budget(budgets, [0, step, 0]) for step in range(400)]
 
 
 class Watched(Standin):
@@ -80,7 +85,7 @@ class Watched(Standin):
 def fit(folder, steps, resume=None):
     model = Watched()
     options = Optimization(lr=0.05)
-    budgets = TokenBudgets(["all", "window", 0, 1, 2])
+    budgets = ["all", "window", 0, 1, 2]
     module = GHGSModule(model, flat_renderer, losses_of({"render_l1": 1.0}), options, {"seed": 3}, budgets)
     trainer = L.Trainer(
         accelerator="cpu", max_steps=steps, max_epochs=-1, default_root_dir=folder, logger=False,
@@ -115,4 +120,4 @@ def test_without_budgets_the_model_stays_as_it_is_configured():
 def test_budgets_that_do_not_exist_are_refused(choices):
     """A typing error must not become another training."""
     with pytest.raises(InputError, match="token_budgets"):
-        TokenBudgets(choices)
+        Train(token_budgets=choices)

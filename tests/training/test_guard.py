@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import time
+from contextlib import nullcontext, suppress
 
 import lightning.pytorch as L
 import pytest
@@ -16,7 +18,7 @@ from ghgs_lit.training.loggers import CsvLog
 from ghgs_lit.training.replay import replay
 from tests.helpers.losses import losses_of
 from tests.helpers.models import TINY, make_model
-from tests.helpers.processes import run_python
+from tests.helpers.processes import run_prepared
 from tests.helpers.scenes import training_batch
 from tests.helpers.training import Standin, example_batch, flat_renderer, infinitely_steep
 from tests.helpers.verbs import ghgs
@@ -154,16 +156,16 @@ def test_a_saved_step_is_plain_data_and_fails_again_at_the_same_place(tmp_path, 
     assert "expected a step that a training saved; found 'weights'" in capsys.readouterr().err
 
 
-TWO_PROCESSES = """
-import time, torch
-from pathlib import Path
-from tests.training.test_guard import Depths, DivergedError, loader, module, trainer
+class Noted(Depths):
+    """Writes what each process saw at the end, and its error, for which it waits until the other has one."""
 
-folder = Path({folder!r})
+    def __init__(self, folder):
+        super().__init__()
+        self.folder = folder
 
-class Look(Depths):
     def on_train_end(self, run, pl_module):
-        (folder / f"end_{{run.global_rank}}").write_text(repr(self.seen))
+        (self.folder / f"end_{run.global_rank}").write_text(repr(self.seen))
+
     def on_train_start(self, run, pl_module):
         refuse = pl_module.guard.refuse
 
@@ -171,32 +173,35 @@ class Look(Depths):
             try:
                 refuse(*inputs)
             except DivergedError as error:
-                (folder / f"error_{{run.global_rank}}").write_text(str(error))
+                (self.folder / f"error_{run.global_rank}").write_text(str(error))
                 for _ in range(100):  # the first process to end takes the other with it
-                    if len(list(folder.glob("error_*"))) < 2:
+                    if len(list(self.folder.glob("error_*"))) < 2:
                         time.sleep(0.1)
                 raise
 
         pl_module.guard.refuse = noted
 
+
 class Own(torch.utils.data.DataLoader):
-    "Step 1 of the second process is not finite."
+    """Step 1 of the second process is not finite."""
+
     def __iter__(self):
         return iter(loader(1) if torch.distributed.get_rank() == 1 else loader())
 
-for limit in (1, 0):
+
+def train_in_two_processes(folder, limit):
+    torch.set_num_threads(1)
     data = Own([None] * 6, batch_size=None)
-    run = trainer(folder, 3, [Look()], devices=2, strategy="ddp_fork", use_distributed_sampler=False)
-    try:
+    options = {"devices": 2, "strategy": "ddp_fork", "use_distributed_sampler": False}
+    run = trainer(folder, 3, [Noted(folder)], **options)
+    with nullcontext() if limit else suppress(Exception):
         run.fit(module(limit), data)
-    except Exception as error:
-        assert limit == 0, error
-"""
 
 
 def test_two_processes_skip_and_stop_together(tmp_path):
     """A process that goes on alone would wait for the others for ever, or train other weights."""
-    run_python(TWO_PROCESSES.format(folder=str(tmp_path)), OMP_NUM_THREADS="1")
+    for limit in (1, 0):
+        run_prepared(train_in_two_processes, tmp_path, limit)
     ends = [(tmp_path / f"end_{rank}").read_text() for rank in range(2)]
     assert ends[0] == ends[1]
     seen = [float(value) for value in ends[0].strip("[]").split(",")]

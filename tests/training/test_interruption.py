@@ -1,5 +1,6 @@
 """Ctrl-C and SIGTERM while training: a checkpoint after the step, exit codes, and the same end."""
 
+import functools
 import os
 import signal
 import threading
@@ -37,20 +38,34 @@ def stopped(folder, sender: Signal) -> int:
     return stop.value.code
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Trains with a number of batches in a step, once: the folder, the weights, the validations."""
+
+    @functools.cache
+    def run(accumulate: int):
+        folder, cut = tmp_path_factory.mktemp("whole"), Cut()
+        return folder, fit(folder, cut, accumulate_grad_batches=accumulate), cut.validations
+
+    return run
+
+
 @pytest.mark.parametrize(
-    ("number", "at", "validating", "options"),
+    ("number", "at", "validating", "accumulate"),
     [
-        (signal.SIGINT, 5, False, {}),
-        (signal.SIGTERM, 7, False, {}),
-        (signal.SIGTERM, 8, False, {}),
-        (signal.SIGINT, 8, True, {}),
-        (signal.SIGTERM, 6, False, {"accumulate_grad_batches": 2}),
+        (signal.SIGINT, 5, False, 1),
+        (signal.SIGTERM, 7, False, 1),
+        (signal.SIGTERM, 8, False, 1),
+        (signal.SIGINT, 8, True, 1),
+        (signal.SIGTERM, 6, False, 2),
     ],
 )
-def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, number, at, validating, options):
+def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(
+    whole, tmp_path, number, at, validating, accumulate
+):
     """The step and a validation that is due are finished and saved: weights, logs and validations agree."""
-    whole = Cut()
-    expected = fit(tmp_path / "whole", whole, **options)
+    options = {"accumulate_grad_batches": accumulate}
+    folder, expected, validations = whole(accumulate)
     before = handlers()
     first = Cut()
     with interruptible(), pytest.raises(Interrupted) as stop:
@@ -63,8 +78,8 @@ def test_a_run_that_is_stopped_goes_on_as_if_it_had_not_been(tmp_path, number, a
     subject = fit(tmp_path / "cut", second, resume=last, **options)
     for a, b in zip(expected.parameters(), subject.parameters(), strict=True):
         assert torch.equal(a, b)
-    assert first.validations + second.validations == whole.validations
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert first.validations + second.validations == validations
+    assert rows(tmp_path / "cut") == rows(folder)
 
 
 def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.callbacks import Memory, StepTime, resident_mb
+from ghgs_lit.training.callbacks import Costs, resident_mb
 from ghgs_lit.training.clock import PARTS, StepClock
 from ghgs_lit.training.loggers import (
     CsvLog,
@@ -26,7 +26,7 @@ from ghgs_lit.training.loggers import (
     log_results,
     resume,
 )
-from ghgs_lit.training.validation_pictures import AttentionOptions, Pictures, PointClouds
+from ghgs_lit.training.validation_pictures import PicturesOptions
 from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, flat_renderer
 
@@ -73,7 +73,7 @@ def run(tmp_path_factory):
     )
     trainer = L.Trainer(
         accelerator="cpu", max_steps=8, max_epochs=-1, default_root_dir=folder, logger=loggers(folder),
-        callbacks=[StepTime(), Memory(), Pictures(1), AttentionOptions().build(), PointClouds(1)],
+        callbacks=[Costs(), PicturesOptions(subjects=1).build()],
         enable_checkpointing=False, enable_model_summary=False, enable_progress_bar=False,
         num_sanity_val_steps=0, check_val_every_n_epoch=None, val_check_interval=4, log_every_n_steps=2,
     )  # fmt: skip

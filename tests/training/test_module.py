@@ -20,10 +20,10 @@ from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
-from ghgs_lit.training.callbacks import RunProgress, StepTime
+from ghgs_lit.training.callbacks import Costs, RunProgress
 from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
 from ghgs_lit.training.trainer import require_whole_parameters
-from ghgs_lit.training.validation_pictures import Pictures
+from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
 from tests.helpers.losses import losses_of
@@ -255,7 +255,7 @@ def test_frozen_parameters_stay_for_their_share_of_the_run(tmp_path):
 def test_callbacks_write_pictures_and_numbers(tmp_path):
     """Pictures and logged values appear under the names that the documentation lists."""
     run = trainer(
-        tmp_path, steps=4, callbacks=[Pictures(1), StepTime(), RunProgress()],
+        tmp_path, steps=4, callbacks=[PicturesOptions(subjects=1).build(), Costs(), RunProgress()],
         logger=CSVLogger(tmp_path, name="csv", version=""), log_every_n_steps=1, val_check_interval=2,
     )  # fmt: skip
     run.fit(module(), loader(), loader(2))

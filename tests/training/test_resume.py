@@ -16,7 +16,7 @@ from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
 from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
-from ghgs_lit.training.validation_pictures import Pictures
+from ghgs_lit.training.validation_pictures import PicturesOptions
 from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, _Steps, flat_renderer
 
@@ -281,6 +281,19 @@ def test_averages_of_another_optimizer_are_refused(tmp_path, old, new):
         check_resume(path, Standin(), {**CONFIG, "optimizer": dict(now)})
 
 
+def test_groups_of_another_optimizer_are_refused(tmp_path):
+    """PyTorch raised a ValueError hours into the queue, which named no file."""
+    path, model = tmp_path / "a.ckpt", Standin()
+    state = Optimization(lr=0.05).optimizer(model).state_dict()
+    state["param_groups"] *= 2
+    content = {"state_dict": {f"model.{k}": v for k, v in model.state_dict().items()}}
+    now = {**CONFIG, "optimizer": {"kind": "adamw", "lr": 0.05}}
+    content |= {"config": now, "format_version": 1, "global_step": 5, "optimizer_states": [state]}
+    torch.save(content, path)
+    with pytest.raises(InputError, match=r"a\.ckpt: optimizer_states\.param_groups: expected .*; found \["):
+        check_resume(path, model, now)
+
+
 def test_an_optimizer_whose_state_was_changed_is_refused(tmp_path):
     """Broken averages of the gradient would be trained on in silence: the checkpoint has a digest of all."""
     path = tmp_path / "checkpoints" / "last.ckpt"
@@ -316,10 +329,10 @@ def test_a_run_counts_the_cost_of_all_its_sessions(tmp_path):
 def test_the_pictures_of_the_checkpoints_own_step_stay(tmp_path):
     """TensorBoard drops what is logged again after a restart, and no picture of an earlier validation."""
     with pytest.raises(PowerCut):
-        fit(tmp_path, Cut(10), every=4, more=[Pictures(1)])
+        fit(tmp_path, Cut(10), every=4, more=[PicturesOptions(subjects=1).build()])
     last = tmp_path / "checkpoints" / "last.ckpt"
     assert torch.load(last, weights_only=True)["global_step"] == 8
-    fit(tmp_path, Cut(), resume=last, every=4, more=[Pictures(1)])
+    fit(tmp_path, Cut(), resume=last, every=4, more=[PicturesOptions(subjects=1).build()])
     found = EventAccumulator(str(tmp_path / "tensorboard"), size_guidance={"images": 0}).Reload()
     assert [e.step for e in found.Images("sheet/p0")] == [4, 8, 12, 16]
 
@@ -347,10 +360,15 @@ def test_minutes_are_positive(minutes):
         CheckpointOptions(filename="last", minutes=minutes)
 
 
-def test_minutes_and_steps_exclude_one_another():
-    """One callback saves by steps or by time; both would silently mean one of them."""
-    with pytest.raises(InputError, match="minutes: expected null where every_n_train_steps is given"):
-        CheckpointOptions(filename="last", minutes=1, every_n_train_steps=3)
+@pytest.mark.parametrize(
+    ("minutes", "steps", "saved"), [(1e-6, 1000, STEPS), (1000, 5, 15), (1000, 1000, None)]
+)
+def test_minutes_and_steps_both_count(tmp_path, minutes, steps, saved):
+    """Slow steps are saved by the clock, fast ones by their number; Lightning's own class refuses both."""
+    by_both = CheckpointOptions(filename="both", minutes=minutes, every_n_train_steps=steps).build()
+    fit(tmp_path, Cut(), every=1000, more=[by_both])
+    path = tmp_path / "checkpoints" / "both.ckpt"
+    assert (torch.load(path, weights_only=True)["global_step"] if path.exists() else None) == saved
 
 
 def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):

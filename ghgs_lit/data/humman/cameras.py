@@ -33,15 +33,8 @@ class Calibration:
 
 
 def read_calibration(path: Path, kind: str) -> Calibration:
-    """Read the cameras of a sequence.
-
-    Args:
-        path: its ``cameras.json``.
-        kind: ``color`` or ``depth``.
-
-    Raises:
-        InputError: it is missing or broken, a camera is missing or bad, or translations are not in metres.
-    """
+    """Read the cameras of a sequence. ``kind``: ``color`` or ``depth``. InputError: it is missing or broken,
+    a camera is missing or bad, or translations are not in metres."""
     content = read_json(path, "the cameras of a sequence in JSON")
     cameras = [_camera(path, content, f"kinect_{kind}_{k:03d}") for k in KINECTS]
     intrinsics, extrinsics = (np.stack(matrices) for matrices in zip(*cameras, strict=True))

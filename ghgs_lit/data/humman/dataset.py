@@ -91,11 +91,8 @@ class HuMMan(DataSet):
 
 
 def check_world(path: Path) -> None:
-    """Check that the world of a ``cameras.json`` is the frame of its first colour camera.
-
-    Raises:
-        InputError: it is not, or the file is bad.
-    """
+    """Check that the world of a ``cameras.json`` is the frame of its first colour camera. InputError: it is
+    not, or the file is bad."""
     first = read_calibration(path, "color").extrinsics[0]
     if np.abs(first - np.eye(4)).max() > _POSE_TOLERANCE:
         raise InputError(

@@ -17,20 +17,9 @@ _KEPT = 20000
 def surface_points(
     sequence: Path, frame: int, depth_cameras: Calibration, cameras: Calibration, masks: dict[int, np.ndarray]
 ) -> np.ndarray:
-    """What the depth cameras see inside all masks.
-
-    Args:
-        sequence: folder of the sequence.
-        frame: number of the frame.
-        depth_cameras, cameras: calibrations of the depth and of the colour cameras.
-        masks: [h, w] bool by number of the colour camera.
-
-    Returns:
-        [n, 3] float32 in the world, metres.
-
-    Raises:
-        InputError: a depth map is missing or bad, or no point lies inside the masks.
-    """
+    """What the depth cameras see inside all masks. ``masks``: [h, w] bool by number of the colour camera.
+    Returns: [n, 3] float32 in the world, metres. InputError: a depth map is missing or bad, or no point lies
+    inside the masks."""
     points = [_points(_path(sequence, k, frame), depth_cameras, k) for k in KINECTS]
     inside = [_inside(world, k, cameras, masks) for k, world in zip(KINECTS, points, strict=True)]
     found = np.concatenate(inside)

@@ -36,15 +36,12 @@ class HuMManReader(FrameReader):
     """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
 
     Args:
-        folder: root of the data set.
         sequences: names of folders; missing ones are left out.
         frames: numbers of frames; those that a sequence lacks are left out, and of a frame the cameras.
         masks: folder of masks, ``kinect_mask`` or ``kinect_mask_manual``.
         body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
             cameras inside all masks; ``none``.
-        smpl_model: the model's file, or a folder that has it.
         limit: number of frames in all, the first ones (None: all).
-        strict: as for :class:`Reader`.
 
     Raises:
         InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
@@ -73,7 +70,6 @@ class HuMManReader(FrameReader):
         self.subjects = dict(list(self.subjects.items())[:limit])
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
-        """Add the frames of one sequence that exist, with the cameras that have them."""
         cameras = read_calibration(path / "cameras.json", "color")
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
         found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
@@ -140,7 +136,6 @@ def _file(folder: Path, kind: str, kinect: int, number: int) -> Path:
 
 
 def _frames_of(folder: Path) -> set[int]:
-    """Numbers of the photographs in a folder; none if the folder is missing."""
     if not folder.is_dir():
         return set()
     return {int(p.stem) for p in folder.iterdir() if p.suffix == ".png" and p.stem.isdecimal()}

@@ -66,11 +66,8 @@ _REPLACEMENTS = {
 
 
 def model_file(path: Path) -> Path:
-    """The model's file: ``path`` itself, or one of the usual names in the folder ``path``.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The model's file: ``path`` itself, or one of the usual names in the folder ``path``. InputError: there
+    is none."""
     files = [path, *(path / name for name in _FILES)]
     found = next((file for file in files if file.is_file()), None)
     if found is None:
@@ -79,11 +76,8 @@ def model_file(path: Path) -> Path:
 
 
 def read_model(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an SMPL model file.
-
-    Raises:
-        InputError: it is missing, names anything that could run, or an array is missing or has another shape.
-    """
+    """The arrays of an SMPL model file. InputError: it is missing, names anything that could run, or an array
+    is missing or has another shape."""
     if path.suffix == ".npz":
         with _opened(path) as archive:
             content = {key: archive[key] for key in _SHAPES if key in archive}
@@ -96,11 +90,8 @@ def read_model(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
-    """Parameters of one frame, each a vector of float64.
-
-    Raises:
-        InputError: the file is missing or broken; a vector is missing, has another length or is not finite.
-    """
+    """Parameters of one frame, each a vector of float64. InputError: the file is missing or broken; a vector
+    is missing, has another length or is not finite."""
     if not path.is_file():
         raise InputError(f"{path}: expected SMPL parameters; found no such file")
     with _opened(path) as archive:
@@ -122,11 +113,8 @@ def _opened(path: Path):
 
 
 class Body:
-    """SMPL_NEUTRAL from the file or folder ``path``.
-
-    Raises:
-        InputError: there is no model at ``path``, it is broken, or ``smplx`` is not installed.
-    """
+    """SMPL_NEUTRAL from the file or folder ``path``. InputError: there is no model at ``path``, it is broken,
+    or ``smplx`` is not installed."""
 
     def __init__(self, path: Path) -> None:
         self.model = _model(model_file(path))

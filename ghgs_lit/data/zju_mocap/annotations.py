@@ -40,11 +40,8 @@ class Annotations:
 
 
 def read_annotations(path: Path) -> Annotations:
-    """Read and check an ``annots.npy``.
-
-    Raises:
-        InputError: it is missing, unsafe or broken; a camera or a name is bad.
-    """
+    """Read and check an ``annots.npy``. InputError: it is missing, unsafe or broken; a camera or a name is
+    bad."""
     content = load_npy(path)
     cams, ims = (_entry(path, content, key) for key in ("cams", "ims"))
     lists = {key: _entry(f"{path}: cams", cams, key) for key in ("K", "D", "R", "T")}
@@ -75,11 +72,8 @@ def read_annotations(path: Path) -> Annotations:
 
 
 def frame_number(name: PurePath) -> int:
-    """The frame number in the name of a photograph; the files of bodies are named after it.
-
-    Raises:
-        InputError: the name has neither of the two known forms.
-    """
+    """The frame number in the name of a photograph; the files of bodies are named after it. InputError: the
+    name has neither of the two known forms."""
     field = frame_field(name)
     if not field.isdecimal():
         raise InputError(

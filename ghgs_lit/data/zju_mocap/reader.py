@@ -63,13 +63,10 @@ class ZJUMoCapReader(FrameReader):
     Missing sequences are left out (``ghgs prepare task=check`` counts them).
 
     Args:
-        folder: root of the data set.
-        chosen: which sequences and frames.
         cameras: number of cameras used of each sequence, the first ones (None: all 21 or 23).
         undistorted: remove the lens distortion of photographs and masks.
         masks: folders of label maps; those that a sequence has are united.
         limit: number of frames in all, the first ones (None: all).
-        strict: as for :class:`Reader`.
 
     Raises:
         InputError: all sequences are missing, or annotations are bad.
@@ -96,7 +93,6 @@ class ZJUMoCapReader(FrameReader):
         self.subjects = dict(list(self.subjects.items())[:limit])
 
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
-        """Add the chosen frames of one sequence."""
         annotations = read_annotations(path / "annots.npy")
         count = len(annotations.intrinsics)
         if cameras is not None and cameras > count:

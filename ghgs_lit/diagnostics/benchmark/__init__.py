@@ -1,1 +1,1 @@
-"""Measuring run time against error: presets and knobs on data, and how cost grows on analytic scenes."""
+"""Measuring run time against error: presets and knobs."""

@@ -14,13 +14,9 @@ ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
 
 
 def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf) -> float:
-    """``|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected``
-    is 0 and ``found`` is not; 0 where there are no values.
-
-    Args:
-        found, expected: of one shape.
-        norm: of the difference: the largest of all values, or 2 for their root mean square.
-    """
+    """``|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected`` is
+    0 and ``found`` is not; 0 where there are no values. ``norm``: of the difference: the largest of all
+    values, or 2 for their root mean square."""
     if found.numel() == 0:
         return 0.0
     difference = (found - expected).double().abs()
@@ -49,19 +45,11 @@ def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], 
 def differences(
     found: tuple[Prediction, Rendering], expected: tuple[Prediction, Rendering], masks: Bool[Tensor, "..."]
 ) -> dict[str, float]:
-    """What a preset changes.
-
-    Args:
-        found: of the preset.
-        expected: of the yardstick.
-        masks: of the inputs [B, V, H, W].
-
-    Returns:
-        :func:`relative_difference` of each attribute of the Gaussians, of the ``render`` (root mean square)
-        and of the ``depth`` of the subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in
-        dB of the renders; and ``unmatched``, the part of the yardstick's Gaussians that have no partner, or
-        more than the preset's own that have none.
-    """
+    """What a preset changes. ``masks``: of the inputs [B, V, H, W]. Returns: :func:`relative_difference` of
+    each attribute of the Gaussians, of the ``render`` (root mean square) and of the ``depth`` of the
+    subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the renders; and
+    ``unmatched``, the part of the yardstick's Gaussians that have no partner, or more than the preset's own
+    that have none."""
     (prediction, rendering), (yardstick, reference) = found, expected
     ours, theirs = prediction.gaussians, yardstick.gaussians
     a, b = partners(ours, theirs)

@@ -37,28 +37,19 @@ class Times:
         return cls(median, low, high)
 
 
-@dataclass(frozen=True)
-class Job:
-    """What is timed as one: a case on batches, by a number of threads (None: those there are)."""
-
-    case: Case
-    batches: Sequence[Batch]
-    threads: int | None = None
-
-
 @dataclass
 class Work:
-    """What a forward pass of a batch needs: FLOPs (None: not counted) and peak bytes by stage, and numbers
+    """What a forward pass of a batch needs: FLOPs and peak bytes by stage, and numbers
     of tokens, points, Gaussians and bytes of the PLY."""
 
-    flops: dict[str, float] | None
+    flops: dict[str, float]
     peaks: dict[str, int]
     counts: dict[str, float]
 
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
         """Of several batches: the mean, and the largest peak."""
-        flops = None if works[0].flops is None else _merged([work.flops for work in works], statistics.fmean)
+        flops = _merged([work.flops for work in works], statistics.fmean)
         peaks = _merged([work.peaks for work in works], max)
         return cls(flops, peaks, _merged([work.counts for work in works], statistics.fmean))
 
@@ -79,32 +70,28 @@ class Record:
 
 
 def order(turn: int, count: int) -> list[int]:
-    """The order of ``count`` jobs in a round: each round begins one job later, so that every job has every
+    """The order of ``count`` cases in a round: each round begins one case later, so that every case has every
     neighbour and drift of the machine hits all alike."""
     return [(turn + number) % count for number in range(count)]
 
 
-def time_jobs(jobs: Sequence[Job], warmup: int, repeats: int, device: torch.device) -> list[dict[str, Times]]:
-    """Time jobs in interleaved rounds.
+def time_cases(
+    cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
+) -> list[dict[str, Times]]:
+    """The seconds of each stage of each case, means over the batches, in interleaved rounds.
 
     Args:
-        jobs: what is timed.
         warmup: rounds that do not count.
         repeats: rounds that count, at least 1.
-        device: where the models are.
-
-    Returns:
-        For each job the seconds of each stage, means over its batches.
     """
-    seconds: list[dict[str, list[float]]] = [{} for _ in jobs]
+    seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
-        for number in order(turn, len(jobs)):
-            job, probe = jobs[number], SecondsProbe(device)
-            with threads(job.threads):
-                for batch in job.batches:
-                    forward(job.case.model, job.case.renderer, batch, probe)
+        for number in order(turn, len(cases)):
+            case, probe = cases[number], SecondsProbe(device)
+            for batch in batches:
+                forward(case.model, case.renderer, batch, probe)
             for stage, value in probe.seconds().items() if turn >= 0 else ():
-                seconds[number].setdefault(stage, []).append(value / len(job.batches))
+                seconds[number].setdefault(stage, []).append(value / len(batches))
     return [{stage: Times.of(values) for stage, values in stages.items()} for stages in seconds]
 
 
@@ -119,18 +106,13 @@ def threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def inspect(
-    case: Case, batch: Batch, device: torch.device, count_flops: bool
-) -> tuple[Work, Prediction, Rendering]:
-    """Predict a batch once for its FLOPs, where they are counted, and once for its memory."""
-    flops = None
-    if count_flops:
-        with FlopsProbe() as counted:
-            forward(case.model, case.renderer, batch, counted)
-        flops = counted.flops
+def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Prediction, Rendering]:
+    """Predict a batch once for its FLOPs and once for its memory."""
+    with FlopsProbe() as counted:
+        forward(case.model, case.renderer, batch, counted)
     memory = PeakProbe(device)
     prediction, rendering = forward(case.model, case.renderer, batch, memory)
-    return Work(flops, memory.peaks, _counts(prediction)), prediction, rendering
+    return Work(counted.flops, memory.peaks, _counts(prediction)), prediction, rendering
 
 
 def _counts(prediction: Prediction) -> dict[str, float]:
@@ -155,23 +137,18 @@ def record_cases(
     device: torch.device,
     warmup: int,
     repeats: int,
-    count_flops: bool,
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times.
 
     Args:
         cases: of each source the yardstick first.
         batches: on the device, with targets.
-        metrics: of the renders.
-        device: where the models are.
-        warmup, repeats: as for :func:`time_jobs`.
-        count_flops: whether FLOPs are counted, which takes one more forward pass.
     """
     works: list[list[Work]] = [[] for _ in cases]
-    records = [Record(case, Work(None, {}, {})) for case in cases]
+    records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):
         for record, mine in zip(records, works, strict=True):
-            work, *result = inspect(record.case, batch, device, count_flops)
+            work, *result = inspect(record.case, batch, device)
             if record.case.is_yardstick:
                 yardstick = result
             mine.append(work)
@@ -179,7 +156,7 @@ def record_cases(
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
             record.metrics += _metrics(record.case, batch, *result, metrics, device)
-    times = time_jobs([Job(case, batches) for case in cases], warmup, repeats, device)
+    times = time_cases(cases, batches, warmup, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work, record.times = Work.of(mine), seconds
     return records

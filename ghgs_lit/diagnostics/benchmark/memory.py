@@ -59,7 +59,6 @@ class PeakProbe(Watcher):
             self.reset()
 
     def _note(self) -> None:
-        """The peak since the last reset counts for all stages that are open."""
         peak = self.peak() - self._base
         for stage in self._open:
             self.peaks[stage] = max(self.peaks.get(stage, 0), peak)

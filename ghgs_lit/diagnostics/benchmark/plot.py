@@ -1,12 +1,10 @@
-"""Run time against error with the Pareto front, and cost against the size of a task, as figures."""
+"""Run time against error with the Pareto front, as a figure."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from ghgs_lit.diagnostics.benchmark.report import totals
 from ghgs_lit.runs.results import Row
@@ -34,11 +32,6 @@ def draw_presets(rows: Sequence[Row], machine: str, about: str) -> Figure:
 
     The error is the loss of PSNR against ``none``; of weights that nobody trained, the largest relative
     difference.
-
-    Args:
-        rows: of a benchmark.
-        machine: what the times were measured on, in words.
-        about: what was measured, in words.
     """
     whole = totals(rows)
     is_trained = all(row["trained"] for row in whole)
@@ -70,37 +63,4 @@ def draw_presets(rows: Sequence[Row], machine: str, about: str) -> Figure:
     axes.grid(alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)
     axes.set_title(f"{about}\n{machine}", fontsize=8)
-    return figure
-
-
-def draw_scaling(rows: Sequence[Row], fits: Sequence[Mapping[str, Any]], machine: str, about: str) -> Figure:
-    """Seconds of each preset along each axis of the scaling study, with the fitted exponents.
-
-    Args:
-        rows, fits: of the study.
-        machine: what the times were measured on, in words.
-        about: what was measured, in words.
-    """
-    whole = totals(rows)
-    names = list(dict.fromkeys(row["axis"] for row in whole))
-    presets = list(dict.fromkeys(row["preset"] for row in whole))
-    figure = Figure(figsize=(4.2 * len(names), 4), layout="constrained")
-    exponents = {(f["axis"], f["preset"], f["stage"]): f["exponent"] for f in fits}
-    for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names), sharey=True)), names, strict=True):
-        for number, preset in enumerate(presets):
-            mine = [row for row in whole if (row["axis"], row["preset"]) == (name, preset)]
-            exponent = exponents.get((name, preset, "total"))
-            label = preset if exponent is None else f"{preset}: exponent {exponent:.2f}"
-            line = [row["value"] for row in mine], [row["seconds"] for row in mine]
-            axes.plot(*line, "o-", color=_COLORS(number % 10), label=label)
-        values = sorted({row["value"] for row in whole if row["axis"] == name})
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.set_xticks(values, [f"{value:g}" for value in values])
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.set_xlabel(name)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
-    figure.supylabel("seconds of a batch (median)", fontsize=9)
-    figure.suptitle(f"{about}\n{machine}", fontsize=8)
     return figure

@@ -46,11 +46,7 @@ class Source:
 
     @classmethod
     def of_checkpoint(cls, name: str, path: str) -> "Source":
-        """The model of a checkpoint.
-
-        Raises:
-            FileNotFoundError, InputError: as for :func:`read_checkpoint`.
-        """
+        """The model of a checkpoint. FileNotFoundError, InputError: as for :func:`read_checkpoint`."""
         return cls(name, read_checkpoint(path)["config"], path)
 
 
@@ -59,15 +55,11 @@ class Case:
     """A model that is measured.
 
     Args:
-        source: name of its weights.
-        preset: name of the preset.
         knobs: values that were changed, by key.
         model: in evaluation mode, on its device.
-        renderer: of its Gaussians.
         budget_db: PSNR that the preset may lose against the yardstick; None: nothing is promised.
         max_rel_diff: difference of every attribute from the yardstick's that the preset may make, times
             :data:`ROUNDS_AMPLIFY` where there are rounds; None: nothing is promised.
-        is_trained: whether its weights are a checkpoint's.
     """
 
     source: str
@@ -107,11 +99,8 @@ def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str,
 
 
 def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
-    """Every choice of one value for each knob.
-
-    Raises:
-        InputError: a knob that does not exist, or has no list of values.
-    """
+    """Every choice of one value for each knob. InputError: a knob that does not exist, or has no list of
+    values."""
     for key, values in knobs.items():
         require(is_below(key, KNOBS), f"knobs.{key}", f"a key of {', '.join(KNOBS)}", key)
         is_list = isinstance(values, Sequence) and not isinstance(values, str)
@@ -120,22 +109,10 @@ def combinations(knobs: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def case_config(
-    source: Source,
-    skip: Mapping[str, Any],
-    knobs: Mapping[str, Any],
-    shared: Mapping[str, Any],
+    source: Source, skip: Mapping[str, Any], knobs: Mapping[str, Any], shared: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The configuration of a case as plain data.
-
-    Args:
-        source: gives the model's nodes.
-        skip: the values of the preset.
-        knobs: values by key.
-        shared: nodes that all cases have (``renderer``, ``precision``).
-
-    Raises:
-        InputError: a knob that the configuration does not have.
-    """
+    """The configuration of a case as plain data. ``shared``: nodes that all cases have (``renderer``,
+    ``precision``). InputError: a knob that the configuration does not have."""
     own = {name: source.config[name] for name in MODEL_NODES if name in source.config}
     node = OmegaConf.create({**own, **shared, "skip": dict(skip)})
     for key, value in knobs.items():
@@ -156,11 +133,8 @@ def cases_of(
     """The cases of one source; they share one copy of the weights.
 
     Args:
-        source, shared: as for :func:`case_config`.
         presets: of :func:`presets_of`; the yardstick comes first, without knobs, where it is among them.
         knobs: values of each knob, by key; every preset is measured with every combination.
-        device: of the models.
-        seed: of random weights.
 
     Raises:
         InputError: a preset or knob that the model refuses, or to which the weights do not fit.

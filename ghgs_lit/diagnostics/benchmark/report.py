@@ -41,11 +41,8 @@ _COLUMNS = {
 
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
-    """One row for each case and stage; the row ``total`` has the errors and the budgets, too.
-
-    Args:
-        records: of each source the yardstick first.
-    """
+    """One row for each case and stage; the row ``total`` has the errors and the budgets, too. ``records``: of
+    each source the yardstick first."""
     rows: list[Row] = []
     for record in records:
         (means,) = summarize(record.metrics)
@@ -62,25 +59,22 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
             **record.work.counts,
             "differences": record.differences,
         }
-        rows += [stage_row(record, stage, total if stage == TOTAL else {}) for stage in record.times]
+        for stage, times in record.times.items():
+            rows.append(
+                {
+                    "model": record.case.source,
+                    "preset": record.case.label,
+                    "stage": stage,
+                    "seconds": times.median,
+                    "seconds_low": times.low,
+                    "seconds_high": times.high,
+                    "peak_bytes": record.work.peaks.get(stage),
+                    "flops": record.work.flops.get(stage),
+                    **dict.fromkeys(("max_rel_diff", "psnr", "psnr_loss_db", "budget_db")),
+                    **(total if stage == TOTAL else {}),
+                }
+            )
     return rows
-
-
-def stage_row(record: Record, stage: str, about: Mapping[str, Any]) -> Row:
-    """The row of one stage, with what else is known ``about`` it."""
-    times, work = record.times[stage], record.work
-    return {
-        "model": record.case.source,
-        "preset": record.case.label,
-        "stage": stage,
-        "seconds": times.median,
-        "seconds_low": times.low,
-        "seconds_high": times.high,
-        "peak_bytes": work.peaks.get(stage),
-        "flops": None if work.flops is None else work.flops.get(stage),
-        **dict.fromkeys(("max_rel_diff", "psnr", "psnr_loss_db", "budget_db")),
-        **about,
-    }
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
@@ -127,7 +121,6 @@ def tables_of(rows: Sequence[Row]) -> Tables:
 
 
 def _kept(row: Row) -> str:
-    """What became of the promises of a case."""
     promises = row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
     return "broken" if _broken(row) else "kept" if promises else "-"
 

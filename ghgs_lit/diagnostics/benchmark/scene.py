@@ -1,4 +1,4 @@
-"""A subject of a given size in the frame: an ellipsoid before a ring of cameras, for the scaling study."""
+"""A subject of a given size in the frame: an ellipsoid before a ring of cameras."""
 
 import math
 
@@ -31,10 +31,7 @@ def ellipsoid_batch(
 
     Args:
         share: part of the frame that the subject covers.
-        views: number of input views, at even angles.
         size: side, or height and width, of the photographs in pixels.
-        batch: number of elements.
-        seed: of the noise.
 
     Returns:
         The batch; its target is the first input view.

@@ -13,10 +13,6 @@ def random_model(config: Mapping[str, Any], seed: int = 0) -> GHGS:
     """A model with random weights, without the time of the usual initialisation.
 
     No last layer is 0, as it is at the start of training: every output depends on the photographs.
-
-    Args:
-        config: of the model.
-        seed: of the weights.
     """
     generator = torch.Generator().manual_seed(seed)
 

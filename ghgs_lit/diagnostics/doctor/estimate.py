@@ -112,14 +112,12 @@ def estimate(
 
     Args:
         config: of the model; for training, of a run of ``ghgs train``.
-        scene: the photographs.
         device: ``cpu`` or ``cuda``: whose kernels run.
         precision: of matrix products, ``float32``, ``bfloat16`` or ``float16``.
-        training: whether a loss and its gradients are computed, too.
     """
     shapes, flops = Shapes(), FlopsProbe()
     model = filled_model(config, lambda _, parameter: shapes.of(parameter.shape))
-    model.train(training).options = model.options.replace(check_inputs=False)
+    model.train(training).checks_values = False
     batch, needs = _batch(scene, shapes), _Needs(shapes, flops)
     half = precision != "float32"
     # Tensors without values are on the CPU, whatever the device.

@@ -20,11 +20,7 @@ Line = tuple[str, str]
 
 
 def machine_lines(device: torch.device) -> list[Line]:
-    """What there is, as pairs of a name and its value.
-
-    Args:
-        device: the device that work would run on.
-    """
+    """What there is, as pairs of a name and its value."""
     facts = machine_facts(device)
     versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
     total, available = memory_of_host()

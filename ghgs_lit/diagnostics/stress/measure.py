@@ -187,7 +187,6 @@ def _compared(stage: Stage, family: str, exact: Values, truth: Values, spread: V
 
 
 def _refused(stage: Stage, cases: Values, dtype: str) -> Outcome:
-    """Each case alone must raise an ``InputError``."""
     inputs, errors = _inputs(cases, dtype), []
     for i in range(len(next(iter(cases.values())))):
         try:

@@ -44,7 +44,7 @@ def bounded(error: float | None) -> str:
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
-    """The worst errors, the numbers of cases, budgets with their reasons, and why cells are empty."""
+    """The worst errors, the numbers of cases, budgets with their reasons, and what families are."""
     found, cases = summary(rows), _matrix(pd.DataFrame(rows), "cases", "sum")
     families, stages = list(cases.columns), [STAGES[name] for name in cases.index]
     worst = pd.DataFrame(found["worst"]).assign(error=[bounded(row["error"]) for row in found["worst"]])
@@ -55,10 +55,6 @@ def to_markdown(rows: Sequence[Row]) -> str:
         "Worst errors": texts(worst, {name: (name, form) for name, form in shown.items()}),
         "Cases": counts.assign(all=cases.sum(axis=1).map("{:.0f}".format)).reset_index(),
         "Budgets": pd.DataFrame(budgets, columns=["stage", "factor", "reason"]),
-        "Empty cells": pd.DataFrame(
-            [(stage.name, *_missing(stage, families)) for stage in stages],
-            columns=["stage", "families", "dtypes"],
-        ),
         "Families": pd.DataFrame({"family": families, "inputs": [FAMILIES[f].says for f in families]}),
     }
     notes = [
@@ -66,15 +62,6 @@ def to_markdown(rows: Sequence[Row]) -> str:
         "Errors are in units of eps times the condition number of the case.",
     ]
     return document("Stress test", notes, tables)
-
-
-def _missing(stage: Any, families: Sequence[str]) -> tuple[str, str]:
-    """Why a stage has no cases of some families, and no other dtypes."""
-    reasons: dict[str, list[str]] = {}
-    for family in families:
-        if reason := stage.missing(family):
-            reasons.setdefault(reason, []).append(family)
-    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items()), stage.no_dtype
 
 
 def _matrix(frame: pd.DataFrame, values: str, how: str) -> pd.DataFrame:

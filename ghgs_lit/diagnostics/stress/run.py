@@ -11,7 +11,6 @@ import torch
 
 from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
-from ghgs_lit.diagnostics.stress.stage import DTYPES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
 from ghgs_lit.runs.journal import Journal
@@ -25,35 +24,28 @@ class Task:
     stage: str
     family: str
     seeds: int
-    dtypes: tuple[str, ...]
 
     @property
     def key(self) -> str:
         """A name that no other task has."""
-        return "/".join((self.stage, self.family, str(self.seeds), ",".join(self.dtypes)))
+        return "/".join((self.stage, self.family, str(self.seeds)))
 
     def run(self) -> list[Row]:
         """One row for each dtype."""
-        rows = measure(STAGES[self.stage], self.family, range(self.seeds), self.dtypes)
+        rows = measure(STAGES[self.stage], self.family, range(self.seeds))
         return [{**row, "seeds": self.seeds} for row in rows]
 
 
 def tasks_of(
     stages: Sequence[str] | None = None,
     families: Sequence[str] | None = None,
-    dtypes: Sequence[str] | None = None,
     quick: bool = False,
 ) -> list[Task]:
-    """Everything to run; None: all stages, families or dtypes.
-
-    Raises:
-        InputError: a name that is not known.
-    """
+    """Everything to run; None: all stages or families. InputError: a name that is not known."""
     stages = _chosen("stages", stages, tuple(STAGES))
     families = _chosen("families", families, tuple(FAMILIES))
-    dtypes = _chosen("dtypes", dtypes, DTYPES)
     return [
-        Task(name, family, STAGES[name].quick if quick else STAGES[name].seeds, dtypes)
+        Task(name, family, STAGES[name].quick if quick else STAGES[name].seeds)
         for name in stages
         for family in families
         if STAGES[name].missing(family) is None
@@ -70,7 +62,6 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
     """The rows of all tasks; those that ``journal`` has already are read from it.
 
     Args:
-        tasks: what to run.
         journal: a file of one line for each task, which is written as the tasks end.
         workers: processes; 0: this one.
     """

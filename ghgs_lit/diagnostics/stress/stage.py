@@ -12,6 +12,8 @@ Values = dict[str, Tensor]
 
 #: Names of the dtypes: the last two are those of autocast, with inputs in float32.
 DTYPES = ("float64", "float32", "bfloat16", "float16")
+#: Those of kernels and of photographs, which are never in float64.
+FLOAT32_ONLY = DTYPES[1:]
 
 #: The largest factor of a budget: more than this many roundings of its inputs no stage may lose.
 LARGEST = 100.0
@@ -26,20 +28,16 @@ class Stage:
     is rounded at random, in units of eps.
 
     Args:
-        name: of the row.
         ingredients: what the inputs contain; families of others do not apply.
         make: the inputs of one case in float64, from a family and a generator.
         run: outputs [n, ...] of n cases, whose inputs are stacked; in the dtype of the inputs.
         factor: at most :data:`LARGEST`.
-        reason: why this factor.
         reference: the same in float64 by other means; None: ``run`` itself in float64.
         gradients: inputs whose gradients are compared, too.
         steady: inputs that are not rounded for kappa.
         seeds: cases of each family and dtype in the full run.
         quick: the same in a quick run, which says nothing of rare failures.
         network: computes in autocast's dtype; all others stay in float32 or wider.
-        dtypes: those that the stage has.
-        no_dtype: why it has no others.
         kappa: a least condition number, where the stage's definition subtracts large numbers.
         excluded: families that do not apply although their ingredient does, with the reason.
         sizes: size of the numbers [n] whose differences gradients are, where those cancel by definition.
@@ -61,7 +59,6 @@ class Stage:
     quick: int = 3
     network: bool = False
     dtypes: tuple[str, ...] = DTYPES
-    no_dtype: str = ""
     kappa: Callable[[Values], Tensor] | None = None
     excluded: Mapping[str, str] = field(default_factory=dict)
     sizes: Callable[[Values], Tensor] | None = None
@@ -72,8 +69,6 @@ class Stage:
     def __post_init__(self) -> None:
         if not (0 < self.factor <= LARGEST and self.reason):
             raise ValueError(f"{self.name}: a budget needs a factor up to {LARGEST} and a reason")
-        if (self.dtypes != DTYPES) != bool(self.no_dtype):
-            raise ValueError(f"{self.name}: dtypes that are left out need a reason")
 
     def missing(self, family: str) -> str | None:
         """Why there are no cases of a family; None where there are."""

@@ -11,16 +11,18 @@ import numpy as np
 from numba.core import types
 from numba.np.numpy_support import from_dtype
 
-from ghgs_lit.encoder.cpu.bfloat16 import aligned_words, pack_line, per_word, store_numbers
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
-from ghgs_lit.encoder.cpu.products import add_values, score
-from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
 from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.bfloat16 import aligned_words, pack_line, per_word, store_numbers
 from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.products import make_product, product
 from ghgs_lit.kernels.simd import EXP2_LIMIT
+from ghgs_lit.kernels.tile import PANEL, ROWS
 
 LANES = simd.LANES
 LOWEST = np.float32(-np.inf)
+#: ``out += x y`` where the words of one row are neighbours: ``KEYS`` numbers.
+add_values = make_product(lambda half: (KEYS // 2 if half else KEYS, 1), adds=True)
 
 
 def _attend_head(q, k, v, out, first, last):
@@ -112,7 +114,7 @@ def _pack_queries(q, start, count, packed):
 def _score(queries, row, keys, key, seen, steps, scores):
     """Products of ``ROWS`` queries and ``seen`` keys [ROWS, KEYS]; the padding after them is -inf."""
     for panel in range(0, seen, PANEL):
-        score(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
+        product(queries, row * steps, keys, (key + panel) * steps, steps, scores, panel, KEYS)
     for r in range(ROWS):
         for i in range(seen, _padded(seen)):
             scores[r * KEYS + i] = LOWEST

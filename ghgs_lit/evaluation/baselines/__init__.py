@@ -17,29 +17,15 @@ from ghgs_lit.evaluation.measure import Method, ModelMethod, Renderer
 __all__ = ["BASELINES", "baseline", "black", "nearest_view", "splats_at", "splatted"]
 
 #: By name, what gives the depth of a baseline's discs.
-DEPTHS = {
-    "body_depth": body_depth,
-    "hull": hull_depth,
-    "photo_depth": photo_depth,
-    "true_depth": true_depth,
-}
+DEPTHS = {"body_depth": body_depth, "hull": hull_depth, "photo_depth": photo_depth, "true_depth": true_depth}
 BASELINES = ("black", "nearest_view", *DEPTHS, "per_scene", "untrained")
 
 
 def baseline(
-    name: str,
-    renderer: Renderer,
-    untrained: Callable[[], torch.nn.Module],
-    per_scene: Mapping[str, Any],
+    name: str, renderer: Renderer, untrained: Callable[[], torch.nn.Module], per_scene: Mapping[str, Any]
 ) -> Method:
-    """The baseline called ``name``, one of ``BASELINES``.
-
-    Args:
-        name: which one.
-        renderer: draws its Gaussians.
-        untrained: builds a model with random weights, for the baseline ``untrained``.
-        per_scene: options of :class:`PerScene`.
-    """
+    """The baseline called ``name``, one of ``BASELINES``. ``untrained``: builds a model with random weights,
+    for the baseline ``untrained``."""
     choice("baselines", name, BASELINES)
     if name in DEPTHS:
         return partial(splatted, depth_of=DEPTHS[name], renderer=renderer)

@@ -31,7 +31,6 @@ class PerScene:
     None is added or pruned: a Gaussian for each pixel of each photograph is more than they can tell apart.
 
     Args:
-        renderer: draws the Gaussians.
         steps: of the optimiser, 1 or more.
         start: where the Gaussians begin, ``hull`` or ``photo_depth``.
     """

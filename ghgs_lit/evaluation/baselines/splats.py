@@ -26,7 +26,6 @@ def splats_at(
     """Round splats for pixels of the inputs, in the order of the pixels.
 
     Args:
-        batch: gives cameras and colours.
         depth: where the splats are [B, V, H, W], metres.
         valid: pixels that get a splat [B, V, H, W].
         sigma: standard deviation in pixels of the input.
@@ -47,13 +46,7 @@ def splats_at(
 
 
 def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
-    """Discs on the surface that depth maps describe, as Gaussian heads with ``axes=surface`` start.
-
-    Args:
-        batch: gives cameras, colours and mattes.
-        depth: as for :func:`splats_at`.
-        valid: likewise.
-    """
+    """Discs on the surface that depth maps describe, as Gaussian heads with ``axes=surface`` start."""
     places = valid.flatten(0, 1).flatten(1).nonzero()
     image, pixel = places.unbind(1)
     intrinsics = at_least_float32(batch.cameras.intrinsics)
@@ -95,12 +88,7 @@ def true_depth(batch: Batch) -> Tensor:
 
 def splatted(batch: Batch, depth_of: Callable[[Batch], Tensor], renderer: Renderer) -> Estimate:
     """Discs at a depth that is not learned, of pixels at the rim, too, where the data have mattes.
-
-    Args:
-        batch: inputs and targets.
-        depth_of: gives depths of the inputs [B, V, H, W], metres.
-        renderer: draws the discs.
-    """
+    ``depth_of``: gives depths of the inputs [B, V, H, W], metres."""
     batch = with_matte(batch, _MATTE)
     depth = depth_of(batch)
     valid = batch.masks & (depth > 0)

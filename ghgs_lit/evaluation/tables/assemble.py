@@ -34,10 +34,7 @@ class TableOptions:
     """What is shown.
 
     Args:
-        layout: rows and columns.
         views, targets, metrics: a selection; None: those of the layout and of the runs.
-        reported: whether the paper's figures are shown.
-        test: the test against the reference row.
         unit: a regular expression whose first group is the person, where subjects are frames of people.
         illustration: whether a note says that the numbers are no result, of which none is bold.
     """
@@ -53,17 +50,9 @@ class TableOptions:
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
-    """One table for each setting that occurs (and each model, where rows are ablations).
-
-    Args:
-        sweep: our runs.
-        others: results of other methods, of each file.
-        options: what is shown.
-
-    Raises:
-        InputError: nothing was measured on these targets; two runs claim one cell; the results of other
-            methods fit no table.
-    """
+    """One table for each setting that occurs (and each model, where rows are ablations). ``others``: results
+    of other methods, of each file. InputError: nothing was measured on these targets; two runs claim one
+    cell; the results of other methods fit no table."""
     layout = options.layout
     if others and layout.rows == "ablation":
         raise InputError(f"others: expected layout=table1, table2 or table3; found {layout.name}")
@@ -91,7 +80,6 @@ def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOpt
 
 
 def _measured(rows: pd.DataFrame) -> list[str]:
-    """The metrics of some rows."""
     facts = {*SETTING, "variant", "views", "seed", "source", "run", "git", "subject", "count", "said"}
     return [name for name in rows if name not in facts and rows[name].notna().any()]
 

@@ -30,11 +30,8 @@ def fill(
     """Fill ``table.cells``.
 
     Args:
-        table: its lines, columns and rows are known.
         figures: the reported figures, as entries of ``table.cells``.
-        test: the test against the reference row.
         unit: tells persons of subjects, as for :func:`person_of`.
-        configs: configurations by file, for messages.
         illustration: nothing is best: the numbers are no result.
 
     Raises:

@@ -9,8 +9,8 @@ from ghgs_lit.evaluation.tables.records import Planned, Variant
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
 DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
+HIGHER_IS_BETTER = ("psnr", "ssim")
 LOWER_IS_BETTER = ("lpips", "flip", "depth_error_mm", "prediction_seconds", "seconds", "peak_gb")
-NEITHER_IS_BETTER = ("gaussians", "steps")
 TITLES = {
     "depth_error_mm": "Depth error (mm)",
     "gaussians": "Gaussians",
@@ -26,10 +26,8 @@ class Layout:
     """Rows (``ablation``: all four combinations, or ``methods``) and groups of columns.
 
     Args:
-        name: the layout's name.
         rows: ``ablation`` or ``methods``.
         columns: ``views`` or ``data``, one group for each.
-        views: numbers of input views.
         heading: above each group of columns: its ``views``, its ``data`` or ``none``.
         reported: the paper's table whose figures are shown beside the measured ones.
     """
@@ -68,9 +66,9 @@ def decimals(metric: str) -> int:
 
 
 def arrow(metric: str) -> str:
-    """Whether higher (↑) or lower (↓) is better; empty where neither is."""
+    """Whether higher (↑) or lower (↓) is better; empty where neither is, or nothing says."""
     stem = _stem(metric)
-    return "" if stem in NEITHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else "↑"
+    return "↑" if stem in HIGHER_IS_BETTER else "↓" if stem in LOWER_IS_BETTER else ""
 
 
 def title(metric: str) -> str:
@@ -121,12 +119,10 @@ class Table:
     """One table: everything that a writer of a format needs.
 
     Args:
-        layout: its layout.
         rows: what was measured, as in :class:`Sweep`.
         planned: the training runs of the sweep, finished or not, that belong to it.
         stub: headings of the first columns.
         groups, metrics: the columns.
-        lines: the rows.
         cells: by ``CELL``, every line and column in order: ``mean`` over subjects and seeds (nan: no number),
             ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as
             tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best``: whether it is the best of its

@@ -38,8 +38,6 @@ class Variant:
 
     Args:
         kind: ``model`` (ours), ``baseline``, ``other`` (another method) or ``reported`` (by the paper).
-        name: name of the method.
-        model, encoder: options of our model.
         switches: whether 3D unprojection and semantic consistency are on.
         has_semantics: whether the semantic features have learned parts: from published weights or in `ghgs
             pretext`. It is not known before training starts, so rows are not told apart by it.
@@ -114,7 +112,6 @@ def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()
 
     Args:
         config: the configuration that it was trained with.
-        source: the file of the configuration, for messages.
         by: keys that tell rows apart beside model, encoder and ablation.
 
     Raises:
@@ -164,8 +161,6 @@ class _Training(_Strict):
 
 
 class _Provenance(_Strict):
-    """What tables read of the provenance of results."""
-
     config: dict[str, Any]
     config_hash: str | None = None
     # The configuration of `ghgs evaluate` does not say how the model was trained; that of its checkpoint
@@ -234,7 +229,6 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     """All runs below some folders, finished or not.
 
     Args:
-        folders: directories of runs.
         by: configuration keys that tell rows apart beside model, encoder and ablation.
 
     Raises:

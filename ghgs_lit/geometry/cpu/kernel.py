@@ -1,4 +1,4 @@
-"""The plane sweep of one pixel after the other (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
+"""The plane sweep of 16 pixels at once (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
 
 import math
 from functools import cache
@@ -6,110 +6,127 @@ from functools import cache
 import numpy as np
 from numba.core import types
 
+from ghgs_lit.geometry.cpu.pixels import CHANNELS, channels_of, interpolate, store_places
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
 from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
 ZERO, HALF, ONE, THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
-# Unsigned: a signed index is compared with 0 at each access.
-INSIDE, CHANNELS = np.uint64(3), np.uint64(4)
 
 FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
-MASKS, PAIRS = types.Array(types.boolean, 4, "C"), types.Array(types.boolean, 3, "C")
+PIXELS, PAIRS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
 NUMBER = types.int64
 
 
 @cache
-def sweep_rows():
-    """The compiled :func:`_sweep_rows`."""
-    maps = (FLOATS[1], MASKS, FLOATS[4], FLOATS[4], FLOATS[5], FLOATS[4], PAIRS, FLOATS[1])
-    return kernel_for(_sweep_rows, *maps, types.float32, FLOATS[5], *[NUMBER] * 4)
+def sweep_pixels():
+    """The compiled :func:`_sweep_pixels`."""
+    rows = (PIXELS, FLOATS[1], FLOATS[1])
+    views = (FLOATS[5], FLOATS[4], PAIRS)
+    numbers = [NUMBER] * 5
+    return kernel_for(_sweep_pixels, FLOATS[1], *rows, *views, FLOATS[1], types.float32, FLOATS[2], *numbers)
 
 
 @helper
-def _project(ray, shift, low, length, shares, height, width, pixels, rights, downs):
-    """Where the points of a ray lie in an image: index among its pixels, and the way to the next pixels.
+def _rays(turn, u, v):
+    """The directions of pixels in another view, not normalised."""
+    return (
+        turn[0, 0] * u + (turn[0, 1] * v + turn[0, 2]),
+        turn[1, 0] * u + (turn[1, 1] * v + turn[1, 2]),
+        turn[2, 0] * u + (turn[2, 1] * v + turn[2, 2]),
+    )
+
+
+@helper
+def _project(rays, shift, depth, height, width, places, rights, downs):
+    """Where points of rays lie in an image: places of its pixels, and the way to the next pixels.
 
     What lies outside the image, behind it or nowhere (NaN) is put into its rim, where nothing is seen.
     """
-    for s in range(len(shares)):
-        depth = low + length * shares[s]
-        z = ray[2] * depth + shift[2]
-        x, y = (ray[0] * depth + shift[0]) / z - HALF, (ray[1] * depth + shift[1]) / z - HALF
-        seen = (z > ZERO) & (x > -ONE) & (x < np.float32(width)) & (y > -ONE) & (y < np.float32(height))
-        x, y = x if seen else -ONE, y if seen else -ONE
-        left, top = np.floor(x), np.floor(y)
-        rights[s], downs[s] = x - left, y - top
-        pixels[s] = (np.int32(top) + np.int32(1)) * np.int32(width + 2) + np.int32(left) + np.int32(1)
+    z = simd.fma(rays[2], depth, shift[2])
+    inverse = ONE / z
+    x = simd.fma(rays[0], depth, shift[0]) * inverse - HALF
+    y = simd.fma(rays[1], depth, shift[1]) * inverse - HALF
+    seen = (z > ZERO) & (x > -ONE) & (x < np.float32(width)) & (y > -ONE) & (y < np.float32(height))
+    x, y = simd.select(seen, x, -ONE), simd.select(seen, y, -ONE)
+    left, top = simd.floor(x), simd.floor(y)
+    memory.store(rights, 0, x - left)
+    memory.store(downs, 0, y - top)
+    store_places(places, 0, top + ONE, left + ONE, (width + 2) * CHANNELS)
 
 
 @helper
-def _compare(colors, own, at, line, right, down, columns):
-    """Difference of pixel ``own`` and what lies between four pixels from ``at``; how much is seen there.
-
-    A line's two pixels are loaded at once; ``columns`` holds their channels on the way down to the next line.
-    """
-    above, below = memory.load_anywhere(colors, at), memory.load_anywhere(colors, at + line)
-    memory.store(columns, 0, simd.fma(below - above, down, above))
-    difference = ZERO
-    for channel in range(INSIDE):
-        color = columns[channel] + right * (columns[channel + CHANNELS] - columns[channel])
-        difference += abs(color - colors[own + channel])
-    return difference, columns[INSIDE] + right * (columns[INSIDE + CHANNELS] - columns[INSIDE])
+def _difference(first, second):
+    return simd.maximum(first - second, second - first)
 
 
 @helper
-def _keep_best(best, differences, seen, rate):
-    """``best = max(best, seen 2^(-rate difference))``."""
-    for s in range(0, len(best), LANES):
-        exponent = memory.load(differences, s) * simd.full(rate)
-        agreement = memory.load(seen, s) * simd.exp2_minus(simd.minimum(simd.full(EXP2_LIMIT), exponent))
-        memory.store(best, s, simd.maximum(memory.load(best, s), agreement))
+def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, values, own):
+    """Fill ``values`` with the pixels' centres, near and far - near; ``own`` with their colours."""
+    for lane in range(LANES):
+        i = min(start + lane, last - 1)
+        place = pixels[i] % (height * width)
+        row, column = place // width, place % width
+        values[lane], values[LANES + lane] = np.float32(column) + HALF, np.float32(row) + HALF
+        values[2 * LANES + lane], values[3 * LANES + lane] = near[i], far[i] - near[i]
+        at = begin + ((row + 1) * (width + 2) + column + 1) * CHANNELS
+        for channel in range(CHANNELS):
+            own[lane * CHANNELS + channel] = colors[at + channel]
 
 
-def _sweep_rows(
-    colors, masks, near, far, turn, shift, compared, shares, tolerance, out, element, view, first, last
+def _sweep_pixels(
+    colors,
+    pixels,
+    near,
+    far,
+    turn,
+    shift,
+    compared,
+    shares,
+    tolerance,
+    out,
+    height,
+    width,
+    image,
+    first,
+    last,
 ):
-    """Write rows ``first`` to ``last`` of ``out[element, view]``; see :func:`ghgs_lit.geometry.cpu.sweep`.
-
-    The arithmetic of all depths of a pixel comes before their colours: without a branch, it is vectorized.
-    """
-    views, height, width = masks.shape[1], masks.shape[2], masks.shape[3]
-    count = len(shares)
-    line = np.uint64(width + 2) * CHANNELS
-    size = np.uint64(height + 2) * line
+    """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
+    views = turn.shape[1]
+    element, view = image // views, image % views
+    line = (width + 2) * CHANNELS
+    size = (height + 2) * line
     rate = np.float32(math.log2(math.e)) / (THREE * tolerance)
-    padded = -(-count // LANES) * LANES
-    pixels = np.empty(count, np.int64)
-    rights, downs = np.empty(count, np.float32), np.empty(count, np.float32)
-    differences, seen, best = simd.aligned(padded), simd.aligned(padded), simd.aligned(padded)
-    columns = simd.aligned(LANES)
-    differences[:], seen[:] = ZERO, ZERO  # no result, but defined arithmetic beyond the last depth
-    for row in range(first, last):
-        v = np.float32(row) + HALF
-        for column in range(width):
-            if not masks[element, view, row, column]:
+    values, own, found = simd.aligned(4 * LANES), simd.aligned(4 * LANES), simd.aligned(4 * LANES)
+    rights, downs, places = simd.aligned(LANES), simd.aligned(LANES), np.empty(LANES, np.int32)
+    best = simd.aligned(len(shares) * LANES)
+    for start in range(first, last, LANES):
+        _load_pixels(colors, pixels, near, far, start, last, height, width, image * size, values, own)
+        u, v, low, length = (
+            memory.load(values, 0),
+            memory.load(values, LANES),
+            memory.load(values, 2 * LANES),
+            memory.load(values, 3 * LANES),
+        )
+        red, green, blue, _ = channels_of(own, 0)
+        best[:] = ZERO
+        for other in range(views):
+            if other == view or not compared[element, view, other]:
                 continue
-            u = np.float32(column) + HALF
-            place = np.uint64((row + 1) * (width + 2) + column + 1) * CHANNELS
-            own = np.uint64(element * views + view) * size + place
-            low = near[element, view, row, column]
-            length = far[element, view, row, column] - low
-            best[:] = ZERO
-            for other in range(views):
-                if other == view or not compared[element, view, other]:
-                    continue
-                m, t = turn[element, view, other], shift[element, view, other]
-                ray = (
-                    m[0, 0] * u + m[0, 1] * v + m[0, 2],
-                    m[1, 0] * u + m[1, 1] * v + m[1, 2],
-                    m[2, 0] * u + m[2, 1] * v + m[2, 2],
-                )
-                moved = (t[0], t[1], t[2])
-                _project(ray, moved, low, length, shares, height, width, pixels, rights, downs)
-                start = np.uint64(element * views + other) * size
-                for s in range(count):
-                    at = start + np.uint64(pixels[s]) * CHANNELS
-                    differences[s], seen[s] = _compare(colors, own, at, line, rights[s], downs[s], columns)
-                _keep_best(best, differences, seen, rate)
-            out[element, view, row, column] = best[:count]
+            rays, moved = _rays(turn[element, view, other], u, v), shift[element, view, other]
+            begin = (element * views + other) * size
+            for s in range(len(shares)):
+                depth = simd.fma(length, shares[s], low)
+                _project(rays, moved, depth, height, width, places, rights, downs)
+                for lane in range(LANES):
+                    interpolate(
+                        colors, begin + places[lane], line, rights[lane], downs[lane], found, lane * CHANNELS
+                    )
+                r, g, b, seen = channels_of(found, 0)
+                difference = _difference(r, red) + _difference(g, green) + _difference(b, blue)
+                exponent = simd.minimum(simd.full(EXP2_LIMIT), difference * rate)
+                agreement = seen * simd.exp2_minus(exponent)
+                memory.store(best, s * LANES, simd.maximum(memory.load(best, s * LANES), agreement))
+        for lane in range(min(LANES, last - start)):
+            for s in range(len(shares)):
+                out[start + lane, s] = best[s * LANES + lane]

@@ -2,17 +2,18 @@
 
 import math
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.parts import even_parts
 
-#: Rows of an image of one task.
-_ROWS = 16
+#: Pixels of one task.
+_PIXELS = 1024
 
 
 def padded(colors: Float[Tensor, "B V 4 H W"]) -> Tensor:
@@ -32,49 +33,51 @@ def padded(colors: Float[Tensor, "B V 4 H W"]) -> Tensor:
 
 def sweep(
     colors: Float[Tensor, " n"],
-    masks: Bool[Tensor, "B V H W"],
-    near: Float[Tensor, "B V H W"],
-    far: Float[Tensor, "B V H W"],
+    pixels: Int[Tensor, " N"],
+    near: Float[Tensor, " N"],
+    far: Float[Tensor, " N"],
+    size: tuple[int, int],
     turn: Float[Tensor, "B V V 3 3"],
     shift: Float[Tensor, "B V V 3"],
     compared: Bool[Tensor, "B V V"],
     shares: Float[Tensor, " S"],
     tolerance: float,
-) -> Float[Tensor, "B V H W S"]:
-    """Agreement of the subject's pixels with the best other view; 0 elsewhere.
+) -> Float[Tensor, "N S"]:
+    """Agreement of pixels with the best other view.
 
     Args:
         colors: of all views, :func:`padded`.
-        masks: of the subject.
+        pixels: indices among those of all images, in ascending order.
         near, far: of the depths that are compared.
+        size: height and width of the images.
         turn, shift: from pixels of a view (second axis) to those of another (third axis).
         compared: which pairs of views are compared.
         shares: of the way from near to far.
         tolerance: difference of colours at which the agreement is 1 / e.
     """
-    from ghgs_lit.geometry.cpu.kernel import sweep_rows  # here: it loads a compiler
+    from ghgs_lit.geometry.cpu.kernel import sweep_pixels  # here: it loads a compiler
 
-    elements, views, height, width = masks.shape
-    result = np.zeros((elements, views, height, width, len(shares)), np.float32)
+    result = np.empty((len(pixels), len(shares)), np.float32)
     tables = [
-        x.detach().contiguous().numpy() for x in (colors, masks, near, far, turn, shift, compared, shares)
+        x.detach().contiguous().numpy() for x in (colors, pixels, near, far, turn, shift, compared, shares)
     ]
+    images = np.arange(compared[..., 0].numel() + 1) * math.prod(size)
+    ends = np.searchsorted(tables[1], images).tolist()
     pool.run(
         [
             partial(
-                sweep_rows(),
+                sweep_pixels(),
                 *tables,
                 tolerance,
                 result,
-                element,
-                view,
-                part.start,
-                part.stop,
+                *size,
+                image,
+                first + part.start,
+                first + part.stop,
             )
-            for element in range(elements)
-            for view in range(views)
-            for part in even_parts(height, _ROWS)
+            for image, (first, last) in enumerate(pairwise(ends))
+            for part in even_parts(last - first, _PIXELS)
         ],
-        masks.numel(),
+        result.size,
     )
     return torch.from_numpy(result)

@@ -64,7 +64,6 @@ class StoredCamera:
     """One camera as a file stores it.
 
     Attributes:
-        name: that of its photographs.
         origin: file and key, for messages.
         intrinsics: [3, 3] float64.
         pose: [4, 4] float64, a rotation and a translation.
@@ -117,17 +116,9 @@ class Calibration:
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
-    """The camera of a photograph that a stored camera means.
-
-    Args:
-        camera: as stored.
-        convention: what its numbers mean.
-        photograph: (height, width) in pixels; intrinsics of another size with the same ratio of the sides are
-            scaled.
-
-    Raises:
-        InputError: the ratio of the sides differs.
-    """
+    """The camera of a photograph that a stored camera means. ``photograph``: (height, width) in pixels;
+    intrinsics of another size with the same ratio of the sides are scaled. InputError: the ratio of the sides
+    differs."""
     size = camera.size or photograph
     if not same_ratio(size, photograph):
         shown = tuple(_SHOWN if side == _CODED else side for side in size)

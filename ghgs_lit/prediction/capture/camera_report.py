@@ -13,13 +13,7 @@ import numpy as np
 from ghgs_lit.data.resampling import area_image, area_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
-from ghgs_lit.prediction.capture.calibration import (
-    AXES,
-    EXTRINSICS,
-    INTRINSICS,
-    Convention,
-    StoredCamera,
-)
+from ghgs_lit.prediction.capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.photographs import Pixels
 
@@ -52,9 +46,7 @@ class Hypothesis:
     """A meaning of a calibration, and how well masks and cameras agree with it.
 
     Attributes:
-        says: in words.
         option: of the command line, which makes it so; empty: as it is, or nothing does.
-        views: with this meaning.
         blames: the cameras that it says are wrong; empty: all, or none.
         shares: by view, the share of the mask that lies in the hull of the others; empty before it is ranked.
     """
@@ -71,11 +63,8 @@ class Hypothesis:
         return min(self.shares.values())
 
     def silhouettes(self, folder: CaptureFolder) -> list[Silhouette]:
-        """Masks with cameras, as this meaning has them.
-
-        Raises:
-            InputError: it has the photographs in another ratio of height and width.
-        """
+        """Masks with cameras, as this meaning has them. InputError: it has the photographs in another ratio
+        of height and width."""
         white = np.uint8(255)
         upright = [
             folder.photograph(v.name, v.camera, v.pixels, v.mask * white, v.convention) for v in self.views
@@ -105,8 +94,6 @@ class Diagnosis:
     """The report on a calibration.
 
     Attributes:
-        consistent: whether masks and cameras agree as they are.
-        lines: the results, for people.
         option: of the command line, which mends it; empty where none does.
         ranking: all meanings that were tried, the best first.
         size: the subject's largest extent, in the user's unit, of the best meaning.
@@ -122,11 +109,8 @@ class Diagnosis:
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
-    """Examine the cameras of one instant (None: the first).
-
-    Raises:
-        InputError: photographs or masks cannot be read.
-    """
+    """Examine the cameras of one instant (None: the first). InputError: photographs or masks cannot be
+    read."""
     views = small_views(folder, folder.instants[0] if instant is None else instant)
     given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
     twins = _twins(views)
@@ -168,7 +152,6 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
 
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
-    """Other meanings of all cameras."""
     given = views[0].convention
     for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, _likely_resize(views))):
         inner = replace(given, intrinsics=intrinsics, resized=resized)
@@ -202,7 +185,6 @@ def _likely_resize(views: Sequence[StoredView]) -> float:
 
 
 def _plausible(view: StoredView) -> bool:
-    """Whether the principal point lies near the middle."""
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]
@@ -269,7 +251,6 @@ def _contrast(view: StoredView, mask: np.ndarray) -> float:
 
 
 def _twins(views: Sequence[StoredView]) -> tuple[str, ...]:
-    """The first two cameras with the same pose."""
     for one, other in itertools.combinations(views, 2):
         if np.allclose(one.camera.pose, other.camera.pose, rtol=1e-6, atol=1e-9):
             return one.name, other.name
@@ -290,7 +271,6 @@ def _size_line(size: float) -> str:
 def _explained(
     folder: CaptureFolder, given: Hypothesis, best: Hypothesis, tried: list[Hypothesis]
 ) -> Diagnosis:
-    """The diagnosis where another meaning fits."""
     size = best.size(folder)
     lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}", _size_line(size)]
     if best.option:

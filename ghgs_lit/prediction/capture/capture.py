@@ -15,12 +15,7 @@ from ghgs_lit.types import Batch, Cameras
 
 @dataclass(frozen=True)
 class Capture:
-    """Photographs of one instant. :meth:`read` makes it from files.
-
-    Attributes:
-        name: of the instant.
-        photographs: two or more.
-    """
+    """Photographs of one instant. :meth:`read` makes it from files. ``photographs``: two or more."""
 
     name: str
     photographs: tuple[Photograph, ...]
@@ -30,7 +25,6 @@ class Capture:
         """The photographs of a folder with their cameras.
 
         Args:
-            images: the folder.
             cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`.
             options: as for :class:`ghgs_lit.prediction.capture.folder.CaptureFolder`, such as ``masks``.
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.data.resampling import area_image
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
@@ -19,7 +18,6 @@ class Photograph:
     """One photograph without lens distortion, upright.
 
     Attributes:
-        name: of its camera.
         image: [h, w, 3] uint8, RGB.
         matte: [h, w] uint8, 255 times the share of each pixel that shows the subject.
         intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
@@ -72,6 +70,8 @@ def _refined(
     name: str, image: np.ndarray, matte: np.ndarray, size: tuple[int, int], pixels: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """:func:`refined_matte` of a cut, which is made smaller first where it is much larger than the crop."""
+    from ghgs_lit.data.matting import refined_matte  # here: photographs are read while PyTorch is imported
+
     sides = [min(_FINER * side, whole) for side, whole in zip(size, matte.shape, strict=True)]
     image, matte = area_image(image, *sides), area_image(matte, *sides)
     subject, refined = refined_matte(image, matte, pixels * sides[0] / size[0])
@@ -87,7 +87,6 @@ def _refined(
 
 
 def _on_black(image: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """The image multiplied by its matte."""
     return np.round(image * (matte[..., None] / np.float32(255))).astype(np.uint8)
 
 

@@ -24,7 +24,6 @@ def camera_sheet(
     where it is as far away as the subject: a line passes the same part of the body in every photograph.
 
     Args:
-        names: of the cameras.
         images: photographs [h, w, 3] uint8.
         views: masks of the photographs' sizes with their cameras.
 

@@ -2,16 +2,16 @@
 
 import functools
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from ghgs_lit.data.silhouettes import implausible
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
+from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.calibration import (
     Calibration,
     Convention,
@@ -30,6 +30,9 @@ from ghgs_lit.prediction.capture.photographs import (
     image_named,
     read_pixels,
 )
+
+if TYPE_CHECKING:  # photographs are read while PyTorch is imported
+    import torch
 
 EXIF = ("auto", "stored", "shown")
 _CONVENTION = tuple(f.name for f in fields(Convention))
@@ -77,6 +80,11 @@ class CaptureFolder:
         return default if value is None else value
 
     @functools.cached_property
+    def _begun(self) -> dict[str, list[Future]]:
+        """The views of one instant that are decoded, or are being decoded."""
+        return {}
+
+    @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
         return read_cameras(self.cameras, self._said("format", "auto"))
@@ -111,25 +119,37 @@ class CaptureFolder:
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
-        """The photographs of one instant, two or more.
-
-        Raises:
-            InputError: a photograph or mask is missing or wrong.
-        """
+        """The photographs of one instant, two or more. InputError: a photograph or mask is missing or
+        wrong."""
         views = zip(self.paths[instant], self.decode(instant), strict=True)
+        self._begun.clear()  # they take much memory
         return tuple(self.photograph(name, *view, self.convention) for name, view in views)
 
     def decode(self, instant: str) -> list[tuple[StoredCamera, Pixels, np.ndarray]]:
-        """Camera, photograph and matte as shown of each view, before the calibration is applied."""
-        views = []
-        for name, path in self.paths[instant].items():
-            camera, pixels = self.file.cameras[name], read_pixels(path)
-            matte = self._matte(name, camera, path, pixels)
-            problem = implausible(matte > 127)
-            if problem is not None:
-                raise InputError(f"{path}: {problem}")
-            views.append((camera, pixels, matte))
-        return views
+        """Camera, photograph and matte as shown of each view, before the calibration is applied.
+
+        They are kept until :meth:`photographs` has them, or those of another instant are decoded.
+        """
+        self.begin(instant)
+        return [view.result() for view in self._begun[instant]]
+
+    def begin(self, instant: str) -> None:
+        """Decode the views of an instant in threads; :meth:`decode` waits for them."""
+        if instant in self._begun:
+            return
+        self._begun.clear()
+        # Segmentation has threads of its own, and one session.
+        pool = ThreadPoolExecutor(allowed_cores() if self.segment is None else 1)
+        self._begun[instant] = [pool.submit(self._view, *view) for view in self.paths[instant].items()]
+        pool.shutdown(wait=False)
+
+    def _view(self, name: str, path: Path) -> tuple[StoredCamera, Pixels, np.ndarray]:
+        camera, pixels = self.file.cameras[name], read_pixels(path)
+        matte = self._matte(name, camera, path, pixels)
+        problem = implausible(matte > 127)
+        if problem is not None:
+            raise InputError(f"{path}: {problem}")
+        return camera, pixels, matte
 
     def photograph(
         self, name: str, camera: StoredCamera, pixels: Pixels, matte: np.ndarray, convention: Convention
@@ -142,6 +162,8 @@ class CaptureFolder:
         size = image.shape[:2]
         calibration = calibrate(camera, convention, size)
         if calibration.distortion.any():
+            from ghgs_lit.geometry.undistortion import undistort
+
             image, matte = undistort(image, matte, _grid(_key(calibration), *size))
         calibration = quarter_turned(calibration, turns, size)
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
@@ -182,6 +204,8 @@ def _key(calibration: Calibration) -> tuple:
 
 
 @functools.lru_cache(maxsize=16)
-def _grid(key: tuple, height: int, width: int) -> torch.Tensor:
+def _grid(key: tuple, height: int, width: int) -> "torch.Tensor":
+    from ghgs_lit.geometry.undistortion import undistorting_grid
+
     intrinsics, distortion, fisheye = key
     return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from scipy import ndimage
 
 from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import InputError, choice, require
@@ -28,10 +27,8 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
     """The matte of the photograph as shown, from alpha, labels, or grey of 8 or 16 bits.
 
     An alpha channel counts unless it is the same everywhere. Of labels any but 0 is the subject, and the
-    largest number beside them, void, is not.
-
-    Raises:
-        InputError: it cannot be decoded, or fits the photograph neither as shown nor as stored.
+    largest number beside them, void, is not. InputError: it cannot be decoded, or fits the photograph neither
+    as shown nor as stored.
     """
     image = read_image(path)
     values = np.asarray(image)
@@ -59,6 +56,8 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
     Raises:
         InputError: the background's photograph has another size, or nothing differs.
     """
+    from scipy import ndimage  # here: masks of files do not need it
+
     background = read_pixels(path)
     fits = background.size == pixels.size
     require(fits, str(path), f"the size of the photograph, {pixels.size} (height, width)", background.size)
@@ -77,14 +76,8 @@ def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
 
 
 def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
-    """A function from a photograph to its matte.
-
-    Args:
-        name: one of :data:`SEGMENTERS`.
-
-    Raises:
-        InputError: its package is not installed.
-    """
+    """A function from a photograph to its matte. ``name``: one of :data:`SEGMENTERS`. InputError: its package
+    is not installed."""
     choice("segment", name, SEGMENTERS)
     try:
         import rembg

@@ -48,11 +48,8 @@ class Pixels:
 
 
 def read_pixels(path: Path) -> Pixels:
-    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says.
-
-    Raises:
-        InputError: it is missing, cannot be decoded, has other values, or is mirrored.
-    """
+    """Decode a photograph of 8 bits a channel and turn it as its EXIF entry says. InputError: it is missing,
+    cannot be decoded, has other values, or is mirrored."""
     image = read_image(path)
     require(image.mode in _EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
     orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
@@ -74,8 +71,6 @@ def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
     photographs when it reads them.
 
     Args:
-        pixels: the photograph.
-        camera: of the file.
         exif: ``auto`` | ``stored`` | ``shown``: what the user says.
     """
     if exif != "auto" or not pixels.turns:
@@ -90,11 +85,8 @@ def composed(name: str) -> str:
 
 
 def images_in(folder: Path) -> dict[str, Path]:
-    """Photographs of a folder by name without suffix, sorted; masks beside them are left out.
-
-    Raises:
-        InputError: two of them have one name.
-    """
+    """Photographs of a folder by name without suffix, sorted; masks beside them are left out. InputError: two
+    of them have one name."""
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not path.is_dir()
@@ -128,8 +120,6 @@ def find_instants(
     photograph for each instant.
 
     Args:
-        folder: of the photographs.
-        cameras: by name.
         names: the camera of a photograph (or of a camera's folder) whose name differs from the camera's.
 
     Returns:
@@ -168,10 +158,7 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
 
 
 def _by_camera(
-    folder: Path,
-    values: Mapping[str, Any],
-    cameras: Mapping[str, StoredCamera],
-    names: Mapping[str, str],
+    folder: Path, values: Mapping[str, Any], cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
 ) -> dict[str, Any]:
     """Values by camera, given by the name of a photograph or of a camera's folder."""
     unknown = [name for name in values if names.get(name, name) not in cameras]
@@ -182,10 +169,5 @@ def _by_camera(
         )
     require(len(values) >= 2, str(folder), "2 photographs or more", len(values))
     by_camera = {names.get(name, name): value for name, value in values.items()}
-    require(
-        len(by_camera) == len(values),
-        "calibration.names",
-        "one photograph for each camera",
-        dict(names),
-    )
+    require(len(by_camera) == len(values), "calibration.names", "one photograph for each camera", dict(names))
     return by_camera

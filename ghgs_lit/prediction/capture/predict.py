@@ -32,7 +32,6 @@ class TimedPrediction:
     Attributes:
         batch: photographs (of a capture: crops around the subject), masks and cameras, corrected where asked.
         prediction: of this batch, in the world and unit of its cameras.
-        seconds: run time by stage.
         moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
         changed: which share of the subject refining changed in each crop; nothing where masks stay.
         refined: what refining the Gaussians gained; None where they are as predicted. Depths stay.
@@ -63,7 +62,6 @@ def predict(
     """The Gaussians of a capture.
 
     Args:
-        capture: the photographs.
         model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
             one that comes with the package.
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
@@ -107,8 +105,6 @@ def predict_batch(
     """The Gaussians of a batch of one subject, which keeps its targets.
 
     Args:
-        batch: photographs, masks and cameras.
-        model: on the device of the batch.
         renderer: draws what :class:`CameraRefinement` and :class:`Refinement` compare.
         refine_cameras: rounds of the one, at most; 0: none.
         refine: steps of the other; 0: none.
@@ -161,10 +157,8 @@ def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
     """(height, width) of the crops that a checkpoint's model sees; None: as it was trained.
 
-    Larger ones give a warning: they make results worse, not sharper.
-
-    Raises:
-        InputError: the model cannot take this size.
+    Larger ones give a warning: they make results worse, not sharper. InputError: the model cannot take this
+    size.
     """
     trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)

@@ -21,15 +21,8 @@ the rotation (w, x, y, z), of which 128 is zero."""
 
 
 def converted(ply: bytes, name: str) -> bytes:
-    """The content of a file of another format.
-
-    Args:
-        ply: of a file of :func:`ghgs_lit.prediction.export.ply.write_ply`.
-        name: one of ``CONVERTED``.
-
-    Raises:
-        RuntimeError: gaussforge refuses.
-    """
+    """The content of a file of another format. ``name``: one of ``CONVERTED``. RuntimeError: gaussforge
+    refuses."""
     from gaussforge import GaussForge
 
     answer = GaussForge().convert(ply, "ply", CONVERTED[name])

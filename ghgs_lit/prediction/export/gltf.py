@@ -23,15 +23,8 @@ _KERNEL = {
 
 
 def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
-    """The content of a file of the Gaussians of one subject (RGB colours).
-
-    Args:
-        gaussians: in the world of the files.
-        up: the unit vector [3] of that world that points up.
-
-    Raises:
-        InputError: there are none: glTF has no empty lists.
-    """
+    """The content of a file of the Gaussians of one subject (RGB colours). ``up``: the unit vector [3] of
+    that world that points up. InputError: there are none: glTF has no empty lists."""
     import pygltflib as gltf
 
     require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)

@@ -1,7 +1,8 @@
 """Depth maps, photographs, cameras and point clouds as the contents of files of common formats."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from io import BytesIO
 from typing import Any
 
@@ -37,8 +38,8 @@ def depth_unit(largest: float) -> float:
     return 10.0**exponent
 
 
-def depth_files(subject: ExportedSubject) -> Iterator[bytes]:
-    """A PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ.
+def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
+    """Makers of a PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ.
 
     The NPZ has ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``.
     """
@@ -48,16 +49,20 @@ def depth_files(subject: ExportedSubject) -> Iterator[bytes]:
     text = PngInfo()
     text.add_text("Unit", f"{unit:g} (length of one grey level; 0: no depth)")
     for values in depth:
-        yield png(np.nan_to_num(np.round(values / unit)).astype(np.uint16), text)
-    content = BytesIO()
-    np.savez_compressed(
-        content,
+        yield partial(png, np.nan_to_num(np.round(values / unit)).astype(np.uint16), text)
+    yield partial(
+        _npz,
         depth=depth,
         intrinsics=subject.cameras.intrinsics.cpu().numpy(),
         extrinsics=subject.cameras.extrinsics.cpu().numpy(),
         views=np.array(subject.views),
     )
-    yield content.getvalue()
+
+
+def _npz(**arrays: np.ndarray) -> bytes:
+    content = BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()
 
 
 def points_ply(subject: ExportedSubject) -> bytes:
@@ -68,8 +73,8 @@ def points_ply(subject: ExportedSubject) -> bytes:
     return vertices_ply(columns | dict(zip(("red", "green", "blue"), colors.T, strict=True)))
 
 
-def input_files(subject: ExportedSubject) -> Iterator[bytes]:
-    """PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras.
+def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
+    """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras.
 
     Both are what ``ghgs predict images=inputs cameras=cameras.json`` reads.
     """
@@ -77,11 +82,12 @@ def input_files(subject: ExportedSubject) -> Iterator[bytes]:
         # Colours of a PNG are not premultiplied.
         colors = to_uint8(unmultiplied(image, matte))
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
-        yield png(np.concatenate([colors, alpha], -1))
+        yield partial(png, np.concatenate([colors, alpha], -1))
     cameras = subject.cameras
     entries = zip(subject.file_names, cameras.intrinsics, cameras.extrinsics, strict=True)
     size = (cameras.height, cameras.width)
-    yield cameras_json({name: camera_entry(k, e, size) for name, k, e in entries}).encode()
+    text = cameras_json({name: camera_entry(k, e, size) for name, k, e in entries})
+    yield text.encode
 
 
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:

@@ -23,10 +23,8 @@ def page(
     Args:
         gaussians: of one subject, RGB colours.
         cameras: of the photographs [V].
-        views: their names.
         up: the unit vector [3] that points up.
         center: the point [3] that it turns about.
-        name: of the subject, for the title.
     """
     scene = {
         "size": [cameras.width, cameras.height],

@@ -36,11 +36,7 @@ _GROUPS = {
 
 
 def write_ply(gaussians: Gaussians, path: str | Path) -> None:
-    """Write the Gaussians of one subject (RGB colours).
-
-    Raises:
-        InputError: several subjects, or other colours.
-    """
+    """Write the Gaussians of one subject (RGB colours). InputError: several subjects, or other colours."""
     data = ply_bytes(gaussians)
     write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
@@ -96,10 +92,7 @@ def read_ply(path: Path) -> Gaussians:
     """Read such a file as the Gaussians of one subject, without colours that depend on the direction.
 
     A file without this package's comment is taken for one that was made for 3D Gaussian Splatting's own
-    renderer: a low-pass of 0.3 px^2, not antialiased.
-
-    Raises:
-        InputError: not such a file.
+    renderer: a low-pass of 0.3 px^2, not antialiased. InputError: not such a file.
     """
     try:
         content = _read(path)

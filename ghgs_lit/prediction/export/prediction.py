@@ -3,9 +3,11 @@
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import torch
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.geometry.frame import HEIGHT
+from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
@@ -28,7 +31,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.runs.results import plain
 from ghgs_lit.types import Batch, Prediction
-from ghgs_lit.visualization.pictures import sheet
+from ghgs_lit.visualization.pictures import palette, sheet
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,13 @@ class Format:
     Attributes:
         files: their names below the directory of the prediction; one with ``{view}`` or ``{frame}`` stands
             for a file of each view, or of each picture of the turntable.
-        contents: of these files, in their order.
+        contents: functions that make each of these files, in their order; they are called in threads.
         package: that it needs.
         extra: of this package, which installs it.
     """
 
     files: tuple[str, ...]
-    contents: Callable[[ExportedSubject], Iterable[bytes]]
+    contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
     package: str | None = None
     extra: str = "formats"
 
@@ -62,48 +65,45 @@ class Format:
 
 
 def _converted(name: str) -> Format:
-    contents = partial(_contents_of_converted, name=name)
+    contents = _one(lambda s: converted(ply_bytes(s.for_other_renderers), name))
     return Format((f"gaussians.{CONVERTED[name]}",), contents, "gaussforge")
 
 
-def _contents_of_converted(subject: ExportedSubject, name: str) -> Iterable[bytes]:
-    return [converted(ply_bytes(subject.for_other_renderers), name)]
+def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubject], list]:
+    """The contents of a format with one file."""
+    return lambda subject: [partial(content, subject)]
 
 
-def _html(subject: ExportedSubject) -> Iterable[bytes]:
-    text = page(subject.gaussians, subject.cameras, subject.views, subject.up, subject.center, subject.name)
-    return [text.encode()]
+def _html(s: ExportedSubject) -> bytes:
+    return page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()
 
 
 #: The file that lists the others.
 REPORT = "report.json"
 
 FORMATS: dict[str, Format] = {
-    "ply": Format(("gaussians.ply",), lambda s: [ply_bytes(s.stored)]),
+    "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
     **{name: _converted(name) for name in CONVERTED},
-    "splat": Format(("gaussians.splat",), lambda s: [to_records(s.for_other_renderers).tobytes()]),
-    "glb": Format(("gaussians.glb",), lambda s: [glb_bytes(s.for_other_renderers, s.up)], "pygltflib"),
-    "html": Format(("viewer.html",), _html),
-    "turntable": Format(("turntable/{frame:03d}.png",), lambda s: map(png, s.turntable)),
+    "splat": Format(("gaussians.splat",), _one(lambda s: to_records(s.for_other_renderers).tobytes())),
+    "glb": Format(("gaussians.glb",), _one(lambda s: glb_bytes(s.for_other_renderers, s.up)), "pygltflib"),
+    "html": Format(("viewer.html",), _one(_html)),
+    "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
     "mp4": Format(
-        ("turntable.mp4",), lambda s: [mp4_bytes(s.turntable, s.options.fps)], "imageio_ffmpeg", "video"
+        ("turntable.mp4",),
+        lambda s: [partial(mp4_bytes, s.turntable, s.options.fps)],
+        "imageio_ffmpeg",
+        "video",
     ),
     "depth": Format(("depth/{view}.png", "depth.npz"), depth_files),
-    "points": Format(("points.ply",), lambda s: [points_ply(s)]),
+    "points": Format(("points.ply",), _one(points_ply)),
     "inputs": Format(("inputs/{view}.png", "cameras.json"), input_files),
 }
 
 
 def output_options(config: Mapping[str, Any]) -> OutputOptions:
-    """The options of a verb's configuration, checked before any work.
-
-    Args:
-        config: plain data with ``formats`` (``all`` stands for all of them), ``up``, ``smooth`` and
-            ``turntable``.
-
-    Raises:
-        InputError: an unknown format, a value out of range, or a package that is not installed.
-    """
+    """The options of a verb's configuration, checked before any work. ``config``: plain data with ``formats``
+    (``all`` stands for all of them), ``up``, ``smooth`` and ``turntable``. InputError: an unknown format, a
+    value out of range, or a package that is not installed."""
     formats = config["formats"]
     formats = [formats] if isinstance(formats, str) else formats
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
@@ -125,16 +125,8 @@ def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace an input, or a file that :func:`write_prediction` did not write.
-
-    Args:
-        directory: of the outputs.
-        names: of these, below it.
-        inputs: files that are read.
-
-    Raises:
-        InputError: names the first such file.
-    """
+    """Refuse to replace an input, or a file that :func:`write_prediction` did not write. InputError: names
+    the first such file."""
     read = {path.resolve() for path in inputs}
     written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
     for name in names:
@@ -158,7 +150,6 @@ def _report_before(directory: Path) -> dict[str, Any]:
 
 
 def _written_before(directory: Path) -> list[str]:
-    """The files that earlier predictions wrote into a directory."""
     report = _report_before(directory)
     earlier = report.get("earlier_files")
     return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]
@@ -181,9 +172,7 @@ def write_prediction(
         directory: files that an earlier prediction wrote are replaced, others stay.
         batch: photographs, masks and cameras of the subject; the sheet compares renders with its targets,
             or with the photographs where it has none.
-        prediction: of this batch.
         renderer: draws the turntable, and the input views for the report.
-        options: the formats and the frame.
         facts: further plain data for the report, such as the seconds of each stage.
 
     Returns:
@@ -199,29 +188,42 @@ def write_prediction(
     # Before the files: those of a run that is cut off are known as ours, too.
     known = {"files": dict.fromkeys(names[:-1]), "earlier_files": earlier}
     write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
-    paths, seconds = [], {}
-
-    def write(name: str, content: bytes) -> None:
-        paths.append(directory / name)
-        write_atomically(paths[-1], lambda temporary: temporary.write_bytes(content))
-
-    for name in options.formats:
-        begin = time.perf_counter()
-        names = FORMATS[name].names(subject.views, options.frames)
-        for file, content in zip(names, FORMATS[name].contents(subject), strict=True):
-            write(file, content)
-        seconds[f"write {name}"] = time.perf_counter() - begin
-    seen = batch.cameras if batch.targets is None else batch.targets.cameras
-    image = renderer(prediction.gaussians, seen).image
-    write("sheet.png", png(sheet(batch, image, 0, prediction.depth, prediction.depth_valid)))
-    facts = dict(facts or {})
-    report = {**_report(subject), **facts, "seconds": {**facts.get("seconds", {}), **seconds}}
+    paths, seconds = [directory / name for name in names[:-1]], {}
+    files = iter(paths)
+    with ThreadPoolExecutor(allowed_cores()) as pool:
+        pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
+        tasks = {}
+        for name in options.formats:
+            begin = time.perf_counter()
+            contents = FORMATS[name].contents(subject)
+            count = len(FORMATS[name].names(subject.views, options.frames))
+            places = islice(files, count)
+            tasks[name] = [
+                pool.submit(_write, path, made) for made, path in zip(contents, places, strict=True)
+            ]
+            seconds[f"write {name}"] = time.perf_counter() - begin
+        seen = batch.cameras if batch.targets is None else batch.targets.cameras
+        image = renderer(prediction.gaussians, seen).image
+        _write(next(files), partial(png, sheet(batch, image, 0, prediction.depth, prediction.depth_valid)))
+        facts = dict(facts or {})
+        report = {**_report(subject), **facts}
+        for name, begun in tasks.items():
+            seconds[f"write {name}"] += sum(task.result() for task in begun)
+    report["seconds"] = {**facts.get("seconds", {}), **seconds}
     report["files"] = {str(path.relative_to(directory)): path.stat().st_size for path in paths}
     if earlier:
         report["earlier_files"] = earlier
     path = directory / REPORT
     write_text_atomically(path, json.dumps(plain(report), indent=1, allow_nan=False))
     return [*paths, path]
+
+
+def _write(path: Path, content: Callable[[], bytes]) -> float:
+    """Make and write a file; returns the seconds that it took."""
+    begin = time.perf_counter()
+    made = content()
+    write_atomically(path, lambda temporary: temporary.write_bytes(made))
+    return time.perf_counter() - begin
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:

@@ -17,13 +17,7 @@ from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
-from ghgs_lit.visualization.turntable import (
-    center_of,
-    pixel_size,
-    subject_points,
-    turntable,
-    up_direction,
-)
+from ghgs_lit.visualization.turntable import center_of, pixel_size, subject_points, turntable, up_direction
 
 #: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
 VIEWER_LOW_PASS = 0.3
@@ -164,11 +158,7 @@ class ExportedSubject:
 def exported_subject(
     batch: Batch, prediction: Prediction, renderer: Renderer, options: OutputOptions
 ) -> ExportedSubject:
-    """The subject of a batch of one, in the frame that ``options`` choose.
-
-    Raises:
-        InputError: several subjects.
-    """
+    """The subject of a batch of one, in the frame that ``options`` choose. InputError: several subjects."""
     count = len(batch.images)
     require(count == 1, "write_prediction", "a batch of one subject", count)
     cameras, gaussians = batch.cameras[0], prediction.gaussians.detach()

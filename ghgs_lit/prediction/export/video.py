@@ -14,11 +14,7 @@ _COLORS = (
 
 def mp4_bytes(pictures: Sequence[np.ndarray], fps: int) -> bytes:
     """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
-
-    Args:
-        pictures: at least one.
-        fps: pictures per second.
-    """
+    ``pictures``: at least one."""
     import imageio_ffmpeg
 
     height, width = pictures[0].shape[:2]

@@ -8,7 +8,7 @@ and the camera moves until they fit. A view's own Gaussians take no part, as the
 wherever its camera is. Bundle adjustment with a rendering loss is that of BARF (Lin et al., ICCV 2021).
 
 Photographs do not tell where the whole rig is, so cameras only move beside one another
-(:mod:`ghgs_lit.geometry.motion`).
+(:mod:`ghgs_lit.geometry.motion`); where a minority of them explains the silhouettes, beside the others.
 """
 
 import dataclasses
@@ -82,33 +82,39 @@ class CameraRefinement:
             batch: photographs, masks and cameras, of two views or more.
         """
         frame = Frame.of(batch)
-        inside, moved, first = self._coherent(frame.enter(batch))
+        inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
             with torch.no_grad():
                 prediction = self.predict(inside)
             worth = torch.where(moved, _LATER, first)
-            cameras, is_better = self._corrected(prediction, inside, worth)
+            cameras, is_better = self._corrected(prediction, inside, free, worth)
             if not bool(is_better.any()):
                 break
             inside, moved = dataclasses.replace(inside, cameras=cameras), moved | is_better
         # To the frame and back is not exact.
-        cameras = _chosen(moved, frame.leave_cameras(inside.cameras, batch.cameras), batch.cameras)
-        return dataclasses.replace(batch, cameras=cameras)
+        left = frame.leave_cameras(inside.cameras, batch.cameras)
+        return dataclasses.replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()
-    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Float[Tensor, " B"]]:
-        """Elements with coherent silhouettes, which agree better for it, and what a first round must gain."""
-        cameras, distance = coherent_cameras(batch)
+    def _coherent(
+        self, batch: Batch
+    ) -> tuple[Batch, Bool[Tensor, " B"], Bool[Tensor, "B V"], Float[Tensor, " B"]]:
+        """Elements with coherent silhouettes, which agree better for it, and what a first round must gain.
+
+        The third is which cameras may be wrong: all, but where silhouettes and prediction agree on a few.
+        """
+        cameras, free, distance = coherent_cameras(batch)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
-            return batch, moved, first
+            return batch, moved, free, first
         proposal = dataclasses.replace(batch, cameras=cameras)
         before, after = map(self._disagreement, (batch, proposal))
         is_better = moved & (after < (1 - _FIRST) * before)
-        cameras = _chosen(is_better, cameras, batch.cameras)
-        return dataclasses.replace(batch, cameras=cameras), is_better, first
+        free = free | ~is_better[:, None]
+        cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
+        return dataclasses.replace(batch, cameras=cameras), is_better, free, first
 
     def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
         """The loss of the rounds with the cameras as they are."""
@@ -116,7 +122,11 @@ class CameraRefinement:
         return _loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
     def _corrected(
-        self, prediction: Prediction, batch: Batch, worth: Float[Tensor, " B"]
+        self,
+        prediction: Prediction,
+        batch: Batch,
+        free: Bool[Tensor, "B V"],
+        worth: Float[Tensor, " B"],
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
         """Cameras after one round, and which elements agree better by ``worth``; those of the others stay."""
         cameras, losses = batch.cameras, []
@@ -128,7 +138,7 @@ class CameraRefinement:
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
         for _ in range(_STEPS):
             with torch.autocast(axes.device.type, enabled=False), torch.enable_grad():
-                motion = without_common(raw, axes)
+                motion = _of_free(raw, axes, free)
                 drawn = self.renderer(_moved(views, motion), views.cameras, background=0.0)
                 losses.append(_loss(drawn, views, batch))
                 optimizer.zero_grad()
@@ -137,15 +147,23 @@ class CameraRefinement:
             schedule.step()
         is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
         with torch.autocast(axes.device.type, enabled=False):
-            motion = without_common(raw.detach(), axes)
+            motion = _of_free(raw.detach(), axes, free)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
         corrected = dataclasses.replace(cameras, extrinsics=extrinsics)
-        return _chosen(is_better, corrected, cameras), is_better
+        return _chosen(is_better[:, None] & free, corrected, cameras), is_better
 
 
-def _chosen(which: Bool[Tensor, " B"], first: Cameras, second: Cameras) -> Cameras:
-    """The first cameras of some elements, the second of the others."""
-    which = which[:, None, None, None]
+def _of_free(
+    motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Bool[Tensor, "B V"]
+) -> Float[Tensor, "B V 6"]:
+    """Motions of the free cameras: beside one another where all are, and beside the others where some are."""
+    all_are = free.all(1)[:, None, None]
+    return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
+
+
+def _chosen(which: Bool[Tensor, "B V"], first: Cameras, second: Cameras) -> Cameras:
+    """The first cameras of some views, the second of the others."""
+    which = which[..., None, None]
     return dataclasses.replace(
         first,
         intrinsics=torch.where(which, first.intrinsics, second.intrinsics),

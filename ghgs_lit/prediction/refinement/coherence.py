@@ -8,11 +8,13 @@ steps make small. This needs no model and no surface that two photographs share.
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.frame import HEIGHT
@@ -36,6 +38,9 @@ _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
 #: of the logarithms of focal lengths over it: lenses are known better than where cameras stand.
 _STAY, _KNOWN = 1e-3, 5.0
+#: Few cameras explain silhouettes as well as all where rays pass by less than so many times the distance, or
+#: by less than ``_COHERENT``; of fewer silhouettes than so many, which tell less, by a tenth of it.
+_AS_WELL, _TELLING = 1.5, 4
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class _Phase:
         return (r < 0) * self.scale / r.abs().clamp(min=self.scale)
 
 
-_PHASES = (_Phase(12, _TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=True))
+_MEET, _LIE = _Phase(12, _TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=True)
 
 
 @dataclass(frozen=True)
@@ -131,13 +136,36 @@ class _Outlines:
         )
 
 
+@dataclass(frozen=True)
+class _Alignment:
+    """Cameras after some steps of those that are ``free``, and the mean distance of rays before each step."""
+
+    lens: Float[Tensor, "V 3 3"]
+    pose: Float[Tensor, "V 4 4"]
+    free: Bool[Tensor, " V"]
+    distances: tuple[float, ...] = ()
+
+    def after(self, phase: _Phase, outlines: _Outlines) -> "_Alignment":
+        """The same after the steps of a phase."""
+        found = self
+        for _ in range(phase.steps):
+            equations = _equations(outlines, found.lens, found.pose, phase)
+            steps, are_all = equations.solved(self.free), bool(self.free.all())
+            moved = _stepped(steps, found.lens, found.pose, are_all)
+            found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
+        return found
+
+
 @torch.no_grad()
-def coherent_cameras(batch: Batch) -> tuple[Cameras, Float[Tensor, " B"]]:
+def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
     """Cameras whose silhouettes explain one another; those of an element whose silhouettes do already stay.
 
-    Also returned is how far rays near outlines pass beside other silhouettes, in pixels on average, with the
-    given cameras: 0 to 0.00014 with exact cameras and mattes, 0.0001 to 0.0004 with four cameras that are off
-    by up to half a pixel, 0.002 by one, 0.04 to 0.08 by three; infinite where no silhouette has an outline.
+    Where moving a minority of the cameras explains the silhouettes as well as moving all, the others stay.
+
+    Also returned is which cameras were free to move, and how far rays near outlines pass beside other
+    silhouettes, in pixels on average, with the given cameras: 0 to 0.00014 with exact cameras and mattes,
+    0.0001 to 0.0004 with four cameras that are off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by
+    three; infinite where no silhouette has an outline.
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
@@ -147,45 +175,78 @@ def coherent_cameras(batch: Batch) -> tuple[Cameras, Float[Tensor, " B"]]:
     # A small problem of many short steps, and distances to outlines are computed on a CPU.
     elements = zip(*(part.float().cpu() for part in parts), strict=True)
     with torch.autocast("cpu", enabled=False):
-        lenses, poses, distances = zip(*(_coherent(*element) for element in elements), strict=True)
+        lenses, poses, free, distances = zip(*(_coherent(*element) for element in elements), strict=True)
     moved = dataclasses.replace(
         cameras,
         intrinsics=torch.stack(lenses).to(cameras.intrinsics),
         extrinsics=torch.stack(poses).to(cameras.extrinsics),
     )
-    return moved, torch.tensor(distances, device=batch.masks.device)
+    device = batch.masks.device
+    return moved, torch.stack(free).to(device), torch.tensor(distances, device=device)
 
 
 def _coherent(
     mattes: Float[Tensor, "V H W"], lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
-) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], float]:
-    """Intrinsics and extrinsics of one element after all steps, and the mean distance with the given ones."""
-    outlines, given, first = _Outlines.of(mattes), (lens, pose), None
+) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Bool[Tensor, " V"], float]:
+    """Of one element: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
+    outlines, every = _Outlines.of(mattes), torch.ones(len(pose), dtype=torch.bool)
     if not len(outlines.depth):
-        return *given, math.inf
-    for phase in _PHASES:
-        for _ in range(phase.steps):
-            next_lens, next_pose, distance = _step(outlines, lens, pose, phase)
-            first = float(distance) if first is None else first
-            if first < _COHERENT:
-                return *given, first
-            lens, pose = next_lens, next_pose
-    return lens, pose, first
+        return lens, pose, every, math.inf
+    given = _equations(outlines, lens, pose, _MEET)
+    if given.distance < _COHERENT:
+        return lens, pose, every, given.distance
+    found = _Alignment(lens, pose, every).after(_MEET, outlines)
+    floor = _COHERENT if len(pose) >= _TELLING else 0.1 * _COHERENT
+    enough = max(_AS_WELL * found.distances[-1], floor)
+    for free in _minorities(given, len(pose)):
+        few = _Alignment(lens, pose, free).after(_MEET, outlines)
+        if few.distances[-1] < enough:
+            found = few
+            break
+    found = found.after(_LIE, outlines)
+    return found.lens, found.pose, found.free, given.distance
 
 
-def _step(
+def _minorities(equations: "_Equations", count: int) -> Iterator[Bool[Tensor, " V"]]:
+    """Of ``count`` cameras the one that explains most when it alone moves, the two, and so on to half."""
+    for size in range(1, (count + 1) // 2):
+        sets = [
+            torch.zeros(count, dtype=torch.bool).index_fill(0, torch.tensor(views), True)
+            for views in combinations(range(count), size)
+        ]
+        yield max(sets, key=equations.gain)
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """The normal equations of a step of Gauss-Newton, and the mean distance of the rays before it."""
+
+    normal: Float[Tensor, "n n"]
+    right: Float[Tensor, " n"]
+    distance: float
+
+    def solved(self, free: Bool[Tensor, " V"]) -> Float[Tensor, "V 7"]:
+        """The step of the free cameras; that of the others is 0."""
+        index = free.repeat_interleave(7).nonzero()[:, 0]
+        steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
+        return torch.zeros_like(self.right).index_copy(0, index, steps).view(-1, 7)
+
+    def gain(self, free: Bool[Tensor, " V"]) -> float:
+        """What the step of the free cameras takes from the squared distances, to first order."""
+        return float((self.solved(free).flatten() * self.right).sum())
+
+
+def _equations(
     outlines: _Outlines, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"], phase: _Phase
-) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Float[Tensor, ""]]:
-    """Intrinsics and extrinsics after one step of Gauss-Newton, and the mean distance before it."""
+) -> _Equations:
+    """The unknowns are motions and zooms of all cameras, each in about a pixel."""
     count = len(pose)
     near = outlines.depth <= phase.to
     view, depth_at_home = outlines.view[near], outlines.depth[near]
     points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
     distances = phase.distances(depth, depth_at_home)
-    # One pixel for each unit of the unknowns, about.
-    pixel = HEIGHT / 2 * (lens[:, 0, 0] / pose[:, 2, 3]).mean()
     rays = max(len(distances), 1)
-    gradients = _gradients(outlines, lens, pose, points, other) / pixel
+    gradients = _gradients(outlines, lens, pose, points, other) / _pixel(lens, pose)
     jacobian = gradients.new_zeros(len(gradients), count, 7)
     index = torch.arange(len(gradients))
     jacobian[index, other] = _rows(points, gradients, pose[other])
@@ -194,12 +255,27 @@ def _step(
     weighted = phase.weights(distances)[:, None] * jacobian
     stay = _STAY * rays * torch.tensor([*[1.0] * 6, _KNOWN]).to(gradients).repeat(count)
     normal = weighted.mT @ jacobian + stay.diag()
-    steps = -torch.linalg.solve(normal, weighted.mT @ distances).reshape(count, 7) / pixel
-    motions = without_common(steps[:, :6], pose[:, 2, :3])
-    moved = after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
+    return _Equations(normal, -(weighted.mT @ distances), float(distances.abs().sum() / rays))
+
+
+def _pixel(lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]) -> Float[Tensor, ""]:
+    """Pixels of half a height of the subject."""
+    return HEIGHT / 2 * (lens[:, 0, 0] / pose[:, 2, 3]).mean()
+
+
+def _stepped(
+    steps: Float[Tensor, "V 7"],
+    lens: Float[Tensor, "V 3 3"],
+    pose: Float[Tensor, "V 4 4"],
+    are_all_free: bool,
+) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
+    """Intrinsics and extrinsics after a step; where all cameras are free they move beside one another."""
+    motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
+    if are_all_free:
+        motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
     zoomed = lens.clone()
-    zoomed[:, [0, 1], [0, 1]] *= (steps[:, 6:] - steps[:, 6:].mean(0)).exp()
-    return zoomed, moved, distances.abs().sum() / rays
+    zoomed[:, [0, 1], [0, 1]] *= zooms.exp()
+    return zoomed, after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
 
 
 def _best_points(
@@ -210,13 +286,8 @@ def _best_points(
     pixels: Float[Tensor, "R 2"],
 ) -> tuple[Float[Tensor, "R 3"], Int[Tensor, " R"], Float[Tensor, " R"]]:
     """Points deepest in the other silhouettes, one of each ray, with the silhouette that it is least deep in.
-
-    Returns:
-        The points, the numbers of these silhouettes, and the signed depths in them in pixels.
-
-    Args:
-        view: the silhouette of each ray, in ascending order.
-    """
+    Returns: The points, the numbers of these silhouettes, and the signed depths in them in pixels. ``view``:
+    the silhouette of each ray, in ascending order."""
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
     views, points = range(len(pose)), []

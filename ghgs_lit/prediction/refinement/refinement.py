@@ -80,7 +80,6 @@ class Refinement:
 
         Args:
             gaussians: predicted from ``batch``, each at a pixel of an input.
-            batch: photographs, masks and cameras.
             views: numbers of the photographs that take part; None: all.
 
         Raises:
@@ -131,7 +130,6 @@ class Refinement:
         """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
 
         Args:
-            gaussians, refined: before and after.
             batch: one element, of which they were predicted.
             predict: the Gaussians of a batch, here of the inputs without the last: of fewer than four none
                 is held out, since two show too little of a person.
@@ -155,7 +153,6 @@ class Refinement:
 
 
 def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
-    """Photographs on black, masks and cameras of some views."""
     part = batch.of_views(views)
     return on_black(part), coverage(part)[:, :, None], part.cameras
 

@@ -66,12 +66,8 @@ class Content:
 
     @torch.no_grad()
     def comparison(self, view: int) -> dict[str, np.ndarray | float]:
-        """One view beside its photograph.
-
-        Returns:
-            Pictures [H, W, 3] uint8 ``render``, ``photograph`` and ``FLIP``; in the subject's box ``psnr``
-            (dB) and ``flip``, nan where the mask is empty.
-        """
+        """One view beside its photograph. Returns: Pictures [H, W, 3] uint8 ``render``, ``photograph`` and
+        ``FLIP``; in the subject's box ``psnr`` (dB) and ``flip``, nan where the mask is empty."""
         camera, target = self.batch.cameras[:, view : view + 1], self.batch.images[:, view]
         image = render(self.gaussians, camera).image[:, 0].clamp(0, 1)
         difference, box = flip_map(image, target), box_of(self.batch.masks[:, view])
@@ -86,14 +82,8 @@ class Content:
 
 def read_content(path: str | Path, up: str | None) -> Content:
     """Read what ``ghgs predict`` wrote into a directory (its formats ``ply`` and ``inputs``), or a PLY.
-
-    Args:
-        path: the directory or the file.
-        up: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y`` for a PLY.
-
-    Raises:
-        InputError: there is no such thing.
-    """
+    ``up``: the axis ``y``, ``-y`` or ``z`` that points up; None: the up of the cameras, and ``y`` for a PLY.
+    InputError: there is no such thing."""
     path = Path(path)
     choice("up", up, (None, *AXES))
     if path.is_file():

@@ -50,7 +50,6 @@ class Viewer:
     """A running page.
 
     Args:
-        content: what is shown.
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
 
@@ -158,10 +157,7 @@ class Viewer:
         size = np.linalg.norm(cameras.centers.numpy() - target, axis=-1).mean()
         for view, name in enumerate(batch.views[0]):
             k, e = cameras.intrinsics[view].numpy(), cameras.extrinsics[view].numpy().astype(np.float64)
-            pose = {
-                "wxyz": SO3.from_matrix(e[:3, :3].T).wxyz,
-                "position": -e[:3, :3].T @ e[:3, 3],
-            }
+            pose = {"wxyz": SO3.from_matrix(e[:3, :3].T).wxyz, "position": -e[:3, :3].T @ e[:3, 3]}
             fov = 2 * math.atan(cameras.height / 2 / k[1, 1])
             alpha = batch.masks[0, view].numpy() * np.uint8(255)
             node = self.server.scene.add_camera_frustum(

@@ -7,7 +7,6 @@ from functools import cache, partial
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from ghgs_lit.errors import require
@@ -30,21 +29,16 @@ _MEMORY = 1 << 32
 
 
 def rasterize(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    settings: RasterSettings,
-    near: float,
-    far: float,
-    regions: Int[Tensor, "B T 4"] | None = None,
+    gaussians: Gaussians, cameras: Cameras, settings: RasterSettings, near: float, far: float
 ) -> Rendering:
     """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
 
     Differentiable in the Gaussians, not in the cameras. The result has the same bits with any number of
-    threads. Nothing is drawn or computed outside ``regions`` (top, left, height, width).
+    threads.
     """
     _warn_of_narrow_vectors()
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-    plan = Plan.of(gaussians, cameras, settings, near, far, regions)
+    plan = Plan.of(gaussians, cameras, settings, near, far)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
 
 
@@ -77,11 +71,8 @@ class _Splats:
 
 
 def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differentiable: bool) -> _Splats:
-    """Project all Gaussians into their views and list the splats of each tile.
-
-    Raises:
-        InputError: the lists, with their gradients where they are needed, would exceed :data:`_MEMORY`.
-    """
+    """Project all Gaussians into their views and list the splats of each tile. InputError: the lists, with
+    their gradients where they are needed, would exceed :data:`_MEMORY`."""
     settings, (tiles_x, tiles_y), total = plan.settings, plan.tiles, plan.splats
     (elements, views), parts = plan.shape, plan.parts
     records = simd.aligned_floats(total * layout.RECORD).reshape(total, layout.RECORD)

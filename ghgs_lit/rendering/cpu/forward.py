@@ -132,7 +132,6 @@ def _write(image, first, width, rows, columns, block, value):
 
 @helper
 def _write_planes(planes, view, first, height, width, rows, columns, channels, image, alpha, depth):
-    """Write a tile's colours, alpha and expected depth."""
     for block in range(BLOCKS):
         at = block * LANES
         for c in range(channels):

@@ -101,7 +101,6 @@ def _add(sums, k, drawn, value):
 
 @helper
 def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antialiased, sums):
-    """Add the gradients of eight splats to those of their Gaussians."""
     x, y, _, inverse = geometry.camera_points(view, mean)
     clamped_x, clamped_y = geometry.clamped(view, x, y)
     t = geometry.affine(view, clamped_x, clamped_y, inverse)
@@ -135,7 +134,6 @@ def _splat_gradients(view, mean, root, moments, record, drawn, low_pass, antiali
 
 @helper
 def _root_rows(sums):
-    """The gradient of ``R S``, from the sums."""
     at = _ROOT * _WIDE
     return (
         memory.load(sums, at), memory.load(sums, at + 8), memory.load(sums, at + 16),

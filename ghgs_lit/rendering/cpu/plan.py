@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ghgs_lit.kernels import pool, simd
 from ghgs_lit.rendering.cpu import layout
@@ -33,13 +32,13 @@ class Plan:
     far: float
 
     @classmethod
-    def of(cls, gaussians, cameras, settings, near, far, regions) -> "Plan":
+    def of(cls, gaussians, cameras, settings, near, far) -> "Plan":
         counts, views_each = np.array(gaussians.splits, dtype=np.int64), cameras.shape[1]
         firsts = np.cumsum(counts) - counts
         # Each view has whole vectors of splats, so that two threads never write to the same vector.
         sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
         return cls(
-            views=_view_rows(cameras, settings, regions),
+            views=_view_rows(cameras, settings),
             edges=_part_edges(firsts, counts),
             shifts=np.cumsum(sizes) - sizes - np.repeat(firsts, views_each),
             splats=int(sizes.sum()),
@@ -82,8 +81,7 @@ def _part_edges(firsts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return edges + firsts[:, None]
 
 
-def _view_rows(cameras: Cameras, settings: RasterSettings, regions: Tensor | None) -> np.ndarray:
-    """The cameras as rows of ``layout.VIEW`` doubles."""
+def _view_rows(cameras: Cameras, settings: RasterSettings) -> np.ndarray:
     intrinsics = cameras.intrinsics.detach().double().flatten(0, -3).numpy()
     extrinsics = cameras.extrinsics.detach().double().flatten(0, -3).numpy()
     rows = np.zeros((len(intrinsics), layout.VIEW))
@@ -94,10 +92,6 @@ def _view_rows(cameras: Cameras, settings: RasterSettings, regions: Tensor | Non
         rows[:, layout.FX + axis], rows[:, layout.CX + axis] = focal, center
         rows[:, low], rows[:, low + 1] = -center / focal - margin, (size - center) / focal + margin
     rows[:, layout.RIGHT], rows[:, layout.BOTTOM] = cameras.width - 1, cameras.height - 1
-    if regions is not None:
-        top, left, height, width = regions.cpu().double().flatten(0, -2).numpy().T
-        rows[:, layout.LEFT], rows[:, layout.RIGHT] = left, left + width - 1
-        rows[:, layout.TOP], rows[:, layout.BOTTOM] = top, top + height - 1
     rows[:, layout.ROTATION : layout.ROTATION + 9] = extrinsics[:, :3, :3].reshape(-1, 9)
     rows[:, layout.TRANSLATION : layout.TRANSLATION + 3] = extrinsics[:, :3, 3]
     return rows

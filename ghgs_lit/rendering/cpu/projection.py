@@ -13,7 +13,7 @@ _FAR = 1e30
 
 @helper
 def _extents(view, u, v, a, c, cutoff):
-    """First and last pixels of the region, across and down, whose centres lie in the boxes around splats."""
+    """First and last pixels of the image, across and down, whose centres lie in the boxes around splats."""
     reach = (2.0 / geometry.TO_LOG2) * cutoff
     half_width = simd.minimum(simd.sqrt(reach * a), _FAR)
     half_height = simd.minimum(simd.sqrt(reach * c), _FAR)

@@ -5,16 +5,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ghgs_lit.kernels.memory import pointer_to
-from ghgs_lit.kernels.simd import (
-    DOUBLES,
-    I32,
-    I64,
-    LANES,
-    constant,
-    doubles,
-    floats,
-    indices,
-)
+from ghgs_lit.kernels.simd import DOUBLES, I32, I64, LANES, constant, doubles, floats, indices
 from ghgs_lit.rendering.cpu import layout
 
 _FLOAT8, _INT8 = ir.VectorType(ir.FloatType(), DOUBLES), ir.VectorType(I32, DOUBLES)

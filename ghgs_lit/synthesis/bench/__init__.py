@@ -61,14 +61,8 @@ def facts() -> dict[str, str]:
 
 
 def check_settings(settings: Mapping[str, Any]) -> None:
-    """Refuse other settings than those of the definition.
-
-    Args:
-        settings: of ``data``, by key; those that the definition does not name are free, such as the size.
-
-    Raises:
-        InputError: names the first key that differs.
-    """
+    """Refuse other settings than those of the definition. ``settings``: of ``data``, by key; those that the
+    definition does not name are free, such as the size. InputError: names the first key that differs."""
     found = flatten(json.loads(json.dumps(settings)))  # tuples to lists
     size = max(settings["render"]["size"])
     require(size >= LEAST, "data.size", f"{LEAST} pixels or more with split={SPLIT}", size)
@@ -86,14 +80,8 @@ def thumbnail(view: View) -> np.ndarray:
 
 
 def check_photographs(reader: Reader) -> None:
-    """Refuse photographs of other people than those of the definition.
-
-    Args:
-        reader: of all of :func:`names`, or of some.
-
-    Raises:
-        InputError: names the first person whose photographs differ.
-    """
+    """Refuse photographs of other people than those of the definition. ``reader``: of all of :func:`names`,
+    or of some. InputError: names the first person whose photographs differ."""
     known = dict(zip(names(), thumbnails(), strict=True))
     for name in reader.subjects:
         for position, expected in zip(POSITIONS, known[name], strict=True):

@@ -9,26 +9,19 @@ from torchmetrics import MeanMetric
 
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import SemanticBranch, features_of
-from ghgs_lit.errors import require
 from ghgs_lit.training.base import BudgetedModule
 from ghgs_lit.training.guard import DivergedError
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.training.pretext.labels import part_shares
 from ghgs_lit.training.pretext.measure import neighbor_shows_part
-from ghgs_lit.training.pretext.parts import PARTS
 from ghgs_lit.types import Batch
 
 
 class Pretext(nn.Module):
-    """A branch under the name that it has in a model.
-
-    Raises:
-        InputError: it does not have a channel for each of :data:`PARTS`.
-    """
+    """A branch under the name that it has in a model."""
 
     def __init__(self, branch: SemanticBranch):
         super().__init__()
-        require(branch.parts == len(PARTS), "encoder.semantic.parts", str(len(PARTS)), branch.parts)
         self.encoder = nn.ModuleDict({"semantic": branch})
 
     def forward(self, batch: Batch) -> tuple[Float[Tensor, "N P"], Float[Tensor, "N P"], KeptPatches]:

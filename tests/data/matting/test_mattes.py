@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
 from ghgs_lit import Capture
+from ghgs_lit.data import matting
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.geometry.outlines import signed_distance
 from ghgs_lit.prediction.capture import crops
@@ -104,7 +105,7 @@ def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, heig
         calls.append((image.shape[:2], matte.shape, pixels))
         return image, matte
 
-    monkeypatch.setattr(crops, "refined_matte", record)
+    monkeypatch.setattr(matting, "refined_matte", record)
     figure = Figure(height=height, width=height * 3 // 4)
     taken = Capture.read(tmp_path, figure.write(tmp_path))
     cut = [int(1 / crops._SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
@@ -137,7 +138,7 @@ def test_a_matte_that_loses_the_subject_is_refused(monkeypatch, tmp_path):
     """The mask stays as it is, and the warning names the photograph."""
     figure = Figure()
     taken = Capture.read(tmp_path, figure.write(tmp_path))
-    monkeypatch.setattr(crops, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
+    monkeypatch.setattr(matting, "refined_matte", lambda image, matte, pixels: (0 * image, 0 * matte))
     with pytest.warns(UserWarning, match="refine_masks: expected colours of cam") as warned:
         found = taken.batch((56, 42), 4)
     assert len(warned) == len(taken.photographs)

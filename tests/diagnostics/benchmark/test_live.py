@@ -1,14 +1,15 @@
 """``benchmarks/live.py``: which models it times."""
 
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from benchmarks import live as script
 from ghgs_lit.diagnostics.benchmark.measure import threads
 from ghgs_lit.errors import InputError
+from tests.helpers.processes import PREPARED
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "live.py"
 SMALL = ["--size", "56", "--target", "32", "--repeats", "2", "--threads", "1"]
@@ -33,11 +34,13 @@ def test_an_option_of_the_model_beside_a_checkpoint_is_refused(monkeypatch):
         live(monkeypatch, "checkpoint=shipped", *SMALL, "encoder=vggt_small")
 
 
-def test_frames_in_flight_are_drawn_by_processes():
+def test_frames_in_flight_are_drawn_by_processes(monkeypatch, capsys):
     """Each of which has a part of the threads; the table is that of one frame after the other."""
-    options = [*SMALL, "--in-flight", "2", "presets=[exact]"]
-    done = subprocess.run([sys.executable, SCRIPT, *options], capture_output=True, text=True, check=True)
-    lines = [line.split("|") for line in done.stdout.splitlines() if line[:2] == "| "]
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *SMALL, "--in-flight", "2", "presets=[exact]"])
+    monkeypatch.setattr(script.multiprocessing, "get_context", lambda *_: PREPARED)  # spawned ones import all
+    with threads(1):
+        script.main()
+    lines = [line.split("|") for line in capsys.readouterr().out.splitlines() if line[:2] == "| "]
     assert [line[1].strip() for line in lines] == ["ms", "none", "exact"]
     assert lines[0][-2].strip() == "frames a second"
     assert all(float(line[-2]) > 0 for line in lines[1:])

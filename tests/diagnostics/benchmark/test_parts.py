@@ -1,4 +1,4 @@
-"""The parts of a benchmark: order, exponents, errors, FLOPs, memory, the Pareto front, scenes."""
+"""The parts of a benchmark: order, errors, FLOPs, memory, the Pareto front, scenes."""
 
 import dataclasses
 import math
@@ -11,11 +11,10 @@ from ghgs_lit import encoder
 from ghgs_lit.diagnostics.benchmark import measure
 from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES, differences, partners, relative_difference
 from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
-from ghgs_lit.diagnostics.benchmark.measure import Job, Times, order, time_jobs
+from ghgs_lit.diagnostics.benchmark.measure import Times, order, time_cases
 from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.plot import pareto
 from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
-from ghgs_lit.diagnostics.benchmark.scaling import exponent, fits_of
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import (
     NAMES,
@@ -48,15 +47,15 @@ def case(model, name, renderer):
     return Case("model", name, {}, model, renderer, None, None, False)
 
 
-def test_rounds_begin_with_another_job_each():
+def test_rounds_begin_with_another_case_each():
     """A machine that becomes slower must not make the preset that is always last look slow."""
     rounds = [order(turn, 3) for turn in range(3)]
     assert rounds == [[0, 1, 2], [1, 2, 0], [2, 0, 1]]
     assert sorted(order(-1, 3)) == [0, 1, 2]
 
 
-def test_jobs_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, monkeypatch):
-    """Every round runs all jobs once; the numbers are those of the rounds after the warm-up."""
+def test_cases_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, monkeypatch):
+    """Every round runs all cases once; the numbers are those of the rounds after the warm-up."""
     seen, a, b = [], Renderer(), Renderer()
 
     def noted(model, renderer, batch, probe):
@@ -64,9 +63,9 @@ def test_jobs_are_interleaved_and_warm_up_rounds_do_not_count(model, scene, monk
         return forward(model, renderer, batch, probe)
 
     monkeypatch.setattr(measure, "forward", noted)
-    jobs = [Job(case(model, "a", a), [scene, scene]), Job(case(model, "b", b), [scene], threads=1)]
-    times = time_jobs(jobs, warmup=1, repeats=2, device=CPU)
-    assert "".join(seen) == "b" + "aa" + "aa" + "b" + "b" + "aa"
+    cases = [case(model, "a", a), case(model, "b", b)]
+    times = time_cases(cases, [scene, scene], warmup=1, repeats=2, device=CPU)
+    assert "".join(seen) == "bbaa" + "aabb" + "bbaa"
     assert list(times[0]) == [name for name in NAMES if name != ROUNDS]
     assert times[0][TOTAL].low <= times[0][TOTAL].median <= times[0][TOTAL].high
 
@@ -98,22 +97,6 @@ def test_quartiles_of_one_round_are_its_value():
     """One round, as for models of a minute, has no spread."""
     assert Times.of([2.0]) == Times(2.0, 2.0, 2.0)
     assert Times.of([1.0, 2.0, 3.0, 4.0, 5.0]) == Times(3.0, 2.0, 4.0)
-
-
-def test_exponents_of_known_costs():
-    """The fit finds the power of a cost that is one, and none where there is none."""
-    values = [2, 3, 4, 8]
-    assert exponent(values, [0.3 * v**1.7 for v in values]) == pytest.approx(1.7)
-    assert exponent(values, [5.0] * 4) == pytest.approx(0)
-    assert exponent([4], [1.0]) is None
-    assert exponent(values, [1.0, None, 2.0, 3.0]) is None
-    assert exponent(values, [0.0, 1.0, 2.0, 3.0]) is None
-    row = {"preset": "none", "stage": "total"}
-    rows = [{**row, "axis": "size", "value": v, "seconds": v**2, "flops": v**3} for v in values]
-    rows += [{**row, "axis": "threads", "value": v, "seconds": v**-0.5, "flops": 7.0} for v in (1, 2)]
-    size, threads = fits_of(rows)
-    assert (size["exponent"], size["expected"]) == (pytest.approx(2), pytest.approx(3))
-    assert (threads["exponent"], threads["expected"]) == (pytest.approx(-0.5), -1)
 
 
 def test_the_front_has_what_nothing_else_beats():

@@ -1,4 +1,4 @@
-"""``ghgs benchmark`` from end to end with tiny models: files, budgets, presets without code, scaling."""
+"""``ghgs benchmark`` from end to end with tiny models: files, budgets, presets without code."""
 
 import json
 
@@ -172,28 +172,6 @@ def test_a_trained_model_keeps_its_budget_of_psnr(data, checkpoint, tmp_path, ca
     assert "exact: expected a loss up to -1 dB of PSNR; found" in capsys.readouterr().err
 
 
-def test_the_scaling_study_writes_rows_and_exponents(tmp_path):
-    """Every axis has rows with its values and a fitted exponent beside the one of the FLOPs."""
-    code = ghgs(
-        "benchmark", "task=scaling", *TINY, *QUICK, "presets=[balanced]", "scaling.share=[0.1,0.4]",
-        "scaling.views=[2,4]", "scaling.size=[28,56]", "scaling.batch=[1]", "scaling.threads=[]",
-        "scaling.base.size=28", f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
-    assert code == 0
-    content = json.loads((tmp_path / "benchmark.json").read_text())
-    whole = [row for row in content["rows"] if row["stage"] == "total"]
-    found = [(row["axis"], row["value"]) for row in whole]
-    assert found == [
-        ("share", 0.1), ("share", 0.4), ("views", 2), ("views", 4), ("size", 28), ("size", 56), ("batch", 1),
-    ]  # fmt: skip
-    assert {row["preset"] for row in whole} == {"balanced"}
-    fits = {fit["axis"]: fit for fit in content["fits"] if fit["stage"] == "total"}
-    assert fits["views"]["expected"] == pytest.approx(1, abs=0.3)
-    assert fits["size"]["exponent"] is not None
-    assert fits["batch"]["exponent"] is None
-    assert "## Exponents" in (tmp_path / "benchmark.md").read_text()
-
-
 def test_impossible_settings_are_named(data, tmp_path, capsys):
     """Mistakes cost a line, not the time of a benchmark."""
     for wrong, said in {
@@ -201,7 +179,6 @@ def test_impossible_settings_are_named(data, tmp_path, capsys):
         "presets=[]": "presets",
         "presets=exact": "presets",
         "vs=other.ckpt": "vs",
-        "task=speed": "task",
         "subjects=0": "subjects",
         "knobs={recalibration.colour:[1]}": "knobs.recalibration.colour",
     }.items():

@@ -151,6 +151,20 @@ def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch, 
     assert bool(asked[0][0] > 2 * asked[0][1]) == (views == 4)
 
 
+def test_a_camera_that_was_bumped_moves_alone():
+    """Three of four are exact: they stay to the bit, the fourth's error is not spread over them."""
+    truth = scene()
+    poses = truth.cameras.extrinsics.clone()
+    poses[:, 1] = off(truth, 8.0, (4,)).cameras.extrinsics[:, 1]
+    wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
+    found = CameraRefinement(4, predictor(truth), RENDERER)(wrong)
+    moved = pixels_moved(wrong, found)[0]
+    assert [value > 0 for value in moved] == [False, True, False, False]
+    assert moved[1] > 3
+    assert pixels_moved(truth, found)[0][1] < 0.5 * pixels_moved(truth, wrong)[0][1]
+    assert contradiction(found, truth) < 0.3 * contradiction(wrong, truth)
+
+
 def test_rounds_end_where_nothing_gets_better():
     """Cameras that agree are predicted once, others until they do."""
     truth = scene(size=42)

@@ -41,6 +41,14 @@ def figure(batch=1, views=4, size=126):
     return dataclasses.replace(frame.enter(batch), depths=depths)
 
 
+def bumped(truth, off_by, seed):
+    """The batch with some cameras, the keys, off by up to so many pixels."""
+    poses = truth.cameras.extrinsics.clone()
+    for view, pixels in off_by.items():
+        poses[:, view] = off(truth, pixels, (seed,)).cameras.extrinsics[:, view]
+    return dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
+
+
 def pixels_off(cameras, truth):
     """How far surface points are from where they should be seen, root mean square over all views."""
     points = unproject_maps(truth.depths, truth.cameras)[truth.masks][::5]
@@ -57,7 +65,7 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
     """Errors of pixels become errors of a fraction; lenses hardly change, rotations are rotations."""
     truth = figure(views=views)
     wrong = off(truth, pixels, (seed,))
-    found, _ = coherent_cameras(wrong)
+    found, _, _ = coherent_cameras(wrong)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
     zoom = (found.intrinsics / wrong.cameras.intrinsics)[0, :, [0, 1], [0, 1]]
     torch.testing.assert_close(zoom[:, 0], zoom[:, 1])
@@ -72,7 +80,7 @@ def test_silhouettes_correct_cameras(views, pixels, seed):
 def test_exact_cameras_stay():
     """To the bit: silhouettes that explain one another say nothing."""
     truth = figure()
-    found, _ = coherent_cameras(truth)
+    found, _, _ = coherent_cameras(truth)
     assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
     assert torch.equal(found.intrinsics, truth.cameras.intrinsics)
 
@@ -82,7 +90,7 @@ def test_distances_tell_exact_cameras_from_others():
     truth = figure(batch=2)
     poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 4.0, (0, 5)).cameras.extrinsics[1]))
     cameras = dataclasses.replace(truth.cameras, extrinsics=poses)
-    _, distances = coherent_cameras(dataclasses.replace(truth, cameras=cameras))
+    _, _, distances = coherent_cameras(dataclasses.replace(truth, cameras=cameras))
     assert 0 <= distances[0] < 1.5e-4
     assert 3e-3 < distances[1] < 1
 
@@ -90,10 +98,10 @@ def test_distances_tell_exact_cameras_from_others():
 def test_elements_are_corrected_as_if_alone():
     truth = figure(batch=2)
     wrong = off(truth, 2.0, (0, 5))
-    together, _ = coherent_cameras(wrong)
+    together, _, _ = coherent_cameras(wrong)
     for b in range(2):
         parts = (wrong.images[[b]], wrong.masks[[b]], wrong.cameras[[b]])
-        alone, _ = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
+        alone, _, _ = coherent_cameras(Batch(*parts, alpha=wrong.alpha[[b]]))
         torch.testing.assert_close(alone.extrinsics[0], together.extrinsics[b], rtol=0, atol=1e-6)
         torch.testing.assert_close(alone.intrinsics[0], together.intrinsics[b], rtol=0, atol=1e-4)
 
@@ -102,7 +110,7 @@ def test_half_precision_of_others_changes_nothing():
     """Geometry is in float32 under any autocast."""
     wrong = off(figure(), 6.0, (0,))
     with torch.autocast("cpu", torch.bfloat16):
-        found, _ = coherent_cameras(wrong)
+        found, _, _ = coherent_cameras(wrong)
     assert torch.equal(found.extrinsics, coherent_cameras(wrong)[0].extrinsics)
 
 
@@ -111,7 +119,7 @@ def test_no_outline_at_all_moves_nothing_and_says_nothing(matte):
     """Photographs without masks must not pass for silhouettes that agree."""
     truth = figure()
     nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha + matte)
-    found, distances = coherent_cameras(nothing)
+    found, _, distances = coherent_cameras(nothing)
     assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
     assert distances.isposinf().all()
 
@@ -122,7 +130,7 @@ def test_a_silhouette_without_an_outline_says_nothing_wrong(mask):
     truth = figure()
     alpha = truth.alpha.clone()
     alpha[0, 1] = mask
-    found, _ = coherent_cameras(dataclasses.replace(truth, alpha=alpha))
+    found, _, _ = coherent_cameras(dataclasses.replace(truth, alpha=alpha))
     assert found.extrinsics.isfinite().all()
     if mask.all():
         assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
@@ -170,8 +178,30 @@ def test_a_step_follows_the_motion_that_took_cameras_away():
     motion = without_common(motion, pose[:, 2, :3])
     moved = after_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
-    found, _ = coherent_cameras(wrong)
+    found, _, _ = coherent_cameras(wrong)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
+
+
+@pytest.mark.parametrize(
+    ("views", "off_by", "seed"), [(3, {1: 10}, 4), (4, {1: 6}, 0), (4, {2: 10}, 4), (5, {1: 6, 3: 8}, 2)]
+)
+def test_a_minority_that_explains_all_moves_alone(views, off_by, seed):
+    """Cameras that agree with one another are right; of five, two may be off."""
+    truth = figure(views=views)
+    wrong = bumped(truth, off_by, seed)
+    found, free, _ = coherent_cameras(wrong)
+    assert free.tolist() == [[view in off_by for view in range(views)]]
+    for name in ("intrinsics", "extrinsics"):
+        before, after = (getattr(cameras, name)[~free] for cameras in (wrong.cameras, found))
+        assert torch.equal(before, after)
+    assert pixels_off(found, truth) < 0.7 * pixels_off(wrong.cameras, truth)
+
+
+@pytest.mark.parametrize("views", [3, 4, 5])
+def test_where_all_are_off_all_move(views):
+    truth = figure(views=views)
+    _, free, _ = coherent_cameras(off(truth, 6.0, (1,)))
+    assert free.all()
 
 
 @pytest.mark.parametrize("zoomed", [1, 3])
@@ -184,7 +214,7 @@ def test_a_wrong_focal_length_comes_back(zoomed):
     lens = truth.cameras.intrinsics.clone()
     lens[..., [0, 1], [0, 1]] *= zoom[:, None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, intrinsics=lens))
-    found, _ = coherent_cameras(wrong)
+    found, _, _ = coherent_cameras(wrong)
     left = (found.intrinsics / truth.cameras.intrinsics)[0, :, 0, 0].log()
     assert left.abs().max() < 0.7 * zoom.log().abs().max()
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
@@ -209,7 +239,7 @@ def test_a_ray_is_looked_up_in_the_other_silhouettes():
 
 def test_phases_weigh_rays_by_what_they_make_small():
     """First, only rays that miss count; then, only those about as deep as in their own silhouette."""
-    first, second = coherence._PHASES
+    first, second = coherence._MEET, coherence._LIE
     depth = torch.tensor([3.0, -0.5, -4.0])
     distances = first.distances(depth, torch.ones(3))
     torch.testing.assert_close(distances, torch.tensor([0.0, -0.5, -4.0]))

@@ -12,7 +12,7 @@ from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
 from tests.helpers.people import render_boxes
 from tests.helpers.verbs import ghgs
 
-BRANCH = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8, parts: 16}"
+BRANCH = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8}"
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.num_heads=2"]
 TINY += ["evaluation.views=[3]", "evaluation.pictures=0", "logger=none", "callbacks=none"]
 TINY += ["evaluation.targets=[release]", "trainer.limit_val_batches=0"]
@@ -101,7 +101,6 @@ def test_a_model_starts_from_it_and_leaves_it_as_it_is(pretrained, data, tmp_pat
             "encoder.semantic: expected the options of a branch to train; found None",
         ),
         ([BRANCH, "data.size=50"], "data.size: expected sides divisible by the patch size 14"),
-        ([BRANCH.replace("parts: 16", "parts: 3")], "encoder.semantic.parts: expected 16; found 3"),
     ],
 )
 def test_what_cannot_work_is_refused_in_one_line(data, tmp_path, capsys, overrides, message):

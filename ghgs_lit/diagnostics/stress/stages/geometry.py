@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, except_for
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
@@ -72,7 +72,6 @@ def _rays_inputs(family: str, g: Generator) -> Values:
 
 
 def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
-    """Which rays hit a box."""
     directions, centers = ray_directions(cameras), cameras.centers[:, None, None]
     faces = [(middle + sign * half - centers) / directions for sign in (-1, 1)]
     return torch.minimum(*faces).amax(-1) < torch.maximum(*faces).amin(-1)
@@ -313,6 +312,6 @@ STAGES = (
     Stage(
         "undistortion", ("cameras",), _lens_inputs, _lens, 50,
         "a polynomial of degree 7 and its division by the focal length", _lens_slowly,
-        dtypes=("float32", "bfloat16", "float16"), no_dtype="photographs are undistorted in float32",
+        dtypes=FLOAT32_ONLY,
     ),
 )  # fmt: skip

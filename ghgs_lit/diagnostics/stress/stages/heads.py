@@ -11,7 +11,7 @@ from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import CONFIDENCES
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth
-from ghgs_lit.heads.dpt import DPTHead, DPTOptions
+from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.gaussian import FootprintAttributes
 from ghgs_lit.types import Tokens
 
@@ -87,8 +87,7 @@ def _dpt_inputs(family: str, g: Generator) -> Values:
 def _head() -> DPTHead:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(5)
-        options = DPTOptions(features=8, out_channels=(4, 8, 8, 8))
-        return DPTHead(options, 32, 3).requires_grad_(False)
+        return DPTHead(32, 3, widths=(8, (4, 8, 8, 8))).requires_grad_(False)
 
 
 _HEADS = {torch.float32: _head()}

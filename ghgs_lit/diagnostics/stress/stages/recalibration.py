@@ -4,7 +4,7 @@ import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case, except_for
 from ghgs_lit.encoder.cpu.attention import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
@@ -151,5 +151,5 @@ if "avx512f" in processor_features():
     STAGES.append(Stage(
         "encoder kernel", ("features",), _head_inputs, _head_kernel, 100,
         f"logits of sums of 64 products; exponentials by a polynomial. {_HUGE}", _heads_slowly,
-        dtypes=("float32", "bfloat16", "float16"), no_dtype="the kernel takes float32", silent=_INFINITE,
+        dtypes=FLOAT32_ONLY, silent=_INFINITE,
     ))  # fmt: skip

@@ -4,7 +4,7 @@ import torch
 from torch import Generator
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case
 from ghgs_lit.rendering import RasterSettings, reference, render
 from ghgs_lit.types import Cameras, Gaussians
 
@@ -80,6 +80,6 @@ STAGES = (
         "compositing", _TAKES, _inputs, lambda v: _render("cpu", v), 100,
         "an exponential of a square, and a product of up to 1500 transmittances",
         lambda v: _render("reference", v), gradients=_FIELDS, seeds=24, silent=_NOT_DRAWN,
-        dtypes=("float32", "bfloat16", "float16"), no_dtype="the CPU's kernels take float32",
+        dtypes=FLOAT32_ONLY,
     ),
 )  # fmt: skip

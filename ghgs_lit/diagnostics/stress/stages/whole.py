@@ -33,7 +33,6 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
                 parameter.data += 10.0 * torch.randn_like(parameter).sign()
             elif not parameter.any():
                 nn.init.normal_(parameter, std=0.1)
-    model.options = model.options.replace(check_inputs=True)
     # Rounds draw their number in training.
     model.train(name != "recurrent")
     exact = copy.deepcopy(model).double()

@@ -33,10 +33,8 @@ class CameraFile:
         """Cameras in their order, named by their photographs without folder and suffix.
 
         Where several cameras share these names, those of instants, they are named by folders, or as the file
-        has it. A camera that is listed for several photographs is one, without their masks.
-
-        Raises:
-            InputError: two cameras have one name.
+        has it. A camera that is listed for several photographs is one, without their masks. InputError: two
+        cameras have one name.
         """
         for part in (-1, -2, 0):
             named: dict[str, StoredCamera] = {}
@@ -69,7 +67,6 @@ def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str])
     """Name in a warning what a reader does not know.
 
     Args:
-        origin: file and key, for messages.
         fields: of a camera, or of the file.
         known: what is read or of no matter, as :func:`plain` spells it.
 
@@ -92,16 +89,8 @@ def _bends(value: Any) -> bool:
 
 
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
-    """The mapping that a file of text holds.
-
-    Args:
-        path: of the file.
-        parse: of its text.
-        kind, content: of such files, for messages.
-
-    Raises:
-        InputError: the file cannot be read or parsed, or holds something else.
-    """
+    """The mapping that a file of text holds. ``kind``, ``content``: of such files, for messages. InputError:
+    the file cannot be read or parsed, or holds something else."""
     try:
         # Editors of Windows mark UTF-8.
         value = parse(path.read_text(encoding="utf-8-sig"))

@@ -30,11 +30,8 @@ def model_folder(path: Path) -> Path | None:
 
 
 def read_colmap(path: Path) -> CameraFile:
-    """Registered photographs of a sparse model.
-
-    Raises:
-        InputError: it cannot be read, pycolmap is not installed, or a camera model is not known.
-    """
+    """Registered photographs of a sparse model. InputError: it cannot be read, pycolmap is not installed, or
+    a camera model is not known."""
     folder = model_folder(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
     try:
@@ -70,7 +67,6 @@ def _names(folder: Path) -> dict[int, str]:
 
 
 def _camera(folder: Path, name: str, image, camera) -> StoredCamera:
-    """The camera of a registered photograph."""
     origin, model = f"{folder}: {name}", camera.model.name
     require(model in _MODELS, origin, f"a camera model among {', '.join(_MODELS)}", model)
     values = dict(zip(_MODELS[model].split(), camera.params, strict=True))

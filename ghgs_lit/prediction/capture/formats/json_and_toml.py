@@ -17,17 +17,12 @@ from ghgs_lit.prediction.capture.formats.opencv import (
     has_intrinsics,
     size_from_fields,
 )
-from ghgs_lit.prediction.export.maps import camera_entry, cameras_json
 
 _KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
-    """The object of a JSON file.
-
-    Raises:
-        InputError: it is none.
-    """
+    """The object of a JSON file. InputError: it is none."""
     return read_mapping(path, json.loads, "JSON", "a JSON object")
 
 
@@ -35,11 +30,8 @@ def read_json(path: Path) -> CameraFile:
     """``{"cameras": {<name>: {...}}}``, or that mapping alone, with the keys of one of two kinds.
 
     ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion`` and
-    ``fisheye``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there.
-    ``K``, ``R``, ``T``, ``D``: OpenCV's.
-
-    Raises:
-        InputError: a camera is missing or wrong.
+    ``fisheye``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there. ``K``,
+    ``R``, ``T``, ``D``: OpenCV's. InputError: a camera is missing or wrong.
     """
     content = read_json_file(path)
     named = _cameras_of(path, content)
@@ -64,10 +56,7 @@ def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_toml(path: Path) -> CameraFile:
     """Pose2Sim's, Anipose's and Caliscope's TOML: a table for each camera, named by its key ``name``.
-
-    Raises:
-        InputError: a camera is missing or wrong.
-    """
+    InputError: a camera is missing or wrong."""
     tables = _cameras_of(path, read_mapping(path, tomllib.loads, "TOML", "TOML"))
     named = {str(t.get("name", key)): t for key, t in tables.items() if isinstance(t, dict)}
     return _read_matrices(path, named, "toml")
@@ -83,7 +72,6 @@ def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) ->
 
 
 def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
-    """A camera of this package's JSON."""
     unknown = sorted(set(camera) - set(_KEYS))
     require(not unknown, origin, f"keys among {', '.join(_KEYS)}", unknown)
     require("intrinsics" in camera, origin, "intrinsics", sorted(camera))
@@ -95,6 +83,8 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
     """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
+    from ghgs_lit.prediction.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
+
     entries = {
         name: camera_entry(camera.intrinsics, camera.extrinsics, size)
         | {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}

@@ -33,11 +33,8 @@ _KNOWN = {
 
 
 def read_nerfstudio(path: Path) -> CameraFile:
-    """Cameras of ``frames``; intrinsics of a frame win over those of the whole file.
-
-    Raises:
-        InputError: a frame is wrong.
-    """
+    """Cameras of ``frames``; intrinsics of a frame win over those of the whole file. InputError: a frame is
+    wrong."""
     content = read_json_file(path)
     frames = content.get("frames")
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
@@ -73,11 +72,7 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def read_opencv(path: Path) -> CameraFile:
-    """Cameras of a YAML file, or of all YAML files of a folder.
-
-    Raises:
-        InputError: a camera is missing or wrong.
-    """
+    """Cameras of a YAML file, or of all YAML files of a folder. InputError: a camera is missing or wrong."""
     files = sorted([*path.glob("*.yml"), *path.glob("*.yaml")]) if path.is_dir() else [path]
     cameras: list[StoredCamera] = []
     for file in files:
@@ -93,11 +88,8 @@ def read_opencv(path: Path) -> CameraFile:
 
 
 def read_easymocap(path: Path) -> CameraFile:
-    """EasyMocap's ``intri.yml`` and ``extri.yml``, by the path of one of them or of their folder.
-
-    Raises:
-        InputError: one of the files is missing, or a camera is wrong.
-    """
+    """EasyMocap's ``intri.yml`` and ``extri.yml``, by the path of one of them or of their folder. InputError:
+    one of the files is missing, or a camera is wrong."""
     folder = path if path.is_dir() else path.parent
     fields: dict[str, Any] = {}
     for file in (folder / name for name in EASYMOCAP):
@@ -110,7 +102,6 @@ def read_easymocap(path: Path) -> CameraFile:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping of a YAML file of ``cv2.FileStorage``."""
 
     def parse(text: str) -> Any:
         try:
@@ -139,11 +130,8 @@ def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]
 def cameras_from_fields(
     path: Path, named: Mapping[str, Any], expected: str, keys: list[str]
 ) -> list[StoredCamera]:
-    """The cameras of a file by name.
-
-    Raises:
-        InputError: there is none of what is ``expected`` among the ``keys``, or one is wrong.
-    """
+    """The cameras of a file by name. InputError: there is none of what is ``expected`` among the ``keys``, or
+    one is wrong."""
     require(bool(named), str(path), expected, keys)
     return [camera_from_fields(name, f"{path}: {name}", camera) for name, camera in named.items()]
 
@@ -160,16 +148,8 @@ def has_intrinsics(fields: Any) -> bool:
 
 
 def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> StoredCamera:
-    """The camera that ``fields`` describe.
-
-    Args:
-        name: of the camera.
-        origin: file and key, for messages.
-        fields: matrices, lists and numbers by any of their names.
-
-    Raises:
-        InputError: a matrix is missing, or is none.
-    """
+    """The camera that ``fields`` describe. ``fields``: matrices, lists and numbers by any of their names.
+    InputError: a matrix is missing, or is none."""
 
     def array(what: str, *shapes: tuple[int | None, ...]) -> np.ndarray:
         value, names = find(fields, what), " or ".join(_NAMES[what])
@@ -178,6 +158,8 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
 
     rotation = array("rotation", (3, 3), (3,), (3, 1), (1, 3))
     if rotation.size == 3:
+        from scipy.spatial.transform import Rotation  # here: a twentieth of a second for rare files
+
         rotation = Rotation.from_rotvec(rotation.ravel()).as_matrix()
     pose = np.eye(4)
     pose[:3, :3] = rotation

@@ -16,10 +16,10 @@ from kornia.geometry.calibration import undistort_points
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.miniatures import capture
-from ghgs_lit.synthesis.miniatures.smpl import chosen_vertices
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
+from scripts.miniatures import capture
+from scripts.miniatures.smpl import chosen_vertices
 
 # Sequences with long file names, frames numbered from 1, and two cameras fewer.
 OLD = ("313", "315")

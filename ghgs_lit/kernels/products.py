@@ -9,11 +9,10 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from ghgs_lit.encoder.cpu.bfloat16 import PAIRS, holds_pairs
-from ghgs_lit.encoder.cpu.layout import KEYS
-from ghgs_lit.encoder.cpu.tile import PANEL, ROWS
+from ghgs_lit.kernels.bfloat16 import PAIRS, holds_pairs
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I32, I64, LANES, call, constant, floats, indices
+from ghgs_lit.kernels.tile import PANEL, ROWS
 
 _WORDS = ir.VectorType(I32, LANES)
 
@@ -46,7 +45,7 @@ def _steps(builder, half: bool, rows, row_stride: int, step_stride: int, panel, 
                 builder.store(_multiply_add(builder, half, x, part, builder.load(total)), total)
 
 
-def _make_product(strides, adds: bool):
+def make_product(strides, adds: bool):
     """A product of ``ROWS`` rows and one panel.
 
     Args:
@@ -91,6 +90,4 @@ def _make_product(strides, adds: bool):
 
 
 #: ``out = x y`` where the words of all rows for one step are neighbours.
-score = _make_product(lambda half: (1, ROWS), adds=False)
-#: ``out += x y`` where the words of one row are neighbours: ``KEYS`` numbers.
-add_values = _make_product(lambda half: (KEYS // 2 if half else KEYS, 1), adds=True)
+product = make_product(lambda half: (1, ROWS), adds=False)

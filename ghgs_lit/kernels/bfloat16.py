@@ -8,9 +8,9 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, overload
 
-from ghgs_lit.encoder.cpu.tile import PANEL
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I32, LANES, aligned, floats
+from ghgs_lit.kernels.tile import PANEL
 
 
 class _BFloat(ir.Type):

@@ -15,11 +15,11 @@ import torch
 from PIL import Image, ImageFilter
 
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.miniatures import capture
-from ghgs_lit.synthesis.miniatures.smpl import parameters, write_stand_in
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import LightRig, Lights, Studio
 from ghgs_lit.types import Cameras
+from scripts.miniatures import capture
+from scripts.miniatures.smpl import parameters, write_stand_in
 
 KINECTS = 10
 # Frame 12 is missing.

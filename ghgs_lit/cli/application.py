@@ -1,0 +1,175 @@
+"""Each verb as a Hydra application over ``conf/<verb>.yaml``."""
+
+import importlib
+import keyword
+import os
+import re
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import hydra
+import omegaconf._utils
+import yaml
+from hydra._internal.hydra import Hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from ghgs_lit.cli.main import VERBS, collect_garbage_again
+from ghgs_lit.cli.messages import (
+    BAD_INPUT,
+    BadUsage,
+    check_deletions,
+    flags_first,
+    one_line,
+    raised_by_hydra,
+    takes_value,
+)
+from ghgs_lit.config import check_groups, conf_dir, own_keys, resolve
+from ghgs_lit.runs.job import register_resolvers
+from ghgs_lit.runs.signals import Interrupted, interruptible
+
+register_resolvers()  # on import, so that the processes of a launcher have them too
+
+
+def module_of(verb: str) -> str:
+    """The module of a verb; a keyword of Python gets an underscore."""
+    return f"ghgs_lit.cli.{verb}" + "_" * keyword.iskeyword(verb)
+
+
+def discard_unused(directory: Path, verb: str, since: float) -> None:
+    """Remove a run's directory that holds only how the run began, all of it written after ``since``."""
+    begun = {".hydra", ".lock", "config.yaml", "sessions.jsonl", f"{verb}.log"}
+    paths = [] if directory == Path.cwd() else list(directory.glob("*"))
+    if paths and all(path.name in begun and path.stat().st_mtime >= since for path in paths):
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Verb:
+    """The function of one verb that Hydra calls, here or in the processes of a launcher."""
+
+    name: str
+    argv: tuple[str, ...]
+    wants_trace: bool = False
+    started: float = field(default_factory=time.time)
+
+    def __call__(self, cfg: DictConfig) -> object:
+        # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
+        sys.argv = list(self.argv)
+        from ghgs_lit.cli.paths import require_paths  # here: --help needs no NumPy
+
+        try:
+            require_paths(self.name, own_keys(cfg, self.name))
+            # Before the verb's module is imported, which takes longer.
+            resolve(cfg, self.name)
+            check_groups(self.name, cfg)
+            module = importlib.import_module(module_of(self.name))
+            collect_garbage_again()
+            return module.run(cfg)
+        except BAD_INPUT as error:
+            # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise
+            discard_unused(Path(HydraConfig.get().runtime.output_dir), self.name, self.started)
+            if self.wants_trace:
+                raise
+            print(f"ghgs {self.name}: {one_line(error, self.name)}", file=sys.stderr)
+            raise SystemExit(1) from error
+
+
+def read_yaml_quickly() -> None:
+    """Let OmegaConf parse by LibYAML, where PyYAML has it: half the time of a composition."""
+    before, yaml.SafeLoader = yaml.SafeLoader, getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    loader = omegaconf._utils.get_yaml_loader()
+    yaml.SafeLoader = before
+    omegaconf._utils.get_yaml_loader = lambda: loader
+
+
+@contextmanager
+def composed_once(arguments: Sequence[str]) -> Iterator[None]:
+    """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
+
+    No file of ``conf`` sets it. Arguments may, and so may files of the user's own, which flags name.
+    """
+    says = any("hydra.mode" in text or "hydra.searchpath" in text for text in arguments)
+    if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
+        yield
+        return
+    before, Hydra.get_mode = Hydra.get_mode, lambda *_, **__: None
+    try:
+        yield
+    finally:
+        Hydra.get_mode = before
+
+
+def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
+    """Arguments in Hydra's terms.
+
+    ``table sweep=<directory>`` is the key ``runs``: to Hydra ``sweep`` is a group. Where the data is that of
+    a checkpoint, which Hydra does not know, its keys are forced.
+    """
+    if verb == "table":
+        return [re.sub("^sweep=", "runs=", argument) for argument in arguments]
+    has_data = any(argument.startswith("data=") for argument in arguments)
+    if verb in ("evaluate", "predict", "view") and not has_data:
+        return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]
+    return arguments
+
+
+def _help(verb: str, arguments: list[str]) -> int:
+    """``ghgs <verb> --help [group]``; of other arguments only ``--config-dir`` has a say."""
+    from ghgs_lit.cli.help import print_group, print_verb
+
+    words = flags_first(arguments)
+    folders = [Path(folder) for flag, folder in pairwise(words) if flag in ("-cd", "--config-dir")]
+    values = {word for flag, word in pairwise(words) if takes_value(flag)}
+    groups = [word for word in words if not word.startswith("-") and "=" not in word and word not in values]
+    for group in groups:
+        print_group(verb, group, folders)
+    if not groups:
+        print_verb(verb, *VERBS[verb], folders)
+    return 0
+
+
+def run(verb: str, argv: list[str]) -> int:
+    # With this variable Hydra raises errors, which are handled below, instead of printing them.
+    wants_trace = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    task = Verb(verb, tuple(argv), wants_trace)
+    try:
+        if "--help" in argv or "-h" in argv:
+            return _help(verb, argv[2:])
+        sys.argv = [argv[0], *flags_first(_for_hydra(verb, argv[2:]))]
+        check_deletions(sys.argv[1:])
+        read_yaml_quickly()
+        with interruptible(), composed_once(sys.argv[1:]):
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader, such as `head`, has seen enough; Python must not write the rest when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+    except BadUsage as error:
+        print(f"ghgs {verb}: {error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        if wants_trace or not (isinstance(error, BAD_INPUT) or raised_by_hydra(error)):
+            raise
+        print(f"ghgs {verb}: {one_line(error, verb)}", file=sys.stderr)
+        return 1
+    except Interrupted as stop:
+        if not stop.explained:
+            print(f"ghgs {verb}: interrupted ({signal.Signals(stop.number).name})", file=sys.stderr)
+        return stop.code
+    except KeyboardInterrupt:
+        print(f"ghgs {verb}: interrupted", file=sys.stderr)
+        return 130
+    return 0

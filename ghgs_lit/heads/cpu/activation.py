@@ -1,0 +1,83 @@
+"""Activations distributed over threads; the result has the same bits with any number of them."""
+
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghgs_lit.geometry.rotations import matrix_to_quaternion
+from ghgs_lit.kernels import pool
+from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.types import Cameras, DepthMaps, Points
+
+#: Gaussians of one task.
+_TASK = 1024
+
+
+def is_supported(*tensors: Tensor | None) -> bool:
+    """Whether the kernel can compute with these: without a gradient, in float32."""
+    return not torch.is_grad_enabled() and pool.is_supported(*(x for x in tensors if x is not None))
+
+
+def activate(
+    raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
+    image: Tensor,
+    pixel: Tensor,
+    maps: DepthMaps,
+    points: Points,
+    photo: Float[Tensor, "B V 3 H W"],
+    share: Float[Tensor, "B V H W"] | None,
+    cameras: Cameras,
+    constants: tuple[float, ...],
+    on_surface: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Means, quaternions, scales, opacities and colours of Gaussians; see :func:`is_supported`.
+
+    Args:
+        raw: offsets, scales, rotations, opacities and, where there are some, colours before activations.
+        image, pixel: that they belong to, in ascending order.
+        maps, points: of all pixels.
+        photo, share: colours of pixels, and what opacities are multiplied by; None: by nothing.
+        cameras: [B, V].
+        constants: limit of offsets, distance inwards, least scale, logarithm of the largest over it, what is
+            added to raw scales across and along the normal, least opacity, what is added to raw opacities,
+            limit of changes of colours.
+        on_surface: axes are those of the surface.
+    """
+    from ghgs_lit.heads.cpu.kernel import activate as compiled  # here: it loads a compiler
+
+    *raw, color = raw
+    color = raw[0].new_empty(0, 3) if color is None else color
+    share = raw[0].new_empty(0, *photo.shape[3:]) if share is None else share.flatten(0, 1)
+    turns = matrix_to_quaternion(cameras.extrinsics.flatten(0, 1)[:, :3, :3].mT)
+    seen = (maps.depth, maps.valid, points.pixels, photo)
+    inputs = (
+        *raw,
+        color,
+        pixel,
+        *(x.flatten(0, 1) for x in seen),
+        share,
+        cameras.intrinsics.flatten(0, 1),
+        turns,
+    )
+    count = len(pixel)
+    out = [raw[0].new_empty(count, *size) for size in ((3,), (4,), (3,), (), (3,))]
+    arrays = [x.contiguous().numpy() for x in inputs]
+    numbers = tuple(np.float32(x) for x in constants)
+    ends = np.searchsorted(image.numpy(), np.arange(len(turns) + 1)).tolist()
+    pool.run(
+        [
+            partial(
+                compiled(), *arrays, numbers, on_surface, *(x.numpy() for x in out), view, first + part.start,
+                first + part.stop,
+            )
+            for view, (first, last) in enumerate(pairwise(ends))
+            for part in even_parts(last - first, _TASK)
+            if last > first
+        ],
+        count,
+    )  # fmt: skip
+    return tuple(out)

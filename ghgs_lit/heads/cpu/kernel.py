@@ -1,0 +1,224 @@
+"""Raw attributes to Gaussians, 16 of one image at once; each line of ``values`` is a number of the 16.
+
+The same as :meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` in plain PyTorch, without a gradient.
+"""
+
+import math
+from functools import cache
+
+import numpy as np
+from numba.core import types
+
+from ghgs_lit.heads.activations import SIGMOID_LIMIT, TANH_LIMIT
+from ghgs_lit.heads.surface import OTHER, SAME
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
+
+ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
+LOG2_E = np.float32(math.log2(math.e))
+SIGMOID, TANH = np.float32(SIGMOID_LIMIT), np.float32(TANH_LIMIT)
+FAR, RANGE = np.float32(OTHER), np.float32(OTHER - SAME)
+
+# Lines: raw values, then what is read at the pixel, then the depths right, left, below and above of it.
+OFFSET, SCALE, ROTATION, OPACITY, COLOR = 0, 3, 6, 10, 11
+DEPTH, POINT, PHOTO, SHARE, AROUND, LINES = 14, 15, 18, 21, 22, 26
+
+FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(5)]
+PLACES, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
+
+
+@cache
+def activate():
+    """The compiled :func:`_activate`."""
+    raw = [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], PLACES]
+    maps = [FLOATS[3], MASKS, FLOATS[4], FLOATS[4], FLOATS[3], FLOATS[3], FLOATS[2]]
+    out = [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
+    return kernel_for(
+        _activate, *raw, *maps, types.UniTuple(types.float32, 9), types.boolean, *out, *[types.int64] * 3
+    )
+
+
+@helper
+def _line(values, line):
+    return memory.load(values, line * LANES)
+
+
+@helper
+def _sigmoid(x):
+    x = simd.minimum(SIGMOID, simd.maximum(ZERO - SIGMOID, x))
+    shrunk = simd.exp2_minus(simd.maximum(x, ZERO - x) * LOG2_E)
+    return simd.select(x < ZERO, shrunk, ONE) / (ONE + shrunk)
+
+
+@helper
+def _tanh(x):
+    return simd.tanh(simd.minimum(TANH, simd.maximum(ZERO - TANH, x)))
+
+
+@helper
+def _exp(x):
+    """The exponential of numbers that are not negative."""
+    return ONE / simd.exp2_minus(simd.minimum(simd.full(EXP2_LIMIT), x * LOG2_E))
+
+
+@helper
+def _unit(w, x, y, z):
+    largest = simd.maximum(simd.maximum(w, ZERO - w), simd.maximum(x, ZERO - x))
+    largest = simd.maximum(largest, simd.maximum(simd.maximum(y, ZERO - y), simd.maximum(z, ZERO - z)))
+    is_zero = largest == ZERO
+    inverse = ONE / simd.select(is_zero, ONE, largest)
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    squared = simd.select(is_zero, ONE, w * w + (x * x + (y * y + z * z)))
+    inverse = ONE / simd.sqrt(squared)
+    return w * inverse, x * inverse, y * inverse, z * inverse
+
+
+@helper
+def _multiply(p, q):
+    """Products of quaternions."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+@helper
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@helper
+def _rotate(q, v):
+    axis = q[1], q[2], q[3]
+    x, y, z = _cross(axis, v)
+    twice = x + x, y + y, z + z
+    rest = _cross(axis, twice)
+    return (
+        v[0] + q[0] * twice[0] + rest[0],
+        v[1] + q[0] * twice[1] + rest[1],
+        v[2] + q[0] * twice[2] + rest[2],
+    )
+
+
+@helper
+def _slope(values, line, own, footprint):
+    """Relative change of depth along an axis, of the pixels after and before; see ``surface_axes``."""
+    after, before = _line(values, line) - own, _line(values, line + 1) - own
+    near_after = simd.minimum(ONE, (FAR - simd.maximum(after, ZERO - after) / footprint) / RANGE)
+    near_before = simd.minimum(ONE, (FAR - simd.maximum(before, ZERO - before) / footprint) / RANGE)
+    near_after, near_before = simd.maximum(near_after, ZERO), simd.maximum(near_before, ZERO)
+    after = simd.select(near_after > ZERO, after, ZERO) * near_after
+    before = simd.select(near_before > ZERO, before, ZERO) * near_before
+    return (after - before) / ((ONE + near_after * near_before) * own + after + before)
+
+
+@helper
+def _axes(values, camera, turn, row, column, own):
+    """Quaternions from axes of the surface to the world; see ``surface_axes``."""
+    footprint = own / camera[0, 0]
+    right, down = _slope(values, AROUND, own, footprint), _slope(values, AROUND + 2, own, footprint)
+    toward = ONE + right * (column + HALF - camera[0, 2]) + down * (row + HALF - camera[1, 2])
+    x, y = ZERO - right * camera[0, 0], ZERO - right * camera[0, 1] - down * camera[1, 1]
+    length = simd.sqrt(x * x + y * y + toward * toward)
+    turned = _unit(length + toward, ZERO - y, x, simd.full(ZERO))
+    return _multiply((turn[0], turn[1], turn[2], turn[3]), turned)
+
+
+@helper
+def _read(
+    offset,
+    scale,
+    rotation,
+    opacity,
+    color,
+    pixel,
+    depth,
+    valid,
+    points,
+    photo,
+    share,
+    image,
+    start,
+    last,
+    values,
+):
+    """Fill ``values`` with Gaussians from ``start`` on; the last one repeats."""
+    height, width = depth.shape[1], depth.shape[2]
+    for lane in range(LANES):
+        i = min(start + lane, last - 1)
+        row, column = pixel[i] // width, pixel[i] % width
+        for k in range(3):
+            values[(OFFSET + k) * LANES + lane] = offset[i, k]
+            values[(SCALE + k) * LANES + lane] = scale[i, k]
+            values[(COLOR + k) * LANES + lane] = color[i, k] if len(color) > 0 else ZERO
+            values[(POINT + k) * LANES + lane] = points[image, row, column, k]
+            values[(PHOTO + k) * LANES + lane] = photo[image, k, row, column]
+        for k in range(4):
+            values[(ROTATION + k) * LANES + lane] = rotation[i, k]
+            y, x = row + (k == 2) - (k == 3), column + (k == 0) - (k == 1)
+            inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+            around = depth[image, y, x] if inside and valid[image, y, x] else np.float32(np.inf)
+            values[(AROUND + k) * LANES + lane] = around
+        values[OPACITY * LANES + lane] = opacity[i]
+        values[DEPTH * LANES + lane] = depth[image, row, column]
+        values[SHARE * LANES + lane] = share[image, row, column] if len(share) > 0 else ONE
+
+
+@helper
+def _write(lines, values, line):
+    for k in range(len(lines)):
+        memory.store(values, (line + k) * LANES, lines[k])
+
+
+def _activate(
+    offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, intrinsics, turns,
+    constants, on_surface, means, quaternions, scales, opacities, colors, image, first, last,
+):  # fmt: skip
+    """Write Gaussians ``first`` to ``last``, of ``image``; see :func:`ghgs_lit.heads.cpu.activate`."""
+    limit, inward, floor, span, across, thickness, least, bias, change = constants
+    camera, width, values = intrinsics[image], depth.shape[2], simd.aligned(LINES * LANES)
+    rows, columns = simd.aligned(LANES), simd.aligned(LANES)
+    focal = np.sqrt(camera[0, 0] * camera[1, 1])
+    for start in range(first, last, LANES):
+        _read(
+            offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, image, start,
+            last, values,
+        )  # fmt: skip
+        own = _line(values, DEPTH)
+        footprint = own / focal
+        q = _unit(
+            _line(values, ROTATION) + ONE, _line(values, ROTATION + 1), _line(values, ROTATION + 2),
+            _line(values, ROTATION + 3),
+        )  # fmt: skip
+        moved = (
+            _tanh(_line(values, OFFSET)) * limit, _tanh(_line(values, OFFSET + 1)) * limit,
+            _tanh(_line(values, OFFSET + 2)) * limit + footprint * inward,
+        )  # fmt: skip
+        if on_surface:
+            for lane in range(LANES):
+                place = pixel[min(start + lane, last - 1)]
+                rows[lane], columns[lane] = place // width, place % width
+            axes = _axes(values, camera, turns[image], memory.load(rows, 0), memory.load(columns, 0), own)
+            moved, q = _rotate(axes, moved), _multiply(axes, q)
+        for k in range(3):
+            size = _line(values, SCALE + k) + (thickness if k == 2 else across)
+            memory.store(values, (SCALE + k) * LANES, footprint * (floor * _exp(_sigmoid(size) * span)))
+            shade = _line(values, PHOTO + k) + _tanh(_line(values, COLOR + k)) * change
+            memory.store(values, (COLOR + k) * LANES, shade)
+        for k in range(3):
+            memory.store(values, (OFFSET + k) * LANES, _line(values, POINT + k) + moved[k])
+        for k in range(4):
+            memory.store(values, (ROTATION + k) * LANES, q[k])
+        shown = _sigmoid(_line(values, OPACITY) + bias) * (ONE - least) + least
+        memory.store(values, OPACITY * LANES, shown * _line(values, SHARE))
+        for lane in range(min(LANES, last - start)):
+            for k in range(3):
+                means[start + lane, k] = values[(OFFSET + k) * LANES + lane]
+                scales[start + lane, k] = values[(SCALE + k) * LANES + lane]
+                colors[start + lane, k] = values[(COLOR + k) * LANES + lane]
+            for k in range(4):
+                quaternions[start + lane, k] = values[(ROTATION + k) * LANES + lane]
+            opacities[start + lane] = values[OPACITY * LANES + lane]

@@ -1,0 +1,177 @@
+"""What views show of each Gaussian, and what the rounds remember of it."""
+
+from functools import cache
+
+import numpy as np
+from numba.core import types
+
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.layers import linear, lines, put_rows, rectify, size
+from ghgs_lit.kernels.simd import LANES
+from ghgs_lit.kernels.tile import PANEL
+
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+
+FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
+IMAGES = types.Array(types.int64, 1, "C")
+
+
+@cache
+def observe():
+    """The compiled :func:`_observe`."""
+    gaussians, cameras = (FLOATS[2], FLOATS[2], IMAGES), (FLOATS[4], FLOATS[4])
+    maps = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
+    numbers = (types.float32, FLOATS[3], types.int64, types.int64)
+    return kernel_for(_observe, *gaussians, *cameras, *maps, *numbers)
+
+
+@cache
+def remember():
+    """The compiled :func:`_remember`."""
+    return kernel_for(_remember, FLOATS[3], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], *[types.int64] * 2)
+
+
+@helper
+def _see(view, hidden, views, shown, seen):
+    """Put what a view shows into ``seen``: the own view's, then the others' mean and their maximum."""
+    size = hidden * PANEL
+    share = ONE / np.float32(views - 1)
+    for i in range(0, size, LANES):
+        value = memory.load(shown, i)
+        if view == 0:
+            memory.store(seen, i, value)
+        elif view == 1:
+            memory.store(seen, size + i, value * share)
+            memory.store(seen, 2 * size + i, value)
+        else:
+            memory.store(seen, size + i, simd.fma(value, share, memory.load(seen, size + i)))
+            most = simd.maximum(memory.load(seen, 2 * size + i), value)
+            memory.store(seen, 2 * size + i, most)
+
+
+def _remember(each, known, before, layers, after, first, last):
+    """Write rows ``first`` to ``last`` of ``after``; see :func:`ghgs_lit.rounds.cpu.remembered`."""
+    views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
+    inputs = 4 * hidden + known.shape[1]
+    to_deep = size(hidden, channels)
+    to_update = to_deep + size(hidden, hidden)
+    to_narrow = to_update + size(2 * hidden, inputs)
+    to_memory = to_narrow + size(hidden, 2 * hidden)
+    biases = to_memory + lines(hidden) * hidden
+    seen = simd.aligned(inputs * PANEL)
+    widest = max(lines(2 * hidden), channels) * PANEL
+    one, two = simd.aligned(widest), simd.aligned(widest)
+    for start in range(first, last, PANEL):
+        count = min(PANEL, last - start)
+        for view in range(views):
+            put_rows(each[:, view], start, count, 0, one)
+            linear(layers, 0, hidden, channels, one, two)
+            rectify(layers, 0, hidden, channels, two)
+            linear(layers, to_deep, hidden, hidden, two, one)
+            rectify(layers, to_deep, hidden, hidden, one)
+            _see(view, hidden, views, one, seen)
+        put_rows(known, start, count, 3 * hidden, seen)
+        put_rows(before, start, count, inputs - hidden, seen)
+        linear(layers, to_update, 2 * hidden, inputs, seen, one)
+        rectify(layers, to_update, 2 * hidden, inputs, one)
+        linear(layers, to_narrow, hidden, 2 * hidden, one, two)
+        rectify(layers, to_narrow, hidden, 2 * hidden, two)
+        linear(layers, to_memory, hidden, hidden, two, one)
+        for channel in range(hidden):
+            for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
+                old = memory.load(seen, (inputs - hidden) * PANEL + i)
+                memory.store(one, i, simd.tanh(old + memory.load(one, i) + layers[biases + channel]))
+        for lane in range(count):
+            for channel in range(hidden):
+                after[start + lane, channel] = one[channel * PANEL + lane]
+
+
+@helper
+def _axis(row, x, y, z):
+    """A coordinate of points in a camera's axes."""
+    return row[0] * x + (row[1] * y + (row[2] * z + row[3]))
+
+
+@helper
+def _put_cells(place, side, cells):
+    """Two cells beside places along an axis, and their shares in four lines: 0 beyond the border."""
+    place = place - HALF
+    first = simd.floor(place)
+    share, last = place - first, np.float32(side - 1)
+    memory.store(cells, 0, simd.maximum(first, ZERO))
+    memory.store(cells, LANES, simd.minimum(first + ONE, last))
+    memory.store(cells, 2 * LANES, simd.select(first >= ZERO, ONE - share, ZERO))
+    memory.store(cells, 3 * LANES, simd.select(first < last, share, ZERO))
+
+
+@helper
+def _between(plane, rows, columns, weights):
+    """Sum of four cells of a plane times their weights."""
+    upper = weights[0] * plane[rows[0], columns[0]] + weights[1] * plane[rows[0], columns[1]]
+    return upper + (weights[2] * plane[rows[1], columns[0]] + weights[3] * plane[rows[1], columns[1]])
+
+
+@helper
+def _cells(lane, down, across):
+    """Rows, columns and weights of the four cells around a point."""
+    rows = np.uint64(down[lane]), np.uint64(down[LANES + lane])
+    columns = np.uint64(across[lane]), np.uint64(across[LANES + lane])
+    top, bottom = down[2 * LANES + lane], down[3 * LANES + lane]
+    left, right = across[2 * LANES + lane], across[3 * LANES + lane]
+    return rows, columns, (top * left, top * right, bottom * left, bottom * right)
+
+
+@helper
+def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
+    """Put the cells around points in a view, and their depths; returns which it can see, as bits."""
+    distance = _axis(pose[2], x, y, z)
+    inverse = ONE / distance
+    right, below = _axis(pose[0], x, y, z) * inverse, _axis(pose[1], x, y, z) * inverse
+    u = camera[0, 0] * right + (camera[0, 1] * below + camera[0, 2])
+    v = camera[1, 1] * below + camera[1, 2]
+    seen = (distance > ZERO) & (u >= ZERO) & (u <= np.float32(width))
+    _put_cells(u, width, across)
+    _put_cells(v, height, down)
+    memory.store(z_depth, 0, distance)
+    return simd.bits(seen & (v >= ZERO) & (v <= np.float32(height)))
+
+
+def _observe(
+    means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, near, out, first, last
+):
+    """Write rows ``first`` to ``last``, of one element; see :func:`ghgs_lit.rounds.cpu.observe`."""
+    views, height, width = photo.shape[1], photo.shape[3], photo.shape[4]
+    element = image[first] // views
+    point, z_depth, behind = simd.aligned(3 * LANES), simd.aligned(LANES), simd.aligned(LANES)
+    down, across = simd.aligned(4 * LANES), simd.aligned(4 * LANES)
+    for start in range(first, last, LANES):
+        count = min(LANES, last - start)
+        for lane in range(LANES):
+            for axis in range(3):
+                point[axis * LANES + lane] = means[start + min(lane, count - 1), axis]
+        x, y, z = memory.load(point, 0), memory.load(point, LANES), memory.load(point, 2 * LANES)
+        for view in range(views):
+            pose = extrinsics[element, view]
+            seen = _project(intrinsics[element, view], pose, x, y, z, height, width, down, across, z_depth)
+            behind[:] = ZERO
+            for lane in range(count):
+                values = out[start + lane, (view - image[start + lane]) % views]
+                values[:] = ZERO
+                if not seen >> lane & 1:
+                    continue
+                rows, columns, weights = _cells(lane, down, across)
+                for k in range(3):
+                    color = _between(photo[element, view, k], rows, columns, weights)
+                    values[k] = color - colors[start + lane, k]
+                    values[3 + k] = color - _between(drawn[element, view, k], rows, columns, weights)
+                values[6] = _between(mask[element, view], rows, columns, weights)
+                values[7] = _between(alpha[element, view, 0], rows, columns, weights)
+                surface = _between(depth[element, view, 0], rows, columns, weights)
+                behind[lane] = (z_depth[lane] - surface) / near
+                values[9] = ONE
+            memory.store(behind, 0, simd.tanh(memory.load(behind, 0)))
+            for lane in range(count):
+                values = out[start + lane, (view - image[start + lane]) % views]
+                values[8] = behind[lane]
+                values[10] = ONE if (view - image[start + lane]) % views == 0 else ZERO
