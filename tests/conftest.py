@@ -21,26 +21,19 @@ check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 import torch  # noqa: E402
 import yaml  # noqa: E402
 from hydra._internal import defaults_list  # noqa: E402
-from hydra._internal.hydra import Hydra  # noqa: E402
 
 # Composing configurations is a quarter of the suite, reading their files a third of that: LibYAML is faster.
 yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-# Hydra makes a map for interpolations of each file, a third of its time, and composes all of a verb's
-# configuration for its mode alone, which is null but in sweeps.
-_map, _mode = defaults_list._create_interpolation_map, Hydra.get_mode
+# Hydra makes a map for each file, a third of its time, and reads it for interpolations only.
+_map = defaults_list._create_interpolation_map
 
 
 def _map_where_needed(overrides, defaults, *arguments):
     return _map(overrides, defaults, *arguments) if any(d.is_interpolation() for d in defaults) else None
 
 
-def _mode_where_set(self, config_name, overrides):
-    is_set = any("sweep=" in override or "hydra.mode" in override for override in overrides)
-    return _mode(self, config_name, overrides) if is_set else None
-
-
-defaults_list._create_interpolation_map, Hydra.get_mode = _map_where_needed, _mode_where_set
+defaults_list._create_interpolation_map = _map_where_needed
 
 # Test processes share the cores; more threads than cores slow each other down.
 torch.set_num_threads(max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))

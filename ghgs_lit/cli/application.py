@@ -22,7 +22,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.main import VERBS, collect_garbage_again
 from ghgs_lit.cli.messages import (
     BAD_INPUT,
     BadUsage,
@@ -32,7 +31,9 @@ from ghgs_lit.cli.messages import (
     raised_by_hydra,
     takes_value,
 )
+from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import check_groups, conf_dir, own_keys, resolve
+from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
 
@@ -97,9 +98,9 @@ def read_yaml_quickly() -> None:
 def composed_once(arguments: Sequence[str]) -> Iterator[None]:
     """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
 
-    No file of ``conf`` sets it. Arguments may, and so may files of the user's own, which flags name.
+    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name.
     """
-    says = any("hydra.mode" in text or "hydra.searchpath" in text for text in arguments)
+    says = any(key in text for text in arguments for key in ("sweep", "hydra.mode", "hydra.searchpath"))
     if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
         yield
         return

@@ -61,29 +61,25 @@ def consistency_of(
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     # All of it: half a pixel in bfloat16 is a different colour.
     with torch.autocast(batch.masks.device.type, enabled=False):
-        colors, turn, shift, compared = (
-            x.to(near) if x.is_floating_point() else x for x in batch.once(_views)
-        )
-        views = (turn, shift, compared)
+        views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
         if cpu.is_supported(near, far):
             size = tuple(batch.masks.shape[2:])
             return cpu.sweep(batch.once(_padded), pixels, near, far, size, *views, shares, TOLERANCE)
-        result = near.new_zeros(len(pixels), steps)
+        colors, result = batch.once(_smooth).to(near), near.new_zeros(len(pixels), steps)
         for part in even_parts(len(pixels), _SAMPLES // (steps * (batch.masks.shape[1] - 1))):
             depth = near[part, None] + (far - near)[part, None] * shares
             result[part] = _best_match(pixels[part], depth, colors, *views)
         return result
 
 
-def _views(batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What does not depend on depths: smooth colours, relations of the views, and which are compared."""
+def _pairs(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    """Relations of the views, and which are compared: what depends neither on depths nor on colours."""
     turn, shift, facing = _relations(batch.cameras)
-    colors = _smooth(batch.once(surface_colors), batch.masks)
-    return colors, turn, shift, ~(facing < WIDEST)
+    return turn, shift, ~(facing < WIDEST)
 
 
 def _padded(batch: Batch) -> Tensor:
-    return cpu.padded(batch.once(_views)[0])
+    return cpu.padded(batch.once(surface_colors), batch.masks)
 
 
 def _best_match(
@@ -127,12 +123,13 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
     return torch.exp(-difference / TOLERANCE) * seen[..., 3] * front
 
 
-def _smooth(images: Tensor, masks: Tensor) -> Tensor:
+def _smooth(batch: Batch) -> Tensor:
     """Colours averaged over the subject's pixels in 3 x 3, and the mask as a fourth channel.
 
     A pixel that is not finite is none of the subject's: it would spread through sums and samples.
     """
-    inside = (masks & images.sum(2).isfinite())[:, :, None]
+    images = batch.once(surface_colors)
+    inside = (batch.masks & images.sum(2).isfinite())[:, :, None]
     both = torch.cat((torch.where(inside, images, 0), inside.to(images.dtype)), 2)
     for axis in (-2, -1):  # sums of three, several times as fast as an average pool
         both = _sum_of_three(both, axis)

@@ -1,6 +1,7 @@
-"""How the C library gives memory back."""
+"""How the C library gives memory back, and when Python looks for garbage."""
 
 import ctypes
+import gc
 import os
 
 #: Parameters of glibc's ``mallopt``, and the largest value of one.
@@ -20,3 +21,14 @@ def keep_freed_memory() -> bool:
     if mallopt is None:  # not glibc
         return False
     return all(mallopt(name, _MOST) == 1 for name in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
+
+
+def collect_garbage_again() -> None:
+    """Turn the collector on again after ``gc.disable()``; it leaves alone, at exit too, what was imported.
+
+    That once in a process: a later call finds objects that may become garbage.
+    """
+    if not gc.isenabled():
+        if not gc.get_freeze_count():
+            gc.freeze()
+        gc.enable()

@@ -60,9 +60,12 @@ class Exchange(nn.Module):
         nn.init.zeros_(self.hear.bias)
 
     def forward(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N w"]:
-        """``known`` with what the neighbours add; pixels without a Gaussian tell zeros."""
+        """``known`` with what the neighbours add."""
+        return known + self.hear(F.relu(self.heard(known, windows)))
+
+    def heard(self, known: Float[Tensor, "N w"], windows: Windows) -> Float[Tensor, "N c"]:
+        """What the neighbours tell; pixels without a Gaussian tell zeros."""
         told, (count, height, width) = self.tell(known), windows.shape
         maps = told.new_zeros(count * height * width, told.shape[1]).index_copy(0, windows.place, told)
         maps = self.across(maps.view(count, height, width, told.shape[1]).permute(0, 3, 1, 2))
-        heard = maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, windows.place)
-        return known + self.hear(F.relu(heard))
+        return maps.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, windows.place)

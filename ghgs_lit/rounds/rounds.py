@@ -190,16 +190,29 @@ class Rounds(nn.Module):
         each = observe(gaussians, batch)
         search = self._search(state, batch, rays, size * REACH)
         rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
-        if multiplies(*rows, self.memory.weight):
-            memory = cpu.remembered(self.view, self.update, self.memory, *rows)
-        else:
-            memory = self._remembered_in_parts(*rows)
-        if windows is not None:
-            memory = self.exchange(memory, windows)
-        change = float32_last(self.change, memory)
+        memory, change = self._looked(*rows, windows)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
         return (moved, size * change[:, 1:]), memory
+
+    def _looked(
+        self,
+        each: Float[Tensor, "N V c"],
+        known: Float[Tensor, "N k"],
+        memory: Float[Tensor, "N h"],
+        windows: Windows | None,
+    ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
+        """The memory after a look and an exchange, and the change that follows from it."""
+        fused = multiplies(each, known, memory, self.memory.weight)
+        if fused:
+            memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
+        else:
+            memory = self._remembered_in_parts(each, known, memory)
+        if fused and windows is not None:
+            heard = self.exchange.heard(memory, windows)
+            return cpu.answered(self.exchange.hear, self.change[-1], heard, memory)
+        memory = memory if windows is None else self.exchange(memory, windows)
+        return memory, float32_last(self.change, memory)
 
     def _remembered_in_parts(self, *rows: Tensor) -> Float[Tensor, "N h"]:
         """:meth:`_remembered` of as much as a cache holds: half the time. Backward few operators matter."""

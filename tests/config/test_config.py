@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from ghgs_lit.cli.main import VERBS
+from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import build, conf_dir
 from ghgs_lit.config.ablation import ablation_of, switches_of
 from ghgs_lit.errors import InputError

@@ -7,7 +7,7 @@ from typing import get_origin
 import pytest
 from omegaconf import OmegaConf
 
-from ghgs_lit.cli.main import VERBS
+from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import compose, conf_dir, resolve
 from ghgs_lit.config.describe import meanings, options_of
 from ghgs_lit.config.keys import flatten

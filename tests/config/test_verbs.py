@@ -2,7 +2,7 @@
 
 import pytest
 
-from ghgs_lit.cli.main import VERBS as DESCRIBED
+from ghgs_lit.cli.usage import VERBS as DESCRIBED
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.config.describe import meanings, options_of
 from ghgs_lit.config.registry import KINDS

@@ -11,7 +11,7 @@ from pathlib import Path
 #: Makes processes by forking one that runs no threads and has imported what takes seconds.
 PREPARED = multiprocessing.get_context("forkserver")
 PREPARED.set_forkserver_preload(
-    ["pytest", "ghgs_lit.cli.prepare", "ghgs_lit.cli.train", "ghgs_lit.cli.predict", "ghgs_lit.cli.table"]
+    ["pytest", *(f"ghgs_lit.cli.{name}" for name in ("application", "prepare", "train", "predict", "table"))]
 )
 
 
@@ -30,7 +30,8 @@ def run_prepared(function: Callable, *arguments: object) -> None:
     """Call a function of a module, which must succeed, in a process of :data:`PREPARED`."""
     process = PREPARED.Process(target=function, args=arguments)
     process.start()
-    process.join()
+    process.join(300)
+    process.kill()  # where it hangs
     assert process.exitcode == 0
 
 
@@ -39,7 +40,8 @@ def run_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tupl
     output = folder / ".output"
     process = PREPARED.Process(target=_verb, args=(shlex.split(command), folder, dict(environment), output))
     process.start()
-    process.join()
+    process.join(300)
+    process.kill()  # where it hangs
     return process.exitcode, output.read_text()
 
 

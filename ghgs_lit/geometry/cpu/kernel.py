@@ -15,7 +15,14 @@ ZERO, HALF, ONE, THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
 
 FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
 PIXELS, PAIRS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
+MASKS = types.Array(types.boolean, 3, "C")
 NUMBER = types.int64
+
+
+@cache
+def smooth_rows():
+    """The compiled :func:`_smooth_rows`."""
+    return kernel_for(_smooth_rows, FLOATS[4], MASKS, FLOATS[1], NUMBER, NUMBER, NUMBER)
 
 
 @cache
@@ -25,6 +32,29 @@ def sweep_pixels():
     views = (FLOATS[5], FLOATS[4], PAIRS)
     numbers = [NUMBER] * 5
     return kernel_for(_sweep_pixels, FLOATS[1], *rows, *views, FLOATS[1], types.float32, FLOATS[2], *numbers)
+
+
+def _smooth_rows(photo, masks, out, image, first, last):
+    """Write rows ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.geometry.cpu.padded`."""
+    height, width = masks.shape[1], masks.shape[2]
+    for row in range(first, last):
+        top, bottom = max(row - 1, 0), min(row + 2, height)
+        if not masks[image, top:bottom].any():
+            continue
+        for column in range(width):
+            red, green, blue, count = ZERO, ZERO, ZERO, ZERO
+            at = ((image * (height + 2) + row + 1) * (width + 2) + column + 1) * CHANNELS
+            for y in range(top, bottom):
+                for x in range(max(column - 1, 0), min(column + 2, width)):
+                    if not masks[image, y, x]:
+                        continue
+                    r, g, b = photo[image, 0, y, x], photo[image, 1, y, x], photo[image, 2, y, x]
+                    if np.isfinite(r + g + b):
+                        red, green, blue, count = red + r, green + g, blue + b, count + ONE
+                        if y == row and x == column:
+                            out[at + 3] = ONE
+            if count > ZERO:
+                out[at], out[at + 1], out[at + 2] = red / count, green / count, blue / count
 
 
 @helper

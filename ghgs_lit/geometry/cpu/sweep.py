@@ -12,22 +12,30 @@ from torch import Tensor
 from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.parts import even_parts
 
-#: Pixels of one task.
-_PIXELS = 1024
+#: Pixels, and rows of an image, of one task.
+_PIXELS, _ROWS = 1024, 64
 
 
-def padded(colors: Float[Tensor, "B V 4 H W"]) -> Tensor:
+def padded(photo: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]) -> Tensor:
     """Smoothed photographs, and their masks as a fourth channel, as the kernel reads them: flat, with a rim.
 
     The rim of zeros is what lies outside a photograph; one pixel's channels lie side by side. Whole
     vectors are read, of the last pixels beyond the end.
     """
-    from ghgs_lit.kernels.simd import LANES  # here: it loads a compiler
+    from ghgs_lit.geometry.cpu.kernel import smooth_rows  # here: it loads a compiler
+    from ghgs_lit.kernels.simd import LANES
 
-    elements, views, _, height, width = colors.shape
-    shape = (elements, views, height + 2, width + 2, 4)
-    flat = colors.new_zeros(math.prod(shape) + LANES, dtype=torch.float32)
-    flat[:-LANES].view(shape)[:, :, 1:-1, 1:-1] = colors.movedim(2, -1)
+    elements, views, height, width = masks.shape
+    flat = photo.new_zeros(elements * views * (height + 2) * (width + 2) * 4 + LANES)
+    arrays = [x.flatten(0, 1).contiguous().numpy() for x in (photo, masks)]
+    pool.run(
+        [
+            partial(smooth_rows(), *arrays, flat.numpy(), image, part.start, part.stop)
+            for image in range(elements * views)
+            for part in even_parts(height, _ROWS)
+        ],
+        masks.numel() // 8,
+    )
     return flat
 
 

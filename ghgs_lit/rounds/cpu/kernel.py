@@ -18,6 +18,12 @@ IMAGES = types.Array(types.int64, 1, "C")
 
 
 @cache
+def answer():
+    """The compiled :func:`_answer`."""
+    return kernel_for(_answer, FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], FLOATS[2], *[types.int64] * 2)
+
+
+@cache
 def observe():
     """The compiled :func:`_observe`."""
     gaussians, cameras = (FLOATS[2], FLOATS[2], IMAGES), (FLOATS[4], FLOATS[4])
@@ -87,6 +93,33 @@ def _remember(each, known, before, layers, after, first, last):
                 after[start + lane, channel] = one[channel * PANEL + lane]
 
 
+def _answer(heard, before, layers, after, change, first, last):
+    """Write rows ``first`` to ``last``; see :func:`ghgs_lit.rounds.cpu.answered`."""
+    channels, hidden, outputs = heard.shape[1], before.shape[1], change.shape[1]
+    to_change = size(hidden, channels)
+    to_biases, last_biases = lines(hidden) * channels, to_change + lines(outputs) * hidden
+    widest = max(channels, lines(hidden), lines(outputs)) * PANEL
+    one, two, old = simd.aligned(widest), simd.aligned(widest), simd.aligned(hidden * PANEL)
+    for start in range(first, last, PANEL):
+        count = min(PANEL, last - start)
+        put_rows(heard, start, count, 0, one)
+        put_rows(before, start, count, 0, old)
+        for i in range(0, channels * PANEL, LANES):
+            memory.store(one, i, simd.maximum(ZERO, memory.load(one, i)))
+        linear(layers, 0, hidden, channels, one, two)
+        for channel in range(hidden):
+            for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
+                value = memory.load(two, i) + layers[to_biases + channel] + memory.load(old, i)
+                memory.store(two, i, value)
+        linear(layers, to_change, outputs, hidden, two, one)
+        for lane in range(count):
+            for channel in range(hidden):
+                after[start + lane, channel] = two[channel * PANEL + lane]
+            for channel in range(outputs):
+                value = one[channel * PANEL + lane] + layers[last_biases + channel]
+                change[start + lane, channel] = value
+
+
 @helper
 def _axis(row, x, y, z):
     """A coordinate of points in a camera's axes."""
@@ -145,6 +178,11 @@ def _observe(
     element = image[first] // views
     point, z_depth, behind = simd.aligned(3 * LANES), simd.aligned(LANES), simd.aligned(LANES)
     down, across = simd.aligned(4 * LANES), simd.aligned(4 * LANES)
+    # Place of each view among the values of a Gaussian, by the view of the Gaussian.
+    places = np.empty((views, views), np.int64)
+    for own in range(views):
+        for view in range(views):
+            places[own, view] = (view - own) % views
     for start in range(first, last, LANES):
         count = min(LANES, last - start)
         for lane in range(LANES):
@@ -156,7 +194,7 @@ def _observe(
             seen = _project(intrinsics[element, view], pose, x, y, z, height, width, down, across, z_depth)
             behind[:] = ZERO
             for lane in range(count):
-                values = out[start + lane, (view - image[start + lane]) % views]
+                values = out[start + lane, places[image[start + lane] - element * views, view]]
                 values[:] = ZERO
                 if not seen >> lane & 1:
                     continue
@@ -172,6 +210,7 @@ def _observe(
                 values[9] = ONE
             memory.store(behind, 0, simd.tanh(memory.load(behind, 0)))
             for lane in range(count):
-                values = out[start + lane, (view - image[start + lane]) % views]
+                own = image[start + lane] - element * views
+                values = out[start + lane, places[own, view]]
                 values[8] = behind[lane]
-                values[10] = ONE if (view - image[start + lane]) % views == 0 else ZERO
+                values[10] = ONE if own == view else ZERO

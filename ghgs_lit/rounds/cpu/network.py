@@ -46,3 +46,23 @@ def remembered(
         _WORK * len(before),
     )
     return after
+
+
+def answered(
+    hear: nn.Linear, change: nn.Linear, heard: Float[Tensor, "N e"], before: Float[Tensor, "N h"]
+) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
+    """``after = before + hear(relu(heard))``, and ``change(after)``."""
+    from ghgs_lit.kernels.layers import packed
+    from ghgs_lit.rounds.cpu.kernel import answer
+
+    layers = np.concatenate([packed(hear), packed(change)])
+    after, changed = torch.empty_like(before), before.new_empty(len(before), len(change.bias))
+    rows = [x.contiguous().numpy() for x in (heard, before)]
+    pool.run(
+        [
+            partial(answer(), *rows, layers, after.numpy(), changed.numpy(), part.start, part.stop)
+            for part in even_parts(len(before), _TASK)
+        ],
+        len(before),
+    )
+    return after, changed

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch import nn
 
 from ghgs_lit.kernels import pool
 from ghgs_lit.rounds import RoundsOptions, cpu
@@ -34,6 +35,18 @@ def test_the_kernel_remembers_what_plain_pytorch_does(hidden, views, count):
     found = fused(rounds.float(), rows)
     assert expected.std() > 0.1
     torch.testing.assert_close(found.double(), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("hidden", "channels", "count"), [(48, 16, 1111), (17, 5, 33)])
+@torch.no_grad()
+def test_the_kernel_answers_as_plain_pytorch_does(hidden, channels, count):
+    torch.manual_seed(0)
+    hear, change = nn.Linear(channels, hidden), nn.Linear(hidden, 15)
+    heard, before = torch.randn(count, channels), torch.randn(count, hidden)
+    after, changed = cpu.answered(hear, change, heard, before)
+    expected = before + hear(heard.relu())
+    torch.testing.assert_close(after, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(changed, change(expected), atol=1e-5, rtol=0)
 
 
 def test_the_number_of_threads_and_other_gaussians_change_no_bit():
