@@ -14,6 +14,10 @@ VERBS = {
         "train the semantic branch of an encoder on the parts of built-in people",
         "ghgs pretext data=synthetic data/rig=varied trainer.max_time=00:00:15:00",
     ),
+    "adapt": (
+        "train the weights of the package further for your own cameras, in minutes",
+        "ghgs adapt cameras=cameras.json images=photographs masks=masks out=mine.ckpt",
+    ),
     "evaluate": (
         "measure a checkpoint or the baselines",
         "ghgs evaluate checkpoint=runs/train/.../checkpoints/last.ckpt",

@@ -46,6 +46,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     "trainer": {"lightning": "ghgs_lit.training.trainer.TrainerOptions"},
     "data": {
         "humman": "ghgs_lit.data.humman.dataset.HuMMan",
+        "people_in_rig": "ghgs_lit.synthesis.datasets.PeopleInRig",
         "scans": "ghgs_lit.synthesis.datasets.Scans",
         "synthetic": "ghgs_lit.synthesis.datasets.Synthetic",
         "thuman2": "ghgs_lit.synthesis.thuman2.THuman2",

@@ -88,6 +88,17 @@ class Photographs(Options):
     """rembg: masks by that package."""
 
 
+class Adapt(Photographs, Run):
+    """Train weights further for the cameras of one rig."""
+
+    checkpoint: Path = "shipped"
+    """The weights to start from."""
+    minutes: float = Field(3, gt=0, le=1440)
+    """Minutes of training; people are rendered before."""
+    out: Path | None = None
+    """File for the weights; null: adapted.ckpt in the run's directory."""
+
+
 class Predict(Photographs, Measured):
     """Photographs to a splat and to what else ``formats`` lists."""
 
@@ -281,6 +292,7 @@ class Table(Options):
 
 
 VERBS: dict[str, type[Options]] = {
+    "adapt": Adapt,
     "benchmark": Benchmark,
     "doctor": Doctor,
     "evaluate": Evaluate,

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 # Number of splats or entries that justifies one more thread: about a millisecond of work.
 GRAIN = 8192
@@ -42,6 +42,11 @@ def is_supported(*tensors: Tensor) -> bool:
     return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
+def have_values(*tensors: Tensor) -> bool:
+    """Whether NumPy can read these; it cannot read tensors of shapes alone, as the estimates have them."""
+    return all(type(x) in (Tensor, nn.Parameter) for x in tensors)
+
+
 @cache
 def features() -> set[str]:
     """LLVM's names of the processor features that kernels may use; see ``processor_features``."""
@@ -53,7 +58,8 @@ def features() -> set[str]:
 def multiplies(*tensors: Tensor) -> bool:
     """Whether kernels compute products of these, and as fast as PyTorch: no gradient, no half precision."""
     plain = not torch.is_grad_enabled() and not torch.is_autocast_enabled("cpu")
-    return plain and is_supported(*tensors) and features() >= {"avx2", "fma"}
+    readable = is_supported(*tensors) and have_values(*tensors)
+    return plain and readable and features() >= {"avx2", "fma"}
 
 
 def run(tasks: list, work: int) -> None:

@@ -4,6 +4,7 @@ import functools
 import hashlib
 import json
 import os
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -19,6 +20,7 @@ from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import bench, people
+from ghgs_lit.synthesis.capture_rig import CaptureRig, RigCamera
 from ghgs_lit.synthesis.jobs import (
     ACTIVE,
     PersonSource,
@@ -28,7 +30,7 @@ from ghgs_lit.synthesis.jobs import (
     identity,
     render_people,
 )
-from ghgs_lit.synthesis.rig import Rig, RigOptions
+from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
 
 # Of built-in people: one population, whose numbers tell its people apart.
@@ -38,22 +40,34 @@ _SEED = 0
 
 
 class _Renderable(Rendered):
-    """A data set that this package can render; its ring of cameras is the rig's."""
+    """A data set that this package can render."""
 
-    ring: ClassVar[int] = Rig.positions
-
-    rig: RigOptions = RigOptions()
-    """The ring of cameras around each subject."""
     render: RenderOptions = RenderOptions()
     """What is rendered of each person."""
     render_workers: Workers | None = None
     """Rendering processes; null: one for each core; 0: no further process."""
 
+    @abstractmethod
+    def camera_rig(self) -> Rig | CaptureRig:
+        """The cameras around each subject."""
+
     def render_into(
         self, root: Path, names: Mapping[str, Sequence[str]], source: PersonSource, seed: int
     ) -> int:
         """Render the people of each phase that ``root`` lacks; returns their number."""
-        return render_people(root, names, source, self.rig.build(), self.render, seed, self.render_workers)
+        return render_people(root, names, source, self.camera_rig(), self.render, seed, self.render_workers)
+
+
+class _OnRing(_Renderable):
+    """Its cameras are the ring of the rig."""
+
+    ring: ClassVar[int] = Rig.positions
+
+    rig: RigOptions = RigOptions()
+    """The ring of cameras around each subject."""
+
+    def camera_rig(self) -> Rig:
+        return self.rig.build()
 
 
 #: Index of the first validation person: training people never reach it.
@@ -82,15 +96,13 @@ class ActivePeople(Options):
     """People of validation."""
 
 
-class Synthetic(_Renderable):
+class _Generated(_Renderable):
     """Generated people, rendered on first use and kept in a cache folder named after all their settings."""
 
     limit: ClassVar[Limit] = Limit()
     pixel_centers: ClassVar[str] = "half"
 
-    name: Text = "synthetic"
     size: Size = (140, 140)
-    rig: RigOptions = RigOptions(height=None)
     render: RenderOptions = RenderOptions(size=140)
     people: People = People()
     """Number of people."""
@@ -102,7 +114,7 @@ class Synthetic(_Renderable):
     @property
     def root(self) -> str:
         """The cache's folder, which is named after everything that the photographs depend on."""
-        made_with = identity(self.rig.build(), self.render, _PEOPLE_SEED) | {"people": people_version()}
+        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED) | {"people": people_version()}
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         try:
@@ -129,7 +141,7 @@ class Synthetic(_Renderable):
         """Render the people of ``splits`` that the cache lacks. InputError: the people of ``bench`` are not
         those of its definition (:mod:`.bench`)."""
         if bench.SPLIT in splits:
-            made_with = everything(self.rig.build(), self.render)
+            made_with = everything(self.camera_rig(), self.render)
             bench.check_settings({"people_seed": _PEOPLE_SEED, **made_with})
         names = {phase: self.subject_names(phase) for phase in splits}
         self.render_into(Path(self.root), names, SyntheticSource(_PEOPLE_SEED), _PEOPLE_SEED)
@@ -145,7 +157,32 @@ class Synthetic(_Renderable):
             )
 
 
-class Scans(DataSet, _Renderable):
+class Synthetic(_OnRing, _Generated):
+    """Generated people in a ring of cameras."""
+
+    name: Text = "synthetic"
+    rig: RigOptions = RigOptions(height=None)
+
+
+class PeopleInRig(_Generated):
+    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on."""
+
+    name: Text = "people_in_rig"
+    cameras: dict[Text, RigCamera] = Field({})
+    """The cameras of the rig by name."""
+    fill: tuple[Fill, Fill] = (0.5, 0.95)
+    """[least, greatest] share of its photograph's height that a subject takes in the camera that sees it
+    tallest."""
+
+    @property
+    def ring(self) -> int:
+        return len(self.cameras)
+
+    def camera_rig(self) -> CaptureRig:
+        return CaptureRig.of(list(self.cameras.values()), self.fill)
+
+
+class Scans(DataSet, _OnRing):
     """Scans in the rendered layout at ``root``; :meth:`render_missing` renders them from ``source``."""
 
     name: Text = "scans"

@@ -8,6 +8,7 @@ from typing import Any
 from unittest import mock
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ghgs_lit.bounds import cpu as bounds
@@ -22,6 +23,8 @@ from ghgs_lit.diagnostics.doctor.shapes import Shapes
 from ghgs_lit.encoder import cpu as encoder
 from ghgs_lit.geometry import chamfer
 from ghgs_lit.geometry import cpu as geometry
+from ghgs_lit.heads import cpu as heads
+from ghgs_lit.heads import gaussian
 from ghgs_lit.kernels.watching import Inputs, Watcher, inside
 from ghgs_lit.losses import Losses
 from ghgs_lit.model import GHGS, HEADS
@@ -160,7 +163,10 @@ def _kernels(device: str) -> Iterator[None]:
     """The shapes of the results of compiled kernels; PyTorch's own operators where ``device`` has none."""
     results = [
         (encoder, "attend", lambda q, k, v: v.new_empty(q.transpose(1, 2).shape)),
-        (geometry, "sweep", lambda colors, masks, *rest: colors.new_empty(*masks.shape, len(rest[-2]))),
+        (geometry, "padded", lambda photo, masks: photo.new_empty(4 * F.pad(masks, (1, 1, 1, 1)).numel())),
+        (geometry, "sweep", lambda colors, pixels, *rest: colors.new_empty(len(pixels), len(rest[-2]))),
+        (heads, "is_supported", lambda *_: False),
+        (gaussian, "multiplies", lambda *_: False),
         (chamfer, "nearest", lambda queries, _: torch.zeros(len(queries), dtype=torch.long)),
     ]
     if device != "cpu":

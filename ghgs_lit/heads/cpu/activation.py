@@ -19,7 +19,8 @@ _TASK = 1024
 
 def is_supported(*tensors: Tensor | None) -> bool:
     """Whether the kernel can compute with these: without a gradient, in float32."""
-    return not torch.is_grad_enabled() and pool.is_supported(*(x for x in tensors if x is not None))
+    given = [x for x in tensors if x is not None]
+    return not torch.is_grad_enabled() and pool.is_supported(*given) and pool.have_values(*given)
 
 
 def activate(

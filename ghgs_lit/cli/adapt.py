@@ -1,0 +1,126 @@
+"""``ghgs adapt``: weights for the cameras of one rig, from built-in people who stand in it."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model, model_of, pick_device
+from ghgs_lit.cli.photographs import capture_folder
+from ghgs_lit.cli.runtime import announce, output_dir
+from ghgs_lit.cli.train import run_job, train
+from ghgs_lit.config import resolve
+from ghgs_lit.errors import require
+from ghgs_lit.evaluation.measure import ModelMethod
+from ghgs_lit.evaluation.report import measure_and_write
+from ghgs_lit.prediction.capture.calibration import Convention, calibrate
+from ghgs_lit.prediction.capture.crops import Photograph
+from ghgs_lit.prediction.capture.formats import read_cameras
+from ghgs_lit.runs.results import read_results
+from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.weights.inference import write_inference
+from ghgs_lit.weights.reading import file_of
+
+# How much more and less of a photograph than the user's subject takes people of training take.
+_SPREAD = 0.1
+
+
+def run(cfg: DictConfig) -> float | str | None:
+    """The verb; returns the mean PSNR of validation people in the rig.
+
+    Raises:
+        Interrupted: on Ctrl-C and SIGTERM.
+    """
+    config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
+    return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
+
+
+def with_rig(config: dict[str, Any]) -> dict[str, Any]:
+    """``config`` whose people stand in the rig of ``cameras`` and are seen by all of it.
+
+    Raises:
+        InputError: the calibration, or a photograph, is missing or wrong.
+    """
+    if config["images"] is None:
+        entries, fill = _cameras_of_file(config), config["data"]["fill"]
+    else:
+        folder = capture_folder(config)
+        photographs = folder.photographs(folder.instants[0])
+        entries = {p.name: _entry(p.intrinsics, p.extrinsics, p.mask.shape) for p in photographs}
+        fill = _fill_of(photographs)
+    count = len(entries)
+    require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
+    views = {**config["views"], "training_counts": [count], "evaluation_count": count}
+    return {
+        **config,
+        "data": {**config["data"], "cameras": entries, "fill": fill},
+        "views": views,
+        "evaluation": {**config["evaluation"], "views": [count]},
+    }
+
+
+def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """All cameras of the calibration, which must say the size of its photographs."""
+    require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
+    said = {key: value for key, value in config["calibration"].items() if value is not None}
+    file = read_cameras(config["cameras"], said.pop("format", "auto"))
+    meant = {name: said.get(name, value) for name, value in vars(file.convention).items()}
+    entries = {}
+    for name, camera in file.cameras.items():
+        require(camera.size is not None, camera.origin, "the photographs' size, or images=<folder>", None)
+        calibration = calibrate(camera, Convention(**meant), camera.size)
+        entries[name] = _entry(calibration.intrinsics, calibration.extrinsics, camera.size)
+    return entries
+
+
+def _entry(intrinsics: np.ndarray, extrinsics: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:
+    matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
+    return matrices | {"height": size[0], "width": size[1]}
+
+
+def _fill_of(photographs: Sequence[Photograph]) -> list[float]:
+    """[least, greatest] share of their photograph's height that people take, about that of the subject."""
+    tallest = max(np.ptp(np.nonzero(p.mask.any(1))[0]) / len(p.mask) for p in photographs)
+    return [float(np.clip(tallest * (1 + side * _SPREAD), 0.05, 0.99)) for side in (-1, 1)]
+
+
+def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
+    """Render people, train, and write the weights; arguments as for :func:`ghgs_lit.cli.train.train`."""
+    begin = time.perf_counter()
+    build_data(config).prepare_data()
+    rendered = time.perf_counter() - begin
+    before = _measure(config, directory / "before")
+    training = {
+        **config,
+        "trainer": {**config["trainer"], "max_time": {"seconds": 60 * config["minutes"]}},
+        "init_from": str(file_of(config["checkpoint"])),
+        "init_strict": True,
+        "allow_random_encoder": False,
+    }
+    after = train(training, directory, stats)
+    if after is None:
+        return None
+    out = Path(config["out"] or directory / "adapted.ckpt").expanduser()
+    write_inference(directory / "checkpoints" / "last.ckpt", out, "float16")
+    people = config["data"]["people"]["val"] + config["data"]["active"]["val"]
+    print(
+        f"{people} people that were not trained on, half-way between the cameras: {before:.2f} dB before,"
+        f" {after:.2f} dB after ({rendered:.0f} s of rendering, {stats['seconds']:.0f} s of training)",
+        flush=True,
+    )
+    announce(out)
+    return after
+
+
+def _measure(config: dict[str, Any], directory: Path) -> float:
+    """Mean PSNR in dB of the weights that training starts from, on validation people in the rig."""
+    device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
+    inference = {**config, "precision": "inherit"}
+    method = ModelMethod(load_model(inference, device), build_renderer(config, device))
+    path = measure_and_write(
+        {"model": method}, build_data(config), config, directory, device, verb="adapt", choices=choices()
+    )
+    return read_results(path)["summary"][0]["psnr"]

@@ -1,0 +1,86 @@
+"""``ghgs adapt``: the cameras that it reads, and weights that predict."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ghgs_lit.cli.adapt import with_rig
+from ghgs_lit.config import compose, resolve
+from ghgs_lit.data.view import half_centers
+from ghgs_lit.errors import InputError
+from ghgs_lit.model import GHGS
+from ghgs_lit.runs.results import read_results
+from ghgs_lit.synthesis import jobs
+from ghgs_lit.synthesis.rig import Rig
+from tests.helpers.people import box_person
+from tests.helpers.verbs import ghgs
+
+YAWS = (0.0, 90.0, 180.0, 270.0)
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    """A file of four cameras around a subject."""
+    cameras = Rig().cameras(np.array(YAWS), 120, 100)
+    pairs = zip(cameras.intrinsics.tolist(), cameras.extrinsics.tolist(), strict=True)
+    entries = {
+        f"c{i}": {"intrinsics": k, "extrinsics": e, "width": 100, "height": 120}
+        for i, (k, e) in enumerate(pairs)
+    }
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps({"cameras": entries}))
+    return path
+
+
+def test_all_cameras_of_a_file_are_the_rig(calibration):
+    """Every one is an input; what the file does not say acts on it."""
+    said = [f"cameras={calibration}", "calibration.pixel_centers=integer"]
+    config = with_rig(resolve(compose("adapt", said)))
+    assert config["views"]["evaluation_count"] == 4
+    assert config["views"]["training_counts"] == [4]
+    assert config["evaluation"]["views"] == [4]
+    stored = json.loads(calibration.read_text())["cameras"]["c2"]
+    camera = config["data"]["cameras"]["c2"]
+    assert camera["extrinsics"] == stored["extrinsics"]
+    assert np.allclose(camera["intrinsics"], half_centers(np.asarray(stored["intrinsics"])))
+    assert (camera["height"], camera["width"]) == (120, 100)
+
+
+def test_cameras_that_do_not_say_their_size_are_refused(calibration):
+    content = json.loads(calibration.read_text())
+    for camera in content["cameras"].values():
+        del camera["width"], camera["height"]
+    calibration.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="the photographs' size, or images=<folder>"):
+        with_rig(resolve(compose("adapt", [f"cameras={calibration}"])))
+
+
+def test_more_cameras_than_a_prediction_takes_are_refused(calibration):
+    content = json.loads(calibration.read_text())
+    content["cameras"] |= {f"d{i}": content["cameras"]["c0"] for i in range(5)}
+    calibration.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="2 to 8 cameras, those of the photographs in images=; found 9"):
+        with_rig(resolve(compose("adapt", [f"cameras={calibration}"])))
+    with pytest.raises(InputError, match="cameras=<calibration>; found None"):
+        with_rig(resolve(compose("adapt", [])))
+
+
+def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsys):
+    """The file predicts, holds other weights than those it began with, and both are measured alike."""
+    monkeypatch.setattr(jobs.people, "generate", lambda seed, index, active: box_person(f"p{index}"))
+    monkeypatch.setenv("GHGS_CACHE", str(tmp_path / "cache"))
+    small = ["data.size=42", "data.people={train: 2, val: 1}", "data.active.train=0", "data.active.val=0"]
+    small += ["data.render_workers=0", "data.render.samples=1", "minutes=0.02", "evaluation.pictures=0"]
+    run, out = tmp_path / "run", tmp_path / "mine.ckpt"
+    assert ghgs("adapt", f"cameras={calibration}", f"out={out}", f"hydra.run.dir={run}", *small) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == f"wrote {out}"
+    means = [read_results(path / "metrics.json") for path in (run / "before", run)]
+    assert [len(result["rows"]) for result in means] == [4, 4]
+    before, after = (result["summary"][0]["psnr"] for result in means)
+    assert f"{before:.2f} dB before, {after:.2f} dB after" in printed
+    shipped, mine = (GHGS.from_checkpoint(path).state_dict() for path in ("shipped", out))
+    assert shipped.keys() == mine.keys()
+    assert any(not torch.allclose(shipped[name], mine[name], rtol=1e-2) for name in shipped)
