@@ -22,7 +22,6 @@ from tests.helpers.weights import config as imported_config
 QUIRKS = {
     ("model", "pad"): ("none", "multiple"),
     ("unprojection", "tokens"): ("subject", "release"),
-    ("unprojection", "border"): (0, 3),
     ("depth_head", "parameterization"): ("bounded_inverse", "inverse_linear"),
     ("bounds", "kind"): ("box", "none"),
     ("recalibration", "similarity"): ("product", "product_clamped"),

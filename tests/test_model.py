@@ -268,7 +268,7 @@ def test_an_ablation_wins_over_the_releases_values():
     cfg = config("compat=release", "ablation=no_semantic")
     assert cfg["recalibration"]["similarity"] == "none"
     assert cfg["recalibration"]["tokens"] == "all"
-    assert (cfg["unprojection"]["tokens"], cfg["unprojection"]["border"]) == ("release", 3)
+    assert cfg["unprojection"]["tokens"] == "release"
 
 
 def test_named_models_choose_their_parts_and_the_command_line_wins():

@@ -11,6 +11,7 @@ from ghgs_lit.encoder.aggregator import Aggregator, Pair
 from ghgs_lit.encoder.options import VGGTSettings
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
+from ghgs_lit.encoder.semantic import PARTS
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
@@ -53,7 +54,7 @@ class VGGTEncoder(nn.Module):
         self._set_trainable(options.trainable, options.depth)
         branch = options.semantic
         self.semantic = None if branch is None else branch.build(options.patch_size).requires_grad_(False)
-        self.dim_semantic = options.width if branch is None else branch.parts
+        self.dim_semantic = options.width if branch is None else PARTS
 
     def _set_trainable(self, trainable: str, depth: int) -> None:
         if trainable == "all":

@@ -7,11 +7,12 @@ import os
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from ghgs_lit.config import options
+from ghgs_lit.config.describe import Words
 from ghgs_lit.config.options import Index, Options, Share, Size, Text, Workers
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
 from ghgs_lit.data.layout import Rendered
@@ -157,7 +158,7 @@ class _Generated(_Renderable):
             )
 
 
-class Synthetic(_OnRing, _Generated):
+class Synthetic(_Generated, _OnRing):
     """Generated people in a ring of cameras."""
 
     name: Text = "synthetic"
@@ -168,8 +169,8 @@ class PeopleInRig(_Generated):
     """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on."""
 
     name: Text = "people_in_rig"
-    cameras: dict[Text, RigCamera] = Field({})
-    """The cameras of the rig by name."""
+    cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
+    """The cameras of the rig: intrinsics, extrinsics, width and height of each by name."""
     fill: tuple[Fill, Fill] = (0.5, 0.95)
     """[least, greatest] share of its photograph's height that a subject takes in the camera that sees it
     tallest."""
@@ -179,7 +180,8 @@ class PeopleInRig(_Generated):
         return len(self.cameras)
 
     def camera_rig(self) -> CaptureRig:
-        return CaptureRig.of(list(self.cameras.values()), self.fill)
+        read = [RigCamera.read(camera, f"data.cameras.{name}") for name, camera in self.cameras.items()]
+        return CaptureRig.of(read, self.fill)
 
 
 class Scans(DataSet, _OnRing):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.files import resolved
 
 if TYPE_CHECKING:  # a missing file is refused before PyTorch is imported
     import torch
@@ -75,6 +76,7 @@ def require_weights(path: str | Path) -> bytes:
     if path.is_dir():
         raise _unfit(path, "a directory")
     if not path.is_file():
+        resolved(path)  # says so where its links go in a loop
         raise FileNotFoundError(f"{path}: expected a file of weights; found none")
     with path.open("rb") as file:
         start = file.read(64)

@@ -107,7 +107,7 @@ def test_middle_wraps_around_the_ring():
 def test_release_beside_every_input_and_listed_positions():
     """per_subject=all measures beside every input; listed inputs replace the even ones."""
     targets = TargetProtocol(name="release", per_subject="all")
-    samples = evaluation_samples({"a": FULL}, 3, [targets], 16, 0, {3: [0, 6, 11]})
+    samples = evaluation_samples({"a": FULL}, 3, [targets], 16, 0, [[0, 6, 11]])
     assert samples[0].inputs == ((0, 0), (6, 0), (11, 0))
     assert samples[0].targets == ((0, 3), (6, 3), (11, 3))
 

@@ -120,7 +120,7 @@ def test_dpt(name, dtype):
     """The DPT head reproduces the published numbers."""
     case, groups = CASES[name], _load(name)
     options = case["options"]
-    widths = options["features"], options["out_channels"]
+    widths = options["features"], tuple(options["out_channels"])
     head = DPTHead(options["dim_in"], options["output_dim"], widths=widths)
     head.load_state_dict(groups["state"])
     head.to(dtype)

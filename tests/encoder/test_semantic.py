@@ -84,7 +84,7 @@ def test_where_there_is_no_subject_features_are_zero():
     assert torch.equal(semantic.abs().sum(-1) > 0, shown)
     assert not semantic[0, 1].any()
     encoder.tokens = "subject"
-    assert encoder(images, torch.zeros_like(masks)).semantic.shape == (0, 6)
+    assert encoder(images, torch.zeros_like(masks)).semantic.shape == (0, 16)
 
 
 def test_the_consistency_of_two_patches_is_the_overlap_of_their_parts():

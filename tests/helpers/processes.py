@@ -18,7 +18,9 @@ PREPARED.set_forkserver_preload(
 def run_python(code: str, expected: int = 0, **variables: str) -> subprocess.CompletedProcess:
     """``code``, which must end with exit code ``expected``, in a process with these variables."""
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
-    environment = {**os.environ, "PYTHONPATH": path, **variables}
+    # Where a user has not set it: tests of commands in this process have.
+    before = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
+    environment = {**before, "PYTHONPATH": path, **variables}
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300
     )

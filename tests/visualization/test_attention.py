@@ -64,7 +64,7 @@ def test_the_chosen_token_is_of_its_element_and_has_a_point():
         assert points.tokens_valid[query]
     query = chosen_token(tokens, points, 1, (2, 0, 0))  # nothing there: the nearest that has a point
     assert int(tokens.image[query]) == 5
-    with pytest.raises(InputError, match=r"callbacks\.attention\.token"):
+    with pytest.raises(InputError, match=r"callbacks\.pictures\.token"):
         chosen_token(tokens, points, 0, (3, 0, 0))
     background = int((~points.tokens_valid).nonzero()[0])
     assert attention_of(model.recalibration, tokens, points, background) is None
