@@ -40,7 +40,7 @@ _COHERENT = 5e-4
 _STAY, _KNOWN = 1e-3, 5.0
 #: Few cameras explain silhouettes as well as all where rays pass by less than so many times the distance, or
 #: by less than ``_COHERENT``; of fewer silhouettes than so many, which tell less, by a tenth of it. None is
-#: looked for where the distance with the given cameras is below the last, that of errors of up to a pixel.
+#: looked for where the distance with the given cameras is below the last: that of one that is off by 2.5.
 _AS_WELL, _TELLING, _BUMPED = 1.5, 4, 2e-3
 
 

@@ -208,10 +208,10 @@ def test_where_all_are_off_all_move(views):
 
 
 def test_small_errors_name_no_camera():
-    """Of up to half a pixel: silhouettes do not tell whose they are."""
-    _, free, distances = coherent_cameras(bumped(figure(), {1: 0.5}, 0))
+    """One camera is off by up to 2.5 pixels: all move, as silhouettes hardly tell whose error it is."""
+    _, free, distances = coherent_cameras(bumped(figure(), {2: 2.5}, 4))
     assert free.all()
-    assert distances < 2e-3
+    assert 5e-4 < distances < 2e-3
 
 
 @pytest.mark.parametrize("zoomed", [1, 3])
