@@ -39,8 +39,9 @@ _COHERENT = 5e-4
 #: of the logarithms of focal lengths over it: lenses are known better than where cameras stand.
 _STAY, _KNOWN = 1e-3, 5.0
 #: Few cameras explain silhouettes as well as all where rays pass by less than so many times the distance, or
-#: by less than ``_COHERENT``; of fewer silhouettes than so many, which tell less, by a tenth of it.
-_AS_WELL, _TELLING = 1.5, 4
+#: by less than ``_COHERENT``; of fewer silhouettes than so many, which tell less, by a tenth of it. None is
+#: looked for where the distance with the given cameras is below the last: that of one that is off by 2.5.
+_AS_WELL, _TELLING, _BUMPED = 1.5, 4, 2e-3
 
 
 @dataclass(frozen=True)
@@ -155,12 +156,25 @@ class _Alignment:
             found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
         return found
 
+    def shows_motions_from(self, start: "_Alignment") -> bool:
+        """Whether the subject moves by more than it grows in the image of each free camera.
+
+        Growth is that of a focal length, which is only known beside those of the others: then all are free.
+        """
+        scale, before = (each.lens[:, 0, 0] / each.pose[:, 2, 3] for each in (self, start))
+        seen, was = (s[:, None] * each.pose[:, :2, 3] for s, each in ((scale, self), (before, start)))
+        growth = HEIGHT / 2 * before * (scale / before).log().abs()
+        return bool(((seen - was).norm(dim=-1) > growth)[self.free].all())
+
 
 @torch.no_grad()
-def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
+def coherent_cameras(
+    batch: Batch, *, may_stay: bool = True
+) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
     """Cameras whose silhouettes explain one another; those of an element whose silhouettes do already stay.
 
     Where moving a minority of the cameras explains the silhouettes as well as moving all, the others stay.
+    Silhouettes do not tell this from all cameras moving, less and apart from what they share.
 
     Also returned is which cameras were free to move, and how far rays near outlines pass beside other
     silhouettes, in pixels on average, with the given cameras: 0 to 0.00014 with exact cameras and mattes,
@@ -169,13 +183,16 @@ def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
+        may_stay: whether a minority may move alone.
     """
     cameras = batch.cameras
     parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)
     # A small problem of many short steps, and distances to outlines are computed on a CPU.
     elements = zip(*(part.float().cpu() for part in parts), strict=True)
     with torch.autocast("cpu", enabled=False):
-        lenses, poses, free, distances = zip(*(_coherent(*element) for element in elements), strict=True)
+        lenses, poses, free, distances = zip(
+            *(_coherent(*element, may_stay) for element in elements), strict=True
+        )
     moved = dataclasses.replace(
         cameras,
         intrinsics=torch.stack(lenses).to(cameras.intrinsics),
@@ -186,7 +203,10 @@ def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[
 
 
 def _coherent(
-    mattes: Float[Tensor, "V H W"], lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]
+    mattes: Float[Tensor, "V H W"],
+    lens: Float[Tensor, "V 3 3"],
+    pose: Float[Tensor, "V 4 4"],
+    may_stay: bool,
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Bool[Tensor, " V"], float]:
     """Of one element: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
     outlines, every = _Outlines.of(mattes), torch.ones(len(pose), dtype=torch.bool)
@@ -195,12 +215,13 @@ def _coherent(
     given = _equations(outlines, lens, pose, _MEET)
     if given.distance < _COHERENT:
         return lens, pose, every, given.distance
-    found = _Alignment(lens, pose, every).after(_MEET, outlines)
+    start = _Alignment(lens, pose, every)
+    found = start.after(_MEET, outlines)
     floor = _COHERENT if len(pose) >= _TELLING else 0.1 * _COHERENT
     enough = max(_AS_WELL * found.distances[-1], floor)
-    for free in _minorities(given, len(pose)):
+    for free in _minorities(given, len(pose)) if may_stay and given.distance > _BUMPED else ():
         few = _Alignment(lens, pose, free).after(_MEET, outlines)
-        if few.distances[-1] < enough:
+        if few.distances[-1] < enough and few.shows_motions_from(start):
             found = few
             break
     found = found.after(_LIE, outlines)

@@ -141,7 +141,7 @@ def test_cameras_that_silhouettes_agree_with_need_more_to_be_moved(monkeypatch, 
     batch = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=poses))
     asked = []
 
-    def corrected(self, prediction, batch, worth):
+    def corrected(self, prediction, batch, free, worth):
         asked.append(worth)
         return batch.cameras, torch.zeros(2, dtype=torch.bool)
 

@@ -170,7 +170,10 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_a_step_follows_the_motion_that_took_cameras_away():
-    """One camera moves by six pixels, sideways, but for what all share: most of it comes back."""
+    """One camera moves by six pixels, sideways, but for what all share: most of it comes back.
+
+    Silhouettes do not tell this from one camera that moved alone, so none may stay here.
+    """
     truth = figure()
     pose = truth.cameras.extrinsics[0]
     motion = torch.zeros(4, 6)
@@ -178,7 +181,7 @@ def test_a_step_follows_the_motion_that_took_cameras_away():
     motion = without_common(motion, pose[:, 2, :3])
     moved = after_motions(pose, motion, torch.zeros(3), HEIGHT / 2)[None]
     wrong = dataclasses.replace(truth, cameras=dataclasses.replace(truth.cameras, extrinsics=moved))
-    found, _, _ = coherent_cameras(wrong)
+    found, _, _ = coherent_cameras(wrong, may_stay=False)
     assert pixels_off(found, truth) < 0.5 * pixels_off(wrong.cameras, truth)
 
 
@@ -202,6 +205,13 @@ def test_where_all_are_off_all_move(views):
     truth = figure(views=views)
     _, free, _ = coherent_cameras(off(truth, 6.0, (1,)))
     assert free.all()
+
+
+def test_small_errors_name_no_camera():
+    """One camera is off by up to 2.5 pixels: all move, as silhouettes hardly tell whose error it is."""
+    _, free, distances = coherent_cameras(bumped(figure(), {2: 2.5}, 4))
+    assert free.all()
+    assert 5e-4 < distances < 2e-3
 
 
 @pytest.mark.parametrize("zoomed", [1, 3])
