@@ -35,6 +35,9 @@ def run(cfg: DictConfig) -> float | str | None:
         Interrupted: on Ctrl-C and SIGTERM.
     """
     config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
+    if config["out"] is not None and not config["overwrite"]:
+        taken = Path(config["out"]).expanduser().exists()
+        require(not taken, "out", "a path where there is no file, or overwrite=true", config["out"])
     return run_job(with_rig(config), RunDirectory(output_dir()), adapt)
 
 

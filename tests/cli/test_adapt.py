@@ -84,3 +84,12 @@ def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsy
     shipped, mine = (GHGS.from_checkpoint(path).state_dict() for path in ("shipped", out))
     assert shipped.keys() == mine.keys()
     assert any(not torch.allclose(shipped[name], mine[name], rtol=1e-2) for name in shipped)
+
+
+def test_no_file_is_replaced(calibration, capsys):
+    """The calibration, given as the place for the weights by mistake, stays as it is."""
+    before = calibration.read_text()
+    run = calibration.parent / "run"
+    assert ghgs("adapt", f"cameras={calibration}", f"out={calibration}", f"hydra.run.dir={run}") == 1
+    assert "out: expected a path where there is no file, or overwrite=true" in capsys.readouterr().err
+    assert calibration.read_text() == before
