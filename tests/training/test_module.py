@@ -342,8 +342,9 @@ def test_validation_measures_clamped_renders(tmp_path):
     (found,) = run.validate(
         subject, DataLoader([batch], batch_size=None, collate_fn=lambda b: b), verbose=False
     )
-    image, target = subject(batch)[1].image.clamp(0, 1).flatten(0, 1), batch.targets.images.flatten(0, 1)
-    assert found["val/ssim"] == pytest.approx(float(ssim(image, target).mean().detach()), rel=1e-4)
+    image = subject(batch)[1].image.detach().clamp(0, 1).flatten(0, 1)
+    target = batch.targets.images.flatten(0, 1)
+    assert found["val/ssim"] == pytest.approx(float(ssim(image, target).mean()), rel=1e-4)
     assert found["val/psnr"] == pytest.approx(float(psnr(image, target).mean()), rel=1e-4)
 
 
