@@ -3,7 +3,7 @@
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from omegaconf import DictConfig
@@ -23,6 +23,9 @@ from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.weights.inference import write_inference
 from ghgs_lit.weights.reading import file_of
+
+if TYPE_CHECKING:
+    from ghgs_lit.data.datamodule import PhotographsDataModule
 
 # How much more and less of a photograph than the user's subject takes people of training take.
 _SPREAD = 0.1
@@ -93,9 +96,10 @@ def _fill_of(photographs: Sequence[Photograph]) -> list[float]:
 def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
     """Render people, train, and write the weights; arguments as for :func:`ghgs_lit.cli.train.train`."""
     begin = time.perf_counter()
-    build_data(config).prepare_data()
+    data = build_data(config)
+    data.prepare_data()
     rendered = time.perf_counter() - begin
-    before = _measure(config, directory / "before")
+    before = _measure(config, data, directory / "before")
     training = {
         **config,
         "trainer": {**config["trainer"], "max_time": {"seconds": 60 * config["minutes"]}},
@@ -118,12 +122,12 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     return after
 
 
-def _measure(config: dict[str, Any], directory: Path) -> float:
+def _measure(config: dict[str, Any], data: "PhotographsDataModule", directory: Path) -> float:
     """Mean PSNR in dB of the weights that training starts from, on validation people in the rig."""
     device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
     inference = {**config, "precision": "inherit"}
     method = ModelMethod(load_model(inference, device), build_renderer(config, device))
     path = measure_and_write(
-        {"model": method}, build_data(config), config, directory, device, verb="adapt", choices=choices()
+        {"model": method}, data, config, directory, device, verb="adapt", choices=choices()
     )
     return read_results(path)["summary"][0]["psnr"]

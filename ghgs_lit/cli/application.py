@@ -32,7 +32,8 @@ from ghgs_lit.cli.messages import (
     takes_value,
 )
 from ghgs_lit.cli.usage import VERBS
-from ghgs_lit.config import check_groups, conf_dir, own_keys, resolve
+from ghgs_lit.config import check_groups, conf_dir, own_keys
+from ghgs_lit.config.registry import check
 from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
@@ -68,9 +69,10 @@ class Verb:
         from ghgs_lit.cli.paths import require_paths  # here: --help needs no NumPy
 
         try:
-            require_paths(self.name, own_keys(cfg, self.name))
+            config = own_keys(cfg, self.name)
+            require_paths(self.name, config)
             # Before the verb's module is imported, which takes longer.
-            resolve(cfg, self.name)
+            check(config)
             check_groups(self.name, cfg)
             module = importlib.import_module(module_of(self.name))
             collect_garbage_again()

@@ -11,6 +11,7 @@ from ghgs_lit.weights.reading import require_weights
 
 #: Keys of checkpoints that these verbs open in any case.
 _WEIGHTS = {
+    "adapt": ("checkpoint",),
     "evaluate": ("checkpoint",),
     "export": ("checkpoint",),
     "predict": ("checkpoint",),

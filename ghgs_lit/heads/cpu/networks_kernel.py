@@ -5,7 +5,7 @@ from functools import cache
 from numba.core import types
 
 from ghgs_lit.kernels import simd
-from ghgs_lit.kernels.compile import kernel_for
+from ghgs_lit.kernels.compile import helper, kernel_for
 from ghgs_lit.kernels.layers import bend, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.tile import PANEL
 
@@ -17,6 +17,15 @@ WIDTHS, FLAGS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 1, 
 def attributes():
     """The compiled :func:`_attributes`."""
     return kernel_for(_attributes, TABLE, FLAT, WIDTHS, FLAGS, TABLE, types.int64, types.int64)
+
+
+@helper
+def _activate(bends, layers, at, outputs, inputs, values):
+    """Add biases; then tanh where ``bends``, else ReLU."""
+    if bends:
+        bend(layers, at, outputs, inputs, values)
+    else:
+        rectify(layers, at, outputs, inputs, values)
 
 
 def _attributes(descriptors, layers, widths, bends, out, first, last):
@@ -31,16 +40,10 @@ def _attributes(descriptors, layers, widths, bends, out, first, last):
         for network in range(len(bends)):
             outputs = widths[2 + network]
             linear(layers, at, wide, channels, given, one)
-            if bends[network]:
-                bend(layers, at, wide, channels, one)
-            else:
-                rectify(layers, at, wide, channels, one)
+            _activate(bends[network], layers, at, wide, channels, one)
             at += size(wide, channels)
             linear(layers, at, narrow, wide, one, two)
-            if bends[network]:
-                bend(layers, at, narrow, wide, two)
-            else:
-                rectify(layers, at, narrow, wide, two)
+            _activate(bends[network], layers, at, narrow, wide, two)
             at += size(narrow, wide)
             linear(layers, at, outputs, narrow, two, one)
             biases = at + lines(outputs) * narrow

@@ -168,9 +168,7 @@ class _Alignment:
 
 
 @torch.no_grad()
-def coherent_cameras(
-    batch: Batch, *, may_stay: bool = True
-) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
+def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
     """Cameras whose silhouettes explain one another; those of an element whose silhouettes do already stay.
 
     Where moving a minority of the cameras explains the silhouettes as well as moving all, the others stay.
@@ -183,16 +181,13 @@ def coherent_cameras(
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-        may_stay: whether a minority may move alone.
     """
     cameras = batch.cameras
     parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)
     # A small problem of many short steps, and distances to outlines are computed on a CPU.
     elements = zip(*(part.float().cpu() for part in parts), strict=True)
     with torch.autocast("cpu", enabled=False):
-        lenses, poses, free, distances = zip(
-            *(_coherent(*element, may_stay) for element in elements), strict=True
-        )
+        lenses, poses, free, distances = zip(*(_coherent(*element) for element in elements), strict=True)
     moved = dataclasses.replace(
         cameras,
         intrinsics=torch.stack(lenses).to(cameras.intrinsics),
@@ -206,7 +201,6 @@ def _coherent(
     mattes: Float[Tensor, "V H W"],
     lens: Float[Tensor, "V 3 3"],
     pose: Float[Tensor, "V 4 4"],
-    may_stay: bool,
 ) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Bool[Tensor, " V"], float]:
     """Of one element: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
     outlines, every = _Outlines.of(mattes), torch.ones(len(pose), dtype=torch.bool)
@@ -219,7 +213,7 @@ def _coherent(
     found = start.after(_MEET, outlines)
     floor = _COHERENT if len(pose) >= _TELLING else 0.1 * _COHERENT
     enough = max(_AS_WELL * found.distances[-1], floor)
-    for free in _minorities(given, len(pose)) if may_stay and given.distance > _BUMPED else ():
+    for free in _minorities(given, len(pose)) if given.distance > _BUMPED else ():
         few = _Alignment(lens, pose, free).after(_MEET, outlines)
         if few.distances[-1] < enough and few.shows_motions_from(start):
             found = few
