@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.cli.adapt import with_rig
+from ghgs_lit.cli.adapt import _fill_of, with_rig
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
+from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.synthesis import jobs
 from ghgs_lit.synthesis.rig import Rig
@@ -93,3 +94,11 @@ def test_no_file_is_replaced(calibration, capsys):
     assert ghgs("adapt", f"cameras={calibration}", f"out={calibration}", f"hydra.run.dir={run}") == 1
     assert "out: expected a path where there is no file, or overwrite=true" in capsys.readouterr().err
     assert calibration.read_text() == before
+
+
+def test_people_are_as_large_as_the_subject_of_the_photographs():
+    """A tenth less to a tenth more than where it is tallest, least first."""
+    mattes = np.zeros((2, 100, 80), np.uint8)
+    mattes[0, 20:71], mattes[1, 30:61] = 255, 255
+    photographs = [Photograph("c", np.zeros((100, 80, 3), np.uint8), m, np.eye(3), np.eye(4)) for m in mattes]
+    assert _fill_of(photographs) == pytest.approx([0.45, 0.55])
