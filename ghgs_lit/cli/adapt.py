@@ -106,6 +106,8 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         "init_from": str(file_of(config["checkpoint"])),
         "init_strict": True,
         "allow_random_encoder": False,
+        # Nothing has to be found first, as from random weights.
+        "optimizer": {**config["optimizer"], "freeze_until": {}},
     }
     after = train(training, directory, stats)
     if after is None:
