@@ -20,11 +20,7 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def soft_signed_distance(matte: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """:func:`signed_distance` to fractions of a pixel: its share that is inside says where its outline is.
-
-    Args:
-        matte: shares of pixels; where all are 0 or 1, distances are those of a mask.
-    """
+    """:func:`signed_distance` to fractions of a pixel: its share that is inside says where outlines are."""
     from scipy.ndimage import distance_transform_edt
 
     inside = matte > 0.5

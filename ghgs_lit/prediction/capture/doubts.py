@@ -25,11 +25,9 @@ _MISSED = 4e-3
 def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
     """Where photographs show outlines, in pixels of crops of ``size``, if masks are off; else ""."""
     off = [_outline(photograph, size) for photograph in capture.photographs]
-    if np.abs(off).mean() < _OFF:
-        return ""
-    return (
-        f"photographs show outlines {', '.join(f'{pixels:+.1f}' for pixels in off)} pixels inside the masks'"
-    )
+    places = ", ".join(f"{pixels:+.1f}" for pixels in off)
+    is_off = np.abs(off).mean() > _OFF
+    return f"photographs show outlines {places} pixels inside the masks'" if is_off else ""
 
 
 def doubt_of_cameras(capture: Capture, batch: Batch) -> str:

@@ -32,8 +32,8 @@ _DEPTHS, _FINER = 48, 4
 _FAR = 20.0
 #: Pixels inside their outline whose rays are tried: from, and to.
 _FROM, _TO = 0.25, 8.0
-#: Of a quick look: pixels inside their outline whose rays are tried, and of how many one is.
-_QUICK = ((_FROM, 1.5), 2)
+#: Of a look: size of the maps, pixels inside outlines to which rays are tried, and of how many one is.
+_CAREFUL, _QUICK = (_FINER, _TO, 1), (1, 1.5, 2)
 #: Half the width in pixels over which a slope of a distance map is taken.
 _REACH = 0.75
 #: Mean distance in pixels of rays near outlines below which silhouettes explain one another.
@@ -89,23 +89,16 @@ class _Outlines:
     finer: int = _FINER
 
     @classmethod
-    def of(
-        cls,
-        mattes: Float[Tensor, "V H W"],
-        finer: int = _FINER,
-        rays: tuple[float, float] = (_FROM, _TO),
-        every: int = 1,
-    ) -> "_Outlines":
-        size = (mattes.shape[1], mattes.shape[2])
+    def of(cls, mattes: Float[Tensor, "V H W"], look: tuple[int, float, int] = _CAREFUL) -> "_Outlines":
+        (finer, to, every), size = look, (mattes.shape[1], mattes.shape[2])
         larger = F.interpolate(mattes[:, None], scale_factor=finer, mode="bilinear", align_corners=False)
-        maps = [
-            soft_signed_distance(m) if finer == 1 else signed_distance(m > 0.5) for m in larger[:, 0].numpy()
-        ]
-        maps = (torch.from_numpy(np.stack(maps))[:, None] / finer).clamp(-_FAR, _FAR).to(mattes)
+        distance = soft_signed_distance if finer == 1 else lambda matte: signed_distance(matte > 0.5)
+        maps = torch.from_numpy(np.stack([distance(one) for one in larger[:, 0].numpy()]))[:, None] / finer
+        maps = maps.clamp(-_FAR, _FAR).to(mattes)
         view = torch.arange(len(mattes))[:, None, None].expand(-1, *size)
         pixels = pixel_centers(*size, mattes).expand(*view.shape, 2)
         depth = sample(maps, view, finer * pixels)[..., 0]
-        near = (depth >= rays[0]) & (depth <= rays[1])
+        near = (depth >= _FROM) & (depth <= to)
         return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
@@ -184,7 +177,7 @@ def contradiction(batch: Batch) -> Float[Tensor, " B"]:
     """
     parts, found = (coverage(batch), batch.cameras.intrinsics, batch.cameras.extrinsics), []
     for mattes, lens, pose in zip(*(part.float().cpu() for part in parts), strict=True):
-        outlines = _Outlines.of(mattes, 1, *_QUICK)
+        outlines = _Outlines.of(mattes, _QUICK)
         depth = _best_points(outlines, lens, pose, outlines.view, outlines.pixels)[2]
         found.append(-depth.clamp(max=0).sum() / max(len(depth), 1))
     return torch.stack(found)
