@@ -41,10 +41,10 @@ _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
 #: of the logarithms of focal lengths over it: lenses are known better than where cameras stand.
 _STAY, _KNOWN = 1e-3, 5.0
-#: Few cameras explain silhouettes as well as all where rays pass by less than so many times the distance, by
-#: less than ``_COHERENT`` or by the last part of what was (the camera across from a bumped one leaves 0.04);
-#: of fewer silhouettes than so many, which tell less, by a tenth of ``_COHERENT``. None is looked for where
-#: the distance with the given cameras is below the third number: that of one that is off by 2.5.
+#: Few cameras explain silhouettes as well as all where rays pass by less than so many times the distance, or
+#: by less than ``_COHERENT``; of fewer silhouettes than so many, which tell less, by a tenth of it. None is
+#: looked for where the distance with the given cameras is below the third: that of one off by 2.5. One
+#: alone may leave the last part of that distance, as of rough masks: the camera across from it leaves 0.04.
 _AS_WELL, _TELLING, _BUMPED, _REST = 1.5, 4, 2e-3, 0.02
 
 
@@ -228,11 +228,11 @@ def _coherent(
     start = _Alignment(lens, pose, every)
     found = start.after(_MEET, outlines)
     is_telling = len(pose) >= _TELLING
-    floor = max(_COHERENT, _REST * given.distance) if is_telling else 0.1 * _COHERENT
-    enough = max(_AS_WELL * found.distances[-1], floor)
+    enough = max(_AS_WELL * found.distances[-1], _COHERENT if is_telling else 0.1 * _COHERENT)
     for free in _minorities(given, len(pose)) if given.distance > _BUMPED else ():
         few = _Alignment(lens, pose, free).after(_MEET, outlines)
-        if few.distances[-1] < enough and few.shows_motions_from(start):
+        rest = _REST * given.distance if is_telling and free.sum() == 1 else 0.0
+        if few.distances[-1] < max(enough, rest) and few.shows_motions_from(start):
             found = few
             break
     found = found.after(_LIE, outlines)
