@@ -208,7 +208,7 @@ class Rounds(nn.Module):
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
         else:
             memory = self._remembered_in_parts(each, known, memory)
-        if fused and windows is not None:
+        if fused and windows is not None and not torch.is_grad_enabled():
             heard = self.exchange.heard(memory, windows)
             return cpu.answered(self.exchange.hear, self.change[-1], heard, memory)
         memory = memory if windows is None else self.exchange(memory, windows)
