@@ -1,4 +1,4 @@
-"""Networks of three layers of ``PANEL`` rows at once, and their gradients; see :mod:`ghgs_lit.kernels.layers`."""
+"""Networks of three layers of ``PANEL`` rows at once, and their gradients; see ``kernels.layers``."""
 
 from functools import cache
 
