@@ -142,11 +142,11 @@ def put_ones(line, values):
 
 
 @helper
-def put_slopes(table, first, count, column, channels, values):
-    """Copy ``count`` rows of ``channels`` columns to lines; 0 in the lanes after them."""
+def put_slopes(table, first, count, values):
+    """Copy ``count`` rows of a table to lines; 0 in the lanes after them."""
     for lane in range(PANEL):
-        for channel in range(channels):
-            value = table[first + lane, column + channel] if lane < count else ZERO
+        for channel in range(table.shape[1]):
+            value = table[first + lane, channel] if lane < count else ZERO
             values[channel * PANEL + lane] = value
 
 
@@ -156,14 +156,6 @@ def unrectify(values, channels, slopes):
     for i in range(0, channels * PANEL, LANES):
         is_off = memory.load(values, i) <= ZERO
         memory.store(slopes, i, simd.select(is_off, ZERO, memory.load(slopes, i)))
-
-
-@helper
-def unbend(values, channels, slopes):
-    """Slopes before a tanh that gave ``values``."""
-    for i in range(0, channels * PANEL, LANES):
-        value = memory.load(values, i)
-        memory.store(slopes, i, memory.load(slopes, i) * (ONE - value * value))
 
 
 @helper

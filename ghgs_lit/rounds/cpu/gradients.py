@@ -87,7 +87,7 @@ def _remember_back(
     for start in range(first, last, PANEL):
         count = min(PANEL, last - start)
         _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow)
-        put_slopes(slopes, start, count, 0, hidden, down)
+        put_slopes(slopes, start, count, down)
         for lane in range(count):
             for channel in range(hidden):
                 value = after[start + lane, channel]

@@ -28,52 +28,32 @@ def test_the_kernel_gives_the_attributes_of_plain_pytorch(channels, hidden, shap
         torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("channels", "hidden"), [(16, (32, 16)), (32, (128, 32)), (5, (3, 7))])
-@pytest.mark.parametrize("count", [2500, 33, 1])
-def test_gradients_are_those_of_plain_pytorch(channels, hidden, count):
-    headers = networks(channels, hidden)
-    x = torch.randn(count, channels, requires_grad=True)
-    weights = [torch.randn(count, header[-1].out_features) for header in headers]
-
-    def gradients(found, dtype):
-        numbers = [p for header in headers for p in header.parameters()]
-        return torch.autograd.grad(found, [x, *numbers], [w.to(dtype) for w in weights])
-
-    found = gradients(cpu.attributes(headers, x), torch.float32)
-    doubled = [header.double()(x.double()) for header in headers]
-    for mine, expected in zip(found, gradients(doubled, torch.float64), strict=True):
-        assert (mine - expected).norm() <= 2e-6 * expected.norm()
-
-
+@torch.no_grad()
 def test_the_number_of_threads_and_other_rows_change_no_bit():
-    headers, x = networks(16, (32, 16)), torch.randn(5000, 16)
-    learned = [headers[0][0].weight, headers[4][4].bias]
+    headers, x = networks(16, (32, 16)), torch.randn(3000, 16)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
         one = cpu.attributes(headers, x)
-        slopes = torch.autograd.grad(sum(values.square().sum() for values in one), learned)
         torch.set_num_threads(3)
         three = cpu.attributes(headers, x)
-        others = torch.autograd.grad(sum(values.square().sum() for values in three), learned)
     finally:
         torch.set_num_threads(threads)
-    assert all(map(torch.equal, slopes, others))
     part = cpu.attributes(headers, x[1000:1010])
     for mine, others, few in zip(one, three, part, strict=True):
         assert torch.equal(mine, others)
         assert torch.equal(mine[1000:1010], few)
 
 
-def test_a_head_uses_the_kernel_where_a_processor_has_fused_products(monkeypatch):
+def test_a_head_uses_the_kernel_without_a_gradient(monkeypatch):
     head, calls, fused = shake(make_head()), [], cpu.attributes
+    monkeypatch.setattr("ghgs_lit.kernels.pool.features", lambda: {"avx2", "fma"})
     monkeypatch.setattr(cpu, "attributes", lambda *args: calls.append(1) or fused(*args))
     x = torch.randn(10, 32)
-    monkeypatch.setattr("ghgs_lit.kernels.pool.features", set)
     expected = head._raw(x)
     assert not calls
-    monkeypatch.setattr("ghgs_lit.kernels.pool.features", lambda: {"avx2", "fma"})
-    found = head._raw(x)
+    with torch.no_grad():
+        found = head._raw(x)
     assert calls
     for mine, own in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, own)
