@@ -154,10 +154,10 @@ def test_ssim_of_images_that_differ_in_a_part(part):
     image = target.clone()
     image[1, ..., top:bottom, left:right] = 0.5
     rendering = Rendering(image.requires_grad_(), image[:, :, :1], image[:, :, :1])
-    _, _, batch = _example()
+    prediction, _, batch = _example()
     masks = torch.ones(2, 1, 41, 40, dtype=torch.bool)
     batch = dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, images=target, masks=masks))
-    value = terms.render_ssim(None, rendering, batch)
+    value = terms.render_ssim(prediction, rendering, batch)
     expected = 1 - ssim_map(image.flatten(0, 1), target.flatten(0, 1)).mean()
     torch.testing.assert_close(value, expected, atol=1e-12, rtol=0)
     slopes = [torch.autograd.grad(x, image)[0] for x in (value, expected)]
