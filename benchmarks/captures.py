@@ -1,9 +1,11 @@
 """What imperfect captures cost a model: built-in people, photographed in twelve ways, with the same targets.
 
     python benchmarks/captures.py model.ckpt [model.ckpt ...] --baselines all --out captures.json
+    python benchmarks/captures.py shipped --mend --people 12 --first 4
 
-Each capture has one trouble, the last one all of them. Photographs are taken before a background, twice as
-large as what the model sees, and go the way of a user's (``Capture``): they are cropped to the subject.
+Each capture has one trouble, the last one all of them; with ``--mend`` they are others, predicted as given
+and as ``ghgs predict`` mends them by itself. Photographs are taken before a background, twice as large as
+what the model sees, and go the way of a user's (``Capture``): they are cropped to the subject.
 Targets are always those of the clean rig, so that a loss is one of the prediction. Prints PSNR of exact
 photographs and what each capture loses, whole and in the box.
 """
@@ -11,11 +13,13 @@ photographs and what each capture loses, whole and in the box.
 import argparse
 import dataclasses
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ghgs_lit import GHGS
@@ -30,10 +34,13 @@ from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import Photograph
-from ghgs_lit.prediction.capture.predict import trained_size
+from ghgs_lit.prediction.capture.predict import predict, trained_size
 from ghgs_lit.prediction.refinement import CameraRefinement
+from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
@@ -54,8 +61,9 @@ _PIECES = {"mask_hole_chance": 1.0}
 class Imperfection:
     """How a capture differs: ``data.rig.variation``, positions of the inputs, and :class:`Augmentation`.
 
-    Photographs have exact mattes, or ``masks`` of 0 and 1. A ``bumped`` camera is the only one whose
-    calibration is wrong; None: all are.
+    Photographs have exact mattes, or ``masks`` of 0 and 1, ``grown`` pixels too large. A ``bumped`` camera is
+    the only one whose calibration is wrong; None: all are. The first one is turned by ``turned`` pixels, its
+    focal length ``zoom`` times and its photograph's colours to the power ``gamma`` of the right ones.
     """
 
     rig: Mapping[str, Any] = field(default_factory=dict)
@@ -63,8 +71,24 @@ class Imperfection:
     augmentation: Mapping[str, float] = field(default_factory=dict)
     masks: bool = False
     bumped: int | None = None
+    grown: float = 0.0
+    turned: float = 0.0
+    zoom: float = 1.0
+    gamma: float = 1.0
 
 
+#: What ``--mend`` measures. Photographs are twice as large as crops, and so are their pixels.
+MENDED = {
+    "exact": Imperfection(),
+    "exact masks": Imperfection(masks=True),
+    "masks grown by 4 px": Imperfection(masks=True, grown=2.0),
+    "masks eroded by 4 px": Imperfection(masks=True, grown=-2.0),
+    "one camera turned by 3 px": Imperfection(turned=1.5),
+    "one camera turned by 6 px": Imperfection(turned=3.0),
+    "all cameras up to 3 px": Imperfection(augmentation={"calibration": 1.5}),
+    "one focal length 3 % off": Imperfection(zoom=1.03),
+    "one gamma of 1.2": Imperfection(gamma=1.2),
+}
 CAPTURES = {
     "clean": Imperfection(),
     "ring a third wider": Imperfection({"radius": [2.67, 2.67]}),
@@ -87,15 +111,18 @@ CAPTURES = {
 }
 
 
-def data_of(capture: Imperfection, people: int, size: list[int]) -> PhotographsDataModule:
-    """People in front of the rig of a capture; what is missing is rendered."""
+def data_of(
+    capture: Imperfection, people: int, size: list[int], uneven: list[int], rendered: list[int] | None = None
+) -> PhotographsDataModule:
+    """People in front of the rig of a capture; what is missing is rendered, in the ``rendered`` size."""
     # Inputs, the targets beside the first one and half-way to the second one.
-    positions = sorted({*_EVEN, *_UNEVEN, _EVEN[1] // 2})
+    positions = sorted({*_EVEN, *uneven, _EVEN[1] // 2})
     overrides = [
         "data=synthetic",
         "targets.training_views=[0,3]",
         f"data.people={{train: 1, val: {people}}}",
         f"data.size={size}",
+        f"data.render.size={rendered or size}",
         f"data.render.positions={positions}",
         "data.render.views=[0,3]",
         f"data.evaluation_positions=[{list(capture.positions)}]",
@@ -123,6 +150,30 @@ def batches(
         yield dataclasses.replace(seen, cameras=cameras, targets=batch.targets)
 
 
+def predicted(
+    capture: Imperfection,
+    data: tuple[PhotographsDataModule, PhotographsDataModule],
+    first: int,
+    model: GHGS,
+    size: tuple[int, int],
+    renderer: Renderer,
+    refine: int | str,
+) -> Iterator[Batch]:
+    """The batch that ``predict`` takes for each person from the ``first`` on, with the targets of the rig."""
+    targets = [read_option("targets", name) for name in _TARGETS]
+    clean, own = data
+    for subject in list(clean.subjects("val"))[first:]:
+        taken = photographed(capture, own.evaluation_batch(subject, views=_VIEWS))
+        keys = {"refine_cameras": refine, "refine_masks": refine}
+        result = predict(taken, model, size, **keys, renderer=renderer)
+        if refine:
+            moved = "".join(f" {pixels:.2f}" for pixels in result.moved)
+            print(f"  {subject}: {result.why or 'nothing'}{moved}", flush=True)
+        batch = clean.evaluation_batch(subject, views=_VIEWS, targets=targets)
+        cameras = result.batch.cameras.to(torch.float32)
+        yield dataclasses.replace(result.batch, cameras=cameras, targets=batch.targets)
+
+
 def photographed(capture: Imperfection, batch: Batch) -> Capture:
     """One subject as a capture has it, from photographs of it on black: before a background."""
     subject = batch.subjects[0]
@@ -134,7 +185,11 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
     )
     behind = backgrounds(_VIEWS, *batch.masks.shape[2:], subject_rng(1, subject))
     images = seen.images + (1 - batch.alpha[:, :, None]) * torch.from_numpy(behind).float()
+    images[:, 0] **= capture.gamma
     mattes = wrong.masks.float() if capture.masks else batch.alpha
+    if capture.grown:
+        grown = [signed_distance(mask.numpy()) + _LARGER * capture.grown > 0 for mask in batch.masks[0]]
+        mattes = torch.from_numpy(np.stack(grown)).float()[None]
     pixels = (255 * images[0].movedim(1, -1)).round().byte().numpy()
     shares = (255 * mattes[0]).round().byte().numpy()
     is_wrong = torch.tensor([capture.bumped in (None, view) for view in range(_VIEWS)])[:, None, None]
@@ -143,8 +198,18 @@ def photographed(capture: Imperfection, batch: Batch) -> Capture:
         for name in ("intrinsics", "extrinsics")
     ]
     matrices = [one.double().numpy() for one in matrices]
+    _knock(matrices[0][0], matrices[1][0], capture, subject)
     views = zip(batch.views[0], pixels, shares, *matrices, strict=True)
     return Capture(subject, tuple(Photograph(*view) for view in views))
+
+
+def _knock(lens: np.ndarray, pose: np.ndarray, capture: Imperfection, subject: str) -> None:
+    """Turn and zoom one camera in place, about an axis in its image plane that is the subject's own."""
+    angle = subject_rng(2, subject).uniform(0, 2 * math.pi)
+    turn = math.tan(_LARGER * capture.turned / lens[0, 0] / 2)
+    rotation = torch.tensor([1.0, turn * math.cos(angle), turn * math.sin(angle), 0.0], dtype=torch.float64)
+    pose[:3] = quaternion_to_matrix(rotation[None])[0].numpy() @ pose[:3]
+    lens[[0, 1], [0, 1]] *= capture.zoom
 
 
 def means(rows: list[dict]) -> dict[str, float]:
@@ -187,6 +252,33 @@ def methods_of(
     yield from baselines_of(names, config, device).items()
 
 
+def measure_mending(
+    options: argparse.Namespace, size: tuple[int, int], config: Mapping[str, Any], device: torch.device
+) -> None:
+    """Print what captures lose as given, and what is left of it where ``predict`` decides."""
+    renderer, model = build_renderer(config, device), GHGS.from_checkpoint(options.checkpoints[0], device)
+    metrics, larger = build(config["metrics"], "metrics").to(device), [_LARGER * side for side in size]
+    data = tuple(data_of(Imperfection(), options.people, side, [], larger) for side in (list(size), larger))
+    results, method = {}, ModelMethod(model, renderer)
+    for name, capture in MENDED.items():
+        print(name, flush=True)
+        results[name] = {
+            key: means(
+                measure(
+                    method,
+                    name,
+                    predicted(capture, data, options.first, model, size, renderer, refine),
+                    metrics,
+                    device,
+                )
+            )
+            for key, refine in (("given", 0), ("auto", "auto"))
+        }
+        shown = (f"{row[f'{t}_psnr']:.2f}" for row in results[name].values() for t in _TARGETS)
+        print(f"| {name} | {' | '.join(shown)} |", flush=True)
+    write_text_atomically(options.out, json.dumps(results, indent=1))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("checkpoints", type=Path, nargs="+")
@@ -195,16 +287,21 @@ def main() -> None:
     parser.add_argument("--size", type=int, help="side in pixels; none: the first checkpoint's")
     parser.add_argument("--refine-masks", type=int, default=0, help="pixels that masks may be off by")
     parser.add_argument("--refine-cameras", type=int, default=0, help="rounds that correct the cameras first")
+    parser.add_argument("--mend", action="store_true", help="what predict mends by itself, and nothing else")
+    parser.add_argument("--first", type=int, default=0, help="with --mend: people before it take no part")
     parser.add_argument("--out", type=Path, default=Path("captures.json"))
     options = parser.parse_args()
     config = resolve(compose("evaluate", ["data=synthetic", "metrics.lpips=off"]))
     device = pick_device(config["device"])
-    metrics = build(config["metrics"], "metrics").to(device)
     size = options.size or trained_size(read_checkpoint(options.checkpoints[0])["config"])
     size = image_size("size", size)
-    clean = data_of(CAPTURES["clean"], options.people, list(size))
+    if options.mend:
+        measure_mending(options, size, config, device)
+        return
+    metrics = build(config["metrics"], "metrics").to(device)
+    clean = data_of(CAPTURES["clean"], options.people, list(size), _UNEVEN)
     larger = [_LARGER * side for side in size]
-    own = {name: data_of(capture, options.people, larger) for name, capture in CAPTURES.items()}
+    own = {name: data_of(capture, options.people, larger, _UNEVEN) for name, capture in CAPTURES.items()}
     results = {}
     for method_name, method in methods_of(options, config, device):
         results[method_name] = {

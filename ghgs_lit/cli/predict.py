@@ -90,7 +90,7 @@ def subject_batch(
 def predict_subject(config: dict[str, Any], directory: Path) -> None:
     """Predict a subject of a data set."""
     expected = "0 without images=...: photographs of data sets are on black"
-    require(config["refine_masks"] == 0, "refine_masks", expected, config["refine_masks"])
+    require(config["refine_masks"] in (0, "auto"), "refine_masks", expected, config["refine_masks"])
     options, device = output_options(config), pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
     data = build_data(config)
@@ -98,7 +98,8 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     write_config(config, directory)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
-    result = predict_batch(batch, model, renderer, config["refine_cameras"], config["refine"])
+    rounds = 0 if config["refine_cameras"] == "auto" else config["refine_cameras"]
+    result = predict_batch(batch, model, renderer, rounds, config["refine"])
     write_result(directory, result, model, renderer, config, options)
 
 
@@ -134,7 +135,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             camera = camera or fixed_camera(capture).to(device)
             pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))
         if capture.name == folder.instants[0]:
-            for line in advice_of(directories[capture.name], config):
+            for line in advice_of(directories[capture.name]):
                 print(line, flush=True)
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
@@ -147,14 +148,15 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
 
 
-def advice_of(directory: Path, config: dict[str, Any]) -> Iterator[str]:
+def advice_of(directory: Path) -> Iterator[str]:
     """Lines that say why a prediction of photographs may be poor, and what may help, by its report."""
-    quality = json.loads((directory / REPORT).read_text())["psnr_box_of_inputs"].values()
+    report = json.loads((directory / REPORT).read_text())
+    quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
     low, high = min(quality), max(quality)
     if low < LOW_PSNR:
-        left = [key for key in ("refine_cameras", "refine_masks") if not config[key]]
+        left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
         hint = f" ({' and '.join(f'{key}=4' for key in left)} may mend them)" if left else ""
         yield (
             f"photographs come back at {low:.1f} to {high:.1f} dB only, sound ones at 30 or more: mostly"
@@ -197,14 +199,15 @@ def write_result(
         The Gaussians that were written, and the run time of each stage in seconds.
     """
     prediction, seconds = result.prediction, dict(result.seconds)
-    facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds}
+    facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds, "why": result.why}
+    why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
     if result.changed:
         shares = ", ".join(f"{share:.1%}" for share in result.changed)
-        print(f"refine_masks: changed by {shares} of the subject", flush=True)
+        print(f"refine_masks: changed by {shares} of the subject{why.get('refine_masks', '')}", flush=True)
         facts["refine_masks"] = list(result.changed)
     if result.moved:
         facts["refine_cameras"] = dict(zip(result.batch.views[0], result.moved, strict=True))
-        print(moved_line(facts["refine_cameras"]), flush=True)
+        print(moved_line(facts["refine_cameras"]) + why.get("refine_cameras", ""), flush=True)
     if model.auto is not None:
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)

@@ -108,10 +108,12 @@ class Predict(Photographs, Measured):
     """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
     size: Size | None = None
     """Side or [height, width] of what the model sees, in pixels; null: as it was trained."""
-    refine_masks: int = Field(0, ge=0, le=64)
-    """Pixels of size that masks may be off by, such as 4: photographs say where outlines are; 0: none."""
-    refine_cameras: int = Field(0, ge=0, le=100)
-    """Rounds, at most, that correct the cameras until the photographs agree, such as 4; 0: none."""
+    refine_masks: Literal["auto"] | Annotated[int, Field(ge=0, le=64)] = "auto"
+    """Pixels of size that masks may be off by: photographs say where outlines are; 0: none; auto: 4 where
+    photographs contradict the masks (of images alone, not of a data set)."""
+    refine_cameras: Literal["auto"] | Annotated[int, Field(ge=0, le=100)] = "auto"
+    """Rounds, at most, that correct the cameras until the photographs agree; 0: none; auto: 4 where
+    silhouettes contradict the cameras (of images alone, not of a data set)."""
     refine: int = Field(0, ge=0, le=10000)
     """Steps of optimisation towards the photographs after the prediction, such as 15; 0: none."""
     out: Path | None = None

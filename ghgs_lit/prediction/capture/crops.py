@@ -8,7 +8,7 @@ import numpy as np
 from ghgs_lit.data.resampling import area_image
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
-_SHARE = 0.8
+SHARE = 0.8
 #: Mattes are searched in photographs of at most this times the size of their crops.
 _FINER = 2
 
@@ -45,7 +45,7 @@ def crop_to_subject(photograph: Photograph, size: tuple[int, int], refine_masks:
     """
     rows, columns = (np.nonzero(photograph.mask.any(axis))[0] for axis in (1, 0))
     extents = [(int(lines[0]), int(lines[-1]) + 1) for lines in (rows, columns)]
-    scale = max((end - first) / (_SHARE * side) for (first, end), side in zip(extents, size, strict=True))
+    scale = max((end - first) / (SHARE * side) for (first, end), side in zip(extents, size, strict=True))
     spans = [
         _span(first, end, max(round(scale * side), 1), whole)
         for (first, end), side, whole in zip(extents, size, photograph.mask.shape, strict=True)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -17,6 +17,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, Report, pixels_moved
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.surroundings import side_multiple
@@ -35,6 +36,7 @@ class TimedPrediction:
         moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
         changed: which share of the subject refining changed in each crop; nothing where masks stay.
         refined: what refining the Gaussians gained; None where they are as predicted. Depths stay.
+        why: what photographs or silhouettes contradict, by the name of the refinement that ``auto`` chose.
     """
 
     batch: Batch
@@ -43,6 +45,7 @@ class TimedPrediction:
     moved: tuple[float, ...] = ()
     changed: tuple[float, ...] = ()
     refined: Report | None = None
+    why: dict[str, str] = field(default_factory=dict)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -54,8 +57,8 @@ def predict(
     capture: Capture,
     model: GHGS | str | Path = SHIPPED,
     size: int | tuple[int, int] | None = None,
-    refine_cameras: int = 0,
-    refine_masks: int = 0,
+    refine_cameras: int | Literal["auto"] = "auto",
+    refine_masks: int | Literal["auto"] = "auto",
     refine: int = 0,
     renderer: Renderer | None = None,
 ) -> TimedPrediction:
@@ -67,9 +70,10 @@ def predict(
         size: side or (height, width) of the crops that the model sees, in pixels; None: as it was trained
             (checkpoints only).
         refine_cameras: rounds, at most, that correct the cameras until the photographs agree
-            (:class:`CameraRefinement`), such as 4 for calibrations that are good to a pixel or two; 0: none.
-        refine_masks: pixels of a crop by which masks may be wrong, such as 4; mattes are then searched in the
-            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right.
+            (:class:`CameraRefinement`); 0: none; ``auto``: 4 where silhouettes contradict one another.
+        refine_masks: pixels of a crop by which masks may be wrong; mattes are then searched in the
+            photographs (:func:`ghgs_lit.data.matting.refined_matte`). 0: masks are right; ``auto``: 4 where
+            photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
 
@@ -81,8 +85,14 @@ def predict(
         model = _model(path, path.stat().st_mtime_ns)
         size = crop_size(size, read_checkpoint(path)["config"], model)
     require(size is not None, "size", "a size in pixels beside a model that is no checkpoint", size)
-    seconds: dict[str, float] = {}
-    batch, changed = _crops(capture, image_size("size", size), refine_masks, seconds)
+    size, seconds, why = image_size("size", size), {}, {}
+    if refine_masks == "auto":
+        why["refine_masks"] = doubt_of_masks(capture, size)
+        refine_masks = ENOUGH if why["refine_masks"] else 0
+    batch, changed = _crops(capture, size, refine_masks, seconds)
+    if refine_cameras == "auto":
+        why["refine_cameras"] = doubt_of_cameras(capture, batch)
+        refine_cameras = ENOUGH if why["refine_cameras"] else 0
     batch = batch.to(next(model.parameters()).device)
 
     def in_frame(batch: Batch) -> Prediction:
@@ -91,7 +101,8 @@ def predict(
         return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
 
     result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, in_frame)
-    return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed)
+    why = {name: doubt for name, doubt in why.items() if doubt}
+    return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
 
 
 def predict_batch(

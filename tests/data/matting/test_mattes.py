@@ -108,7 +108,7 @@ def test_mattes_are_found_at_twice_the_size_of_crops(monkeypatch, tmp_path, heig
     monkeypatch.setattr(matting, "refined_matte", record)
     figure = Figure(height=height, width=height * 3 // 4)
     taken = Capture.read(tmp_path, figure.write(tmp_path))
-    cut = [int(1 / crops._SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
+    cut = [int(1 / crops.SHARE * (np.ptp(np.nonzero(one.mask)[0]) + 1)) for one in taken.photographs]
     taken.batch((112, 84), 4)
     for (size, same, pixels), rows in zip(calls, cut, strict=True):
         assert size == same

@@ -9,7 +9,7 @@ from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.motion import after_motions, rigid, without_common
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.prediction.refinement import coherence
-from ghgs_lit.prediction.refinement.coherence import coherent_cameras
+from ghgs_lit.prediction.refinement.coherence import coherent_cameras, contradiction
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import CENTER, ellipsoid, off, ring
 
@@ -93,6 +93,17 @@ def test_distances_tell_exact_cameras_from_others():
     _, _, distances = coherent_cameras(dataclasses.replace(truth, cameras=cameras))
     assert 0 <= distances[0] < 1.5e-4
     assert 3e-3 < distances[1] < 1
+
+
+def test_a_quick_look_tells_exact_cameras_from_others():
+    """Also ones that are off by a pixel or two, each element by itself; nothing without an outline."""
+    truth = figure(batch=2)
+    poses = torch.stack((truth.cameras.extrinsics[0], off(truth, 3.0, (0, 5)).cameras.extrinsics[1]))
+    cameras = dataclasses.replace(truth.cameras, extrinsics=poses)
+    exact, wrong = contradiction(dataclasses.replace(truth, cameras=cameras))
+    assert exact < 2e-3 < 4e-3 < wrong
+    nothing = dataclasses.replace(truth, masks=truth.masks & False, alpha=0 * truth.alpha)
+    assert (contradiction(nothing) == 0).all()
 
 
 def test_elements_are_corrected_as_if_alone():

@@ -1,0 +1,70 @@
+"""What a capture contradicts: photographs the outlines of its masks, silhouettes its cameras.
+
+Both are quick looks. A capture of which they find nothing is predicted as it is.
+"""
+
+import numpy as np
+
+from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.crops import SHARE, Photograph
+from ghgs_lit.prediction.refinement.coherence import contradiction
+from ghgs_lit.types import Batch
+
+#: Pixels of masks, and rounds of cameras, that mend what is found.
+ENOUGH = 4
+#: Pixels beside an outline at which photographs are looked at.
+_REACH = 6
+#: Pixels of crops by which outlines lie beside the masks', on average, above which masks are off.
+_OFF = 0.35
+#: Pixels that rays near outlines miss other silhouettes by, on average, above which cameras are off.
+_MISSED = 4e-3
+
+
+def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
+    """Where photographs show outlines, in pixels of crops of ``size``, if masks are off; else ""."""
+    off = [_outline(photograph, size) for photograph in capture.photographs]
+    places = ", ".join(f"{pixels:+.1f}" for pixels in off)
+    is_off = np.abs(off).mean() > _OFF
+    return f"photographs show outlines {places} pixels inside the masks'" if is_off else ""
+
+
+def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
+    """By how much silhouettes of its crops miss one another, if cameras are off; else ""."""
+    missed = float(contradiction(Frame.of(batch).enter(batch)))
+    focal = [photograph.intrinsics[0, 0] for photograph in capture.photographs]
+    # Pixels of a photograph that is smaller than its crop are larger, and so are steps of outlines.
+    larger = max(1.0, *(batch.cameras.intrinsics[0, :, 0, 0].numpy() / focal))
+    return f"silhouettes miss one another by {missed:.4f} pixels" if missed > larger**2 * _MISSED else ""
+
+
+def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
+    """How many pixels of its crop inside the mask's outline the photograph has the most contrast."""
+    extents = [np.nonzero(photograph.mask.any(axis))[0][[0, -1]] for axis in (1, 0)]
+    steps = [(end - start + 1) / (SHARE * side) for (start, end), side in zip(extents, size, strict=True)]
+    step = max(*steps, 1)
+    reach = (_REACH + 2) * step
+    # One pixel of the photograph for each of a crop: as fast for a large one, and edges stay where they are.
+    seen = np.ix_(
+        *(
+            np.arange(max(start - reach, 0), min(end + reach, whole - 1) + 0.5, step).astype(int)
+            for (start, end), whole in zip(extents, photograph.mask.shape, strict=True)
+        )
+    )
+    distance = signed_distance(photograph.mask[seen])
+    near = np.abs(distance) < _REACH
+    if not near.any():
+        return 0.0
+    slopes = np.gradient(photograph.image[seen].astype(np.float32), axis=(0, 1))
+    across = sum(
+        slope[near] * n[near][:, None] for slope, n in zip(slopes, np.gradient(distance), strict=True)
+    )
+    lines = np.floor(distance[near]).astype(int) + _REACH
+    count = np.maximum(np.bincount(lines, minlength=2 * _REACH), 1)
+    contrast = np.bincount(lines, np.abs(across).sum(-1), 2 * _REACH) / count
+    # An edge has a line of pixels on either side; those beside them say to fractions of a pixel where it is.
+    first = int((contrast[1:-2] + contrast[2:-1]).argmax())
+    around = contrast[first : first + 4]
+    middle = (around * np.arange(4)).sum() / max(around.sum(), 1e-6)
+    return float(first + middle - _REACH + 0.5) * step / max(steps)
