@@ -19,21 +19,8 @@ for name in ("bounds", "encoder", "geometry", "heads", "pretext", "recalibration
 check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 
 import torch  # noqa: E402
-import yaml  # noqa: E402
-from hydra._internal import defaults_list  # noqa: E402
 
-# Composing configurations is a quarter of the suite, reading their files a third of that: LibYAML is faster.
-yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-# Hydra makes a map for each file, a third of its time, and reads it for interpolations only.
-_map = defaults_list._create_interpolation_map
-
-
-def _map_where_needed(overrides, defaults, *arguments):
-    return _map(overrides, defaults, *arguments) if any(d.is_interpolation() for d in defaults) else None
-
-
-defaults_list._create_interpolation_map = _map_where_needed
+import tests.helpers.composing  # noqa: E402, F401
 
 # Test processes share the cores; more threads than cores slow each other down.
 torch.set_num_threads(max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))

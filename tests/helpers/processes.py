@@ -11,7 +11,11 @@ from pathlib import Path
 #: Makes processes by forking one that runs no threads and has imported what takes seconds.
 PREPARED = multiprocessing.get_context("forkserver")
 PREPARED.set_forkserver_preload(
-    ["pytest", *(f"ghgs_lit.cli.{name}" for name in ("application", "prepare", "train", "predict", "table"))]
+    [
+        "pytest",
+        "tests.helpers.composing",
+        *(f"ghgs_lit.cli.{name}" for name in ("application", "prepare", "train", "predict", "table")),
+    ]
 )
 
 
