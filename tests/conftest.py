@@ -11,6 +11,11 @@ from tests.helpers.shapes import begin_test, check_shapes
 # Modules and tests are no garbage: looking through them takes half a second each time.
 gc.disable()
 
+# Test processes and their children share the cores; more threads than cores slow each other down, and those
+# that spin while they wait do so most.
+_THREADS = max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+os.environ |= {"OMP_NUM_THREADS": str(_THREADS), "OMP_WAIT_POLICY": "PASSIVE"}
+
 _PACKAGE = Path(__file__).parents[1] / "ghgs_lit"
 _CHECKED = ["types", "losses", "metrics"]
 # Without their folders of kernels: a wrapped function cannot be compiled.
@@ -22,8 +27,7 @@ import torch  # noqa: E402
 
 import tests.helpers.composing  # noqa: E402, F401
 
-# Test processes share the cores; more threads than cores slow each other down.
-torch.set_num_threads(max(1, (os.cpu_count() or 2) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
+torch.set_num_threads(_THREADS)
 
 # Shells start background jobs with Ctrl-C ignored, and child processes inherit that.
 if threading.current_thread() is threading.main_thread():
