@@ -196,8 +196,9 @@ def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
     assert not any(lives(int(p.name)) for p in pids.iterdir())
 
 
-def test_several_workers_make_the_same_files(scans, reference, tmp_path):
+def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeypatch):
     """Files are independent of the number of processes."""
+    monkeypatch.setattr(jobs.multiprocessing, "get_context", lambda *_: PREPARED)  # spawned ones import all
     render_boxes(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
     assert contents(tmp_path / "out") == reference
 
