@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model, model_of, pick_device
+from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model, model_of, pick_device, said
 from ghgs_lit.cli.photographs import capture_folder
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.cli.train import run_job, train
@@ -45,7 +45,8 @@ def run(cfg: DictConfig) -> float | str | None:
 
 
 def with_rig(config: dict[str, Any]) -> dict[str, Any]:
-    """``config`` whose people stand in the rig of ``cameras`` and are seen by all of it.
+    """``config`` whose people stand in the rig of ``cameras`` and are seen by all of it, where
+    ``views.training_counts`` is not said.
 
     Raises:
         InputError: the calibration, or a photograph, is missing or wrong.
@@ -59,7 +60,8 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
         fill = _fill_of(photographs)
     count = len(entries)
     require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
-    views = {**config["views"], "training_counts": [count], "evaluation_count": count}
+    trained = config["views"]["training_counts"] if "views.training_counts" in said() else [count]
+    views = {**config["views"], "training_counts": trained, "evaluation_count": count}
     return {
         **config,
         "data": {**config["data"], "cameras": entries, "fill": fill},
@@ -106,6 +108,8 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
         "init_from": str(file_of(config["checkpoint"])),
         "init_strict": True,
         "allow_random_encoder": False,
+        # Nothing has to be found first, as from random weights.
+        "optimizer": {**config["optimizer"], "freeze_until": {}},
     }
     after = train(training, directory, stats)
     if after is None:

@@ -94,7 +94,7 @@ class Adapt(Photographs, Run):
     checkpoint: Path = "shipped"
     """The weights to start from."""
     minutes: float = Field(3, gt=0, le=1440)
-    """Minutes of training; people are rendered before."""
+    """Minutes of training."""
     out: Path | None = None
     """File for the weights; null: adapted.ckpt in the run's directory."""
 

@@ -98,9 +98,9 @@ class Layout(Reader):
         integer = pixel_centers == "auto" and not self._complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
         self._folders: dict[str, Path] = {}
-        self._find(phase, names, limit)
+        self.find(phase, names, limit)
 
-    def _find(self, phase: str, names: Sequence[str] | None, limit: int | None) -> None:
+    def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
         """Fill ``subjects`` with those that are complete."""
         if not self.root.is_dir():
             raise InputError(f"{self.root}: expected the root of a rendered data set; found no such folder")

@@ -158,6 +158,7 @@ def render_people(
     settings: RenderOptions,
     seed: int,
     workers: int | None = None,
+    shown: bool = True,
 ) -> int:
     """Render people below ``root``; those that are already there are kept.
 
@@ -166,6 +167,7 @@ def render_people(
     Args:
         names: names of the subjects of each phase.
         workers: number of processes (None: one for each core; 0: this one).
+        shown: whether there is a progress bar.
 
     Returns:
         How many subjects were rendered now.
@@ -191,7 +193,7 @@ def render_people(
             for phase, listed in names.items()
             for name in missing(phase, listed)
         ]
-        with _bar() as bar:
+        with _bar(shown) as bar:
             task = bar.add_task(f"rendering into {root}", total=len(todo))
             try:
                 with contextlib.closing(_run(todo, workers)) as finished:
@@ -213,7 +215,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
         # A worker of joblib: its start method is inherited by name, and a fresh process does not know it.
         multiprocessing.set_start_method("spawn", force=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
         try:
             futures = [pool.submit(render_subject, job) for job in jobs]
             for future in as_completed(futures):
@@ -236,7 +238,7 @@ def _check_main_guard() -> None:
         )
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
     """One thread for each process; Ctrl-C is left to the parent; a worker ends with its parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -249,6 +251,6 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _bar() -> Bar:
+def _bar(shown: bool) -> Bar:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Bar(*columns, console=Console(stderr=True))
+    return Bar(*columns, console=Console(stderr=True), disable=not shown)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ghgs_lit.cli import adapt
 from ghgs_lit.cli.adapt import _fill_of, with_rig
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers
@@ -102,3 +103,14 @@ def test_people_are_as_large_as_the_subject_of_the_photographs():
     mattes[0, 20:71], mattes[1, 30:61] = 255, 255
     photographs = [Photograph("c", np.zeros((100, 80, 3), np.uint8), m, np.eye(3), np.eye(4)) for m in mattes]
     assert _fill_of(photographs) == pytest.approx([0.45, 0.55])
+
+
+def test_numbers_of_views_can_be_said(calibration, tmp_path, monkeypatch):
+    """Weights for a rig of which a camera may fail are trained with fewer, too; measured are all cameras."""
+    seen = []
+    monkeypatch.setattr(adapt, "run_job", lambda config, *_: seen.append(config["views"]))
+    for number, said in enumerate(([], ["views.training_counts=[3,4]"])):
+        run = f"hydra.run.dir={tmp_path / str(number)}"
+        assert ghgs("adapt", f"cameras={calibration}", run, *said) == 0
+    assert [views["training_counts"] for views in seen] == [[4], [3, 4]]
+    assert [views["evaluation_count"] for views in seen] == [4, 4]
