@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 #: Makes processes by forking one that runs no threads and has imported what takes seconds.
@@ -43,20 +44,29 @@ def run_prepared(function: Callable, *arguments: object) -> None:
 
 def run_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
     """Exit code and output of ``ghgs ...`` in a folder, as a process of :data:`PREPARED`."""
-    return _run_in(folder, environment, _verb, shlex.split(command))
+    return _ended(*start_verb(command, folder, environment))
 
 
 def run_block(code: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
     """The same of ``python -c <code>``."""
-    return _run_in(folder, environment, _block, code)
+    return _ended(*_started(folder, environment, _block, code))
 
 
-def _run_in(
+def start_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[BaseProcess, Path]:
+    """The process of :func:`run_verb`, and the file that its output goes to."""
+    return _started(folder, environment, _verb, shlex.split(command))
+
+
+def _started(
     folder: Path, environment: Mapping[str, str], function: Callable, given: object
-) -> tuple[int, str]:
+) -> tuple[BaseProcess, Path]:
     output = folder / ".output"
     process = PREPARED.Process(target=_called_in, args=(folder, dict(environment), output, function, given))
     process.start()
+    return process, output
+
+
+def _ended(process: BaseProcess, output: Path) -> tuple[int, str]:
     process.join(300)
     process.kill()  # where it hangs
     return process.exitcode, output.read_text()
