@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+# Python compiles what it imports, which is a small part of what is installed.
+INSTALL = $(BIN)/python -m pip install -qq --no-compile --disable-pip-version-check -c constraints.txt
 # Test processes: the suite is limited by the CPU, and small machines have two cores.
 JOBS   ?= 2
 
@@ -13,8 +15,8 @@ help: ## List the targets
 
 $(BIN)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(INSTALL) torch==2.13.0 hatchling editables
+	$(INSTALL) --no-build-isolation -e '.[dev]'
 	$(BIN)/python scripts/compile_kernels.py
 	touch $@
 

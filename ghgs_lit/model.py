@@ -14,7 +14,7 @@ from ghgs_lit.config.registry import build, read_node
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.padding import bounds_of
 from ghgs_lit.kernels.precision import PRECISIONS
-from ghgs_lit.rounds import Rounds, State, prediction_of
+from ghgs_lit.rounds import Rounds, State, prediction_of, replaced
 from ghgs_lit.skipping import SkipOptions
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import ModelOptions, computing, surroundings
@@ -86,8 +86,10 @@ class GHGS(nn.Module):
         points = self.unprojection(depth_maps, tokens, batch)
         tokens = self.recalibration(tokens, points)
         raw = self.gaussian_head(tokens, batch, points, depth_maps, self.skip.pixels)
-        state = State(raw, self.gaussian_head.activate(raw, batch, points, depth_maps), points, depth_maps)
-        states = self.rounds(state, self.gaussian_head.activate, batch) if self.rounds else (state,)
+        activate = self.gaussian_head.activate
+        first = replaced(activate, self.training) if self.rounds else activate
+        state = State(raw, first(raw, batch, points, depth_maps), points, depth_maps)
+        states = self.rounds(state, activate, batch) if self.rounds else (state,)
         return prediction_of(states, self.keeps_drafts and not self.training)
 
     def _encode(self, batch: Batch, bounds: DepthBounds | None, kept: Tensor | None) -> Tokens:

@@ -70,6 +70,7 @@ SMALL = [
     (r"^make bench$", "python benchmarks/rasterizer.py --quick", "without the set-up"),
     (r"^(ghgs benchmark (?!.*-help).*)", r"\1 timing.repeats=1 subjects=1", "one round"),
     (r"^(ghgs benchmark data=synthetic .*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),
+    (r"refine=15", "refine=2", "two steps"),
     (r"data\.active\.train=\d+", "data.active.train=1", "one person"),
     (r"^(ghgs pretext .*)", rf"\1 {TINY} {SHORT}", "two people of 56 x 56 pixels, two steps"),
     (r"^(python benchmarks/part_awareness\.py.*)", rf"\1 {TINY}", "two people of 56 x 56 pixels"),

@@ -13,7 +13,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from tests.helpers.processes import run_verb
+from tests.helpers.processes import run_block, run_verb
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CONF = REPOSITORY / "conf"
@@ -194,10 +194,11 @@ def test_fast_commands_run(document, tmp_path, monkeypatch):
     run = check_documents.Reader.run
 
     def prepared(reader, text, is_python=False):
-        """A verb alone needs no shell, and a process that has imported all."""
-        if is_python or not text.startswith("ghgs ") or re.search(r"[$`|&;<>*\n]", text):
-            return run(reader, text, is_python)
-        code, output = run_verb(text, reader.folder, reader.environment)
+        """A verb alone and Python need no shell, and a process that has imported all."""
+        if not is_python and (not text.startswith("ghgs ") or re.search(r"[$`|&;<>*\n]", text)):
+            return run(reader, text)
+        run_prepared = run_block if is_python else run_verb
+        code, output = run_prepared(text, reader.folder, reader.environment)
         return code, 0.0, output
 
     monkeypatch.setattr(check_documents.Reader, "run", prepared)

@@ -377,7 +377,7 @@ class GaussianHead(nn.Module):
         headers = [self.offset_header, self.scale_header, self.rot_header, self.opacity_header]
         if self.options.color_limit > 0:
             headers.append(self.color_header)
-        if multiplies(descriptors, self.offset_header[0].weight):
+        if not torch.is_grad_enabled() and multiplies(descriptors, self.offset_header[0].weight):
             found = cpu.attributes(headers, descriptors)
         else:
             found = (float32_last(header, descriptors) for header in headers)

@@ -1,19 +1,27 @@
-"""Small networks inside kernels, ``PANEL`` rows at a time.
+"""Small networks inside kernels, ``PANEL`` rows at a time, and their gradients.
 
 Values are stored by channel: one line of ``PANEL`` floats, a lane for each row. So a layer's result is the
-next one's input as it is, and its activation needs no other layout.
+next one's input as it is, and its activation needs no other layout. The gradient of a layer's values is the
+product of the transposed weights; that of its weights and biases is a sum over lanes, whose input has a line
+of ones below its channels.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper
-from ghgs_lit.kernels.products import product
+from ghgs_lit.kernels.products import make_product, product
 from ghgs_lit.kernels.simd import LANES
 from ghgs_lit.kernels.tile import PANEL, ROWS
 
-ZERO = np.float32(0)
+ZERO, ONE = np.float32(0), np.float32(1)
+
+#: ``out += x y^T`` over the lanes of lines of ``x``, and of ``y`` as :func:`_turn` stores them.
+_lane_product = make_product(lambda half: (PANEL, 1), adds=True)
 
 
 def room(channels: int) -> int:
@@ -21,13 +29,65 @@ def room(channels: int) -> int:
     return -(-channels // ROWS) * ROWS
 
 
-def packed(layer: nn.Linear) -> np.ndarray:
-    """Weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases, as one flat array."""
-    outputs, inputs = layer.weight.shape
-    both = np.zeros((room(outputs), inputs + 1), np.float32)
-    both[:outputs, :-1], both[:outputs, -1] = (x.detach().numpy() for x in (layer.weight, layer.bias))
-    tiles = both[:, :-1].reshape(-1, ROWS, inputs).swapaxes(1, 2)
-    return np.concatenate((tiles.ravel(), both[:, -1]))
+def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
+    """Weight and bias of each linear layer."""
+    linears = (layer for layer in layers if isinstance(layer, nn.Linear))
+    return [x for layer in linears for x in (layer.weight, layer.bias)]
+
+
+def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
+    """Layers one after another, as one flat array.
+
+    Of each the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases.
+
+    Args:
+        numbers: weight and bias of each.
+        transposed: pack the transposed weights; their biases are zeros.
+    """
+    found = []
+    for weight, bias in _pairs(numbers):
+        weight, bias = (x.detach().numpy() for x in (weight, bias))
+        weight = weight.T if transposed else weight
+        outputs, inputs = weight.shape
+        both = np.zeros((room(outputs), inputs + 1), np.float32)
+        both[:outputs, :-1], both[:outputs, -1] = weight, 0 if transposed else bias
+        found += [both[:, :-1].reshape(-1, ROWS, inputs).swapaxes(1, 2).ravel(), both[:, -1]]
+    return np.concatenate(found)
+
+
+def _pairs(numbers: Sequence) -> list[tuple]:
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
+
+
+class Sums:
+    """Sums of the gradients of layers, of each task of a kernel.
+
+    Args:
+        numbers: weight and bias of each layer.
+        tasks: how many add them up.
+
+    Attributes:
+        places: of each layer, where its packed weights begin, its transposed ones, and its sums.
+        of_task: the sums of each task, as :func:`learn` adds them up.
+    """
+
+    def __init__(self, numbers: Sequence[Tensor], tasks: int):
+        self._shapes = [tuple(weight.shape) for weight, _ in _pairs(numbers)]
+        self._blocks = [(-(-o // PANEL), room(i + 1), PANEL) for o, i in self._shapes]
+        counts = [(room(o) * (i + 1), room(i) * (o + 1)) for o, i in self._shapes]
+        sizes = [(*count, int(np.prod(block))) for count, block in zip(counts, self._blocks, strict=True)]
+        self.places = np.cumsum([(0, 0, 0), *sizes], 0)
+        self.of_task = simd.aligned_floats(tasks * self.places[-1, 2]).reshape(tasks, -1)
+        self.of_task[:] = 0
+
+    def gradients(self) -> list[Tensor]:
+        """Of weight and bias of each layer."""
+        found = np.split(self.of_task.sum(0), self.places[1:-1, 2])
+        both = [
+            part.reshape(block).swapaxes(1, 2).reshape(-1, block[1])[: shape[0], : shape[1] + 1]
+            for part, block, shape in zip(found, self._blocks, self._shapes, strict=True)
+        ]
+        return [x for each in both for x in (torch.tensor(each[:, :-1]), torch.tensor(each[:, -1]))]
 
 
 #: :func:`room` inside kernels.
@@ -72,3 +132,51 @@ def rectify(layers, at, outputs, inputs, values):
     for channel in range(outputs):
         for i in range(channel * PANEL, (channel + 1) * PANEL, LANES):
             memory.store(values, i, simd.maximum(ZERO, memory.load(values, i) + layers[biases + channel]))
+
+
+@helper
+def put_ones(line, values):
+    """Fill a line with ones, the input of biases."""
+    for i in range(line * PANEL, (line + 1) * PANEL, LANES):
+        memory.store(values, i, simd.full(ONE))
+
+
+@helper
+def put_slopes(table, first, count, values):
+    """Copy ``count`` rows of a table to lines; 0 in the lanes after them."""
+    for lane in range(PANEL):
+        for channel in range(table.shape[1]):
+            value = table[first + lane, channel] if lane < count else ZERO
+            values[channel * PANEL + lane] = value
+
+
+@helper
+def unrectify(values, channels, slopes):
+    """Slopes before a ReLU that gave ``values``."""
+    for i in range(0, channels * PANEL, LANES):
+        is_off = memory.load(values, i) <= ZERO
+        memory.store(slopes, i, simd.select(is_off, ZERO, memory.load(slopes, i)))
+
+
+@helper
+def _turn(slopes, channels, turned):
+    """Lines as rows of ``PANEL`` channels, one for each lane."""
+    for channel in range(channels):
+        at = channel // PANEL * PANEL * PANEL + channel % PANEL
+        for lane in range(PANEL):
+            turned[at + lane * PANEL] = slopes[channel * PANEL + lane]
+
+
+@helper
+def learn(values, inputs, slopes, outputs, turned, at, sums):
+    """Add the gradients of a layer's weights and biases to ``sums`` from ``at`` on.
+
+    ``values`` are its inputs and a line of ones, ``slopes`` those of its outputs; ``turned`` has room for
+    whole panels of channels.
+    """
+    _turn(slopes, outputs, turned)
+    rows = lines(inputs + 1)
+    for panel in range(0, outputs, PANEL):
+        for row in range(0, rows, ROWS):
+            to = at + panel * rows + row * PANEL
+            _lane_product(values, row * PANEL, turned, panel * PANEL, PANEL, sums, to, PANEL)

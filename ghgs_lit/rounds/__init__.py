@@ -1,5 +1,5 @@
 """Rounds that look again: Gaussians are compared with the photographs and corrected."""
 
-from ghgs_lit.rounds.rounds import Rounds, RoundsOptions, State, prediction_of
+from ghgs_lit.rounds.rounds import Rounds, RoundsOptions, State, prediction_of, replaced
 
-__all__ = ["Rounds", "RoundsOptions", "State", "prediction_of"]
+__all__ = ["Rounds", "RoundsOptions", "State", "prediction_of", "replaced"]

@@ -100,6 +100,11 @@ def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
 Activate = Callable[[RawGaussians, Batch, Points, DepthMaps], Gaussians]
 
 
+def replaced(activate: Activate, training: bool) -> Activate:
+    """``activate`` for Gaussians that the next round replaces: in training no loss sees them."""
+    return torch.no_grad()(activate) if training else activate
+
+
 class RoundsOptions(Options):
     """Rounds that render the inputs, compare them with the photographs and correct the Gaussians."""
 
@@ -173,9 +178,11 @@ class Rounds(nn.Module):
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))
         windows = None if self.exchange is None else Windows.of(state.raw, batch)
         rays = Rays.of(state.raw, batch)
-        for number in range(self._drawn() if self.training else self.count):
+        count = self._drawn() if self.training else self.count
+        for number in range(count):
             change, memory = self._round(states[-1], batch, rays, memory, windows, 0.5**number)
-            states.append(_moved(states[-1], activate, batch, rays, *change))
+            shown = activate if number == count - 1 else replaced(activate, self.training)
+            states.append(_moved(states[-1], shown, batch, rays, *change))
         return tuple(states)
 
     def _drawn(self) -> int:
@@ -208,7 +215,7 @@ class Rounds(nn.Module):
             memory = cpu.remembered(self.view, self.update, self.memory, each, known, memory)
         else:
             memory = self._remembered_in_parts(each, known, memory)
-        if fused and windows is not None:
+        if fused and windows is not None and not torch.is_grad_enabled():
             heard = self.exchange.heard(memory, windows)
             return cpu.answered(self.exchange.hear, self.change[-1], heard, memory)
         memory = memory if windows is None else self.exchange(memory, windows)

@@ -6,6 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
+from unittest import mock
 
 import torch
 from torch import Tensor, nn
@@ -146,15 +147,9 @@ def _watch(module: Steps, faults: _Faults, stack: ExitStack) -> None:
         owner = model if name in STAGES else module
         if (stage := getattr(owner, name, None)) is None:
             continue
-        if isinstance(stage, nn.Module):
-            hook = stage.register_forward_pre_hook(
-                lambda part, inputs, options, name=name: _own_views((inputs, options), name, faults),
-                with_kwargs=True,
-            )
-            stack.callback(hook.remove)
-        else:
-            stack.callback(setattr, owner, name, stage)
-            setattr(owner, name, _around(stage, name, faults))
+        target, attribute = (stage, "forward") if isinstance(stage, nn.Module) else (owner, name)
+        watched = _around(getattr(target, attribute), name, faults)
+        stack.enter_context(mock.patch.object(target, attribute, watched))
 
 
 def _own_views(inputs: tuple, stage: str, faults: _Faults) -> tuple:
@@ -171,7 +166,7 @@ def _own_views(inputs: tuple, stage: str, faults: _Faults) -> tuple:
 
 
 def _around(stage: Callable[..., Any], name: str, faults: _Faults) -> Callable[..., Any]:
-    """As the hooks of a module, for a stage that is none."""
+    """A stage that looks at its result and at the gradients of its inputs."""
 
     def call(*inputs: Any, **options: Any) -> Any:
         inputs, options = _own_views((inputs, options), name, faults)

@@ -5,7 +5,7 @@ lengths are those of J. Liu et al., "Muon is Scalable for LLM Training", 2025. P
 takes matrices only; here weights of convolutions are matrices of their output channels, too.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -29,34 +29,42 @@ def is_matrix(parameter: nn.Parameter) -> bool:
     return min(rows, parameter.numel() // max(rows, 1)) >= SMALLEST_SIDE
 
 
-def orthogonalized(matrices: Tensor) -> Tensor:
+def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     """The matrices with singular values of about 1 (0.7 to 1.2) in place of their own.
 
-    The polynomials are found from the smaller Gram matrix, for all matrices of a shape at once.
+    The polynomials are found from the smaller Gram matrices, for all of one size at once.
 
     Args:
-        matrices: [N, R, C], float32 or wider. Singular values below 1e-3 of the largest end below 1; a
+        matrices: of any sizes, float32 or wider. Singular values below 1e-3 of the largest end below 1; a
             matrix of zeros stays one.
-
-    Returns:
-        [N, R, C].
     """
-    if matrices.shape[-2] > matrices.shape[-1]:
-        return orthogonalized(matrices.mT).mT
+    wide = [m.mT if m.shape[0] > m.shape[1] else m for m in matrices]
+    largest = torch._foreach_norm(wide, torch.inf)
+    wide = torch._foreach_div(wide, [x + (x == 0) for x in largest])  # so that no square underflows
+    sides: dict[int, list[int]] = {}
+    for number, matrix in enumerate(wide):
+        sides.setdefault(len(matrix), []).append(number)
+    found = list(wide)
+    for numbers in sides.values():
+        grams = torch.stack([wide[number] @ wide[number].mT for number in numbers])
+        for number, polynomial in zip(numbers, _polynomials(grams), strict=True):
+            product = polynomial @ wide[number]
+            found[number] = product if product.shape == matrices[number].shape else product.mT
+    return found
+
+
+def _polynomials(gram: Tensor) -> Tensor:
+    """What matrices [n, R, C] are multiplied by, from their Gram matrices [n, R, R]."""
     a, b, c = COEFFICIENTS
-    largest = matrices.abs().amax(dim=(-2, -1), keepdim=True)
-    matrices = matrices / torch.where(largest > 0, largest, 1)  # so that no square underflows
-    gram = matrices @ matrices.mT
     square = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]  # of the Frobenius norm
-    square = torch.where(square > 0, square, 1)
-    gram = gram / square
-    product = matrices / square.sqrt()
+    square = square + (square == 0)
+    gram, found = gram / square, square.rsqrt() * torch.eye(gram.shape[-1]).to(gram)
     for _ in range(ITERATIONS):
         polynomial = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
         polynomial.diagonal(dim1=-2, dim2=-1).add_(a)
-        product = polynomial @ product
+        found = polynomial @ found
         gram = polynomial @ gram @ polynomial
-    return product
+    return found
 
 
 class Muon(torch.optim.AdamW):
@@ -91,21 +99,21 @@ class Muon(torch.optim.AdamW):
 
     def _step_matrices(self, group: dict[str, Any]) -> None:
         """Move the matrices, and take their gradients away, so that AdamW leaves them alone."""
-        same_shape: dict[tuple[int, int], list[tuple[nn.Parameter, Tensor]]] = {}
-        for parameter in group["params"]:
-            if parameter.grad is None:
-                continue
+        moved = [parameter for parameter in group["params"] if parameter.grad is not None]
+        if not moved:
+            return
+        for parameter in moved:
             state = self.state[parameter]
             if not state:  # AdamW's loading of a state asks for a step
                 state.update(step=torch.zeros(()), momentum=torch.zeros_like(parameter))
             state["step"] += 1
-            average = state["momentum"].lerp_(parameter.grad, 1 - MOMENTUM)
-            direction = parameter.grad.lerp(average, MOMENTUM).flatten(1)  # Nesterov's
-            same_shape.setdefault(tuple(direction.shape), []).append((parameter, direction))
+        gradients, averages = [p.grad for p in moved], [self.state[p]["momentum"] for p in moved]
+        torch._foreach_lerp_(averages, gradients, 1 - MOMENTUM)
+        directions = torch._foreach_lerp(gradients, averages, MOMENTUM)  # Nesterov's
+        steps = orthogonalized([direction.flatten(1) for direction in directions])
+        lengths = [-group["lr"] * ROOT_MEAN_SQUARE * max(step.shape) ** 0.5 for step in steps]
+        torch._foreach_mul_(steps, lengths)
+        torch._foreach_mul_(moved, 1 - group["lr"] * group["weight_decay"])
+        torch._foreach_add_(moved, [x.view_as(p) for x, p in zip(steps, moved, strict=True)])
+        for parameter in moved:
             parameter.grad = None
-        for (rows, columns), pairs in same_shape.items():
-            steps = orthogonalized(torch.stack([direction for _, direction in pairs]))
-            length = group["lr"] * ROOT_MEAN_SQUARE * max(rows, columns) ** 0.5
-            for (parameter, _), step in zip(pairs, steps, strict=True):
-                parameter.mul_(1 - group["lr"] * group["weight_decay"])
-                parameter.sub_(length * step.view_as(parameter))

@@ -5,8 +5,6 @@ import os
 import resource
 import shlex
 import signal
-import subprocess
-import sys
 import time
 from unittest.mock import Mock
 
@@ -20,6 +18,7 @@ from ghgs_lit.synthesis import datasets
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.cli.bad_commands import ROWS
 from tests.helpers.models import config, make_model
+from tests.helpers.processes import start_verb
 
 
 @pytest.fixture(scope="module")
@@ -135,18 +134,19 @@ def test_weights_that_do_not_fit_the_disk_are_one_line_with_their_path(monkeypat
 )
 def test_a_signal_is_an_exit_code_and_one_line(tmp_path, number, expected):
     """Scripts and batch systems tell an interrupted verb from one that failed or succeeded."""
-    command = [sys.executable, "-m", "ghgs_lit", "prepare", "data.people.train=5000", "data.render_workers=0"]
-    command += [f"data.cache_dir={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'run'}"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    command = "ghgs prepare data.people.train=5000 data.render_workers=0"
+    command += f" data.cache_dir={tmp_path / 'cache'} hydra.run.dir={tmp_path / 'run'}"
+    process, output = start_verb(command, tmp_path, os.environ)
     try:
         for _ in range(1200):
-            if any(tmp_path.glob("cache/*/*")) or process.poll() is not None:
+            if any(tmp_path.glob("cache/*/*")) or not process.is_alive():
                 break
             time.sleep(0.1)
-        process.send_signal(number)
-        _, text = process.communicate(timeout=60)
+        os.kill(process.pid, number)
+        process.join(60)
     finally:
         process.kill()
-    assert process.returncode == expected, text
+    text = output.read_text()
+    assert process.exitcode == expected, text
     assert "Traceback" not in text
     assert text.strip().splitlines()[-1].startswith("ghgs prepare: ")

@@ -6,12 +6,17 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 #: Makes processes by forking one that runs no threads and has imported what takes seconds.
 PREPARED = multiprocessing.get_context("forkserver")
 PREPARED.set_forkserver_preload(
-    ["pytest", *(f"ghgs_lit.cli.{name}" for name in ("application", "prepare", "train", "predict", "table"))]
+    [
+        "pytest",
+        "tests.helpers.composing",
+        *(f"ghgs_lit.cli.{name}" for name in ("application", "prepare", "train", "predict", "table")),
+    ]
 )
 
 
@@ -39,22 +44,52 @@ def run_prepared(function: Callable, *arguments: object) -> None:
 
 def run_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
     """Exit code and output of ``ghgs ...`` in a folder, as a process of :data:`PREPARED`."""
+    return _ended(*start_verb(command, folder, environment))
+
+
+def run_block(code: str, folder: Path, environment: Mapping[str, str]) -> tuple[int, str]:
+    """The same of ``python -c <code>``."""
+    return _ended(*_started(folder, environment, _block, code))
+
+
+def start_verb(command: str, folder: Path, environment: Mapping[str, str]) -> tuple[BaseProcess, Path]:
+    """The process of :func:`run_verb`, and the file that its output goes to."""
+    return _started(folder, environment, _verb, shlex.split(command))
+
+
+def _started(
+    folder: Path, environment: Mapping[str, str], function: Callable, given: object
+) -> tuple[BaseProcess, Path]:
     output = folder / ".output"
-    process = PREPARED.Process(target=_verb, args=(shlex.split(command), folder, dict(environment), output))
+    process = PREPARED.Process(target=_called_in, args=(folder, dict(environment), output, function, given))
     process.start()
+    return process, output
+
+
+def _ended(process: BaseProcess, output: Path) -> tuple[int, str]:
     process.join(300)
     process.kill()  # where it hangs
     return process.exitcode, output.read_text()
 
 
-def _verb(argv: list[str], folder: Path, environment: dict[str, str], output: Path) -> None:
-    from ghgs_lit.cli.main import main
-
+def _called_in(
+    folder: Path, environment: dict[str, str], output: Path, function: Callable, given: object
+) -> None:
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
     with open(output, "w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    function(given)
+
+
+def _verb(argv: list[str]) -> None:
+    from ghgs_lit.cli.main import main
+
     sys.argv = argv
     sys.exit(main())
+
+
+def _block(code: str) -> None:
+    exec(code, {"__name__": "__main__"})

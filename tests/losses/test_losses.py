@@ -8,6 +8,8 @@ from scipy.spatial.distance import cdist
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.chamfer import chamfer, nearest
+from ghgs_lit.losses import terms
+from ghgs_lit.metrics.functional import ssim_map
 from ghgs_lit.types import (
     Batch,
     Cameras,
@@ -141,6 +143,25 @@ def test_the_total_is_the_weighted_sum_of_reference_terms():
     }
     assert {k: v.item() for k, v in values.items()} == pytest.approx(expected, rel=1e-4)
     assert total.item() == pytest.approx(sum(weights[k] * expected[k] for k in weights), rel=1e-4)
+
+
+@pytest.mark.parametrize("part", [(0, 1, 0, 1), (30, 41, 39, 40), (5, 25, 12, 30), (0, 0, 0, 0)])
+def test_ssim_of_images_that_differ_in_a_part(part):
+    """Value and gradient are those of the whole map."""
+    top, bottom, left, right = part
+    g = torch.Generator().manual_seed(5)
+    target = torch.rand(2, 1, 3, 41, 40, generator=g, dtype=torch.float64)
+    image = target.clone()
+    image[1, ..., top:bottom, left:right] = 0.5
+    rendering = Rendering(image.requires_grad_(), image[:, :, :1], image[:, :, :1])
+    prediction, _, batch = _example()
+    masks = torch.ones(2, 1, 41, 40, dtype=torch.bool)
+    batch = dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, images=target, masks=masks))
+    value = terms.render_ssim(prediction, rendering, batch)
+    expected = 1 - ssim_map(image.flatten(0, 1), target.flatten(0, 1)).mean()
+    torch.testing.assert_close(value, expected, atol=1e-12, rtol=0)
+    slopes = [torch.autograd.grad(x, image)[0] for x in (value, expected)]
+    torch.testing.assert_close(*slopes, atol=1e-12, rtol=0)
 
 
 def test_terms_of_weight_zero_are_not_computed():

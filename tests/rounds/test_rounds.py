@@ -66,6 +66,19 @@ def test_more_rounds_than_trained_stay_within_bounds(count):
     assert (found.rounds[-1].depth != found.rounds[0].depth)[batch.masks].float().mean() > 0.9
 
 
+def test_gaussians_that_are_replaced_need_no_gradient():
+    """Training, which computes none for them, has the gradients of evaluation, which does."""
+    batch, kicked = make_batch(1, 4), model("rounds.training_counts=[2]", kick=0.1)
+    learned, found = [p for p in kicked.parameters() if p.requires_grad], []
+    for is_training in (False, True):
+        gaussians = kicked.train(is_training)(batch).gaussians
+        loss = sum(getattr(gaussians, name).square().mean() for name in ATTRIBUTES)
+        slopes = torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True)
+        found.append(torch.cat([slope.flatten() for slope in slopes]))
+    assert found[0].norm() > 0
+    assert (found[1] - found[0]).norm() < 1e-3 * found[0].norm()
+
+
 def test_a_batch_equals_its_elements_and_the_order_of_other_views_does_not_matter():
     batch, kicked = make_batch(2, 4), model(kick=0.5)
     with torch.no_grad():

@@ -4,7 +4,6 @@ import errno
 import os
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from ghgs_lit.synthesis import jobs, people
 from ghgs_lit.synthesis.jobs import SyntheticSource, render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, render_boxes, write_obj_scan
-from tests.helpers.processes import PREPARED
+from tests.helpers.processes import PREPARED, run_block
 
 SMALL = TINY.replace(positions=(0, 4, 8), views=(0, 3))
 
@@ -182,22 +181,19 @@ def test_a_script_without_a_main_guard_ends_with_a_reason(scans, tmp_path):
     script, pids = tmp_path / "script.py", tmp_path / "pids"
     script.write_text(UNGUARDED)
     pids.mkdir()
-    ended = subprocess.run(
-        [sys.executable, script, pids, tmp_path / "out", scans],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )
-    assert ended.returncode == 1
-    assert 'the script lacks `if __name__ == "__main__":`' in ended.stderr.splitlines()[-1]
-    assert f'{script}: expected `if __name__ == "__main__":` around' in ended.stderr
+    argv = [str(path) for path in (script, pids, tmp_path / "out", scans)]
+    run = f"import runpy, sys; sys.argv = {argv}; runpy.run_path({str(script)!r}, run_name='__main__')"
+    path = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    code, said = run_block(run, tmp_path, {**os.environ, **path})
+    assert code == 1
+    assert 'the script lacks `if __name__ == "__main__":`' in said.splitlines()[-1]
+    assert f'{script}: expected `if __name__ == "__main__":` around' in said
     assert not any(lives(int(p.name)) for p in pids.iterdir())
 
 
-def test_several_workers_make_the_same_files(scans, reference, tmp_path):
+def test_several_workers_make_the_same_files(scans, reference, tmp_path, monkeypatch):
     """Files are independent of the number of processes."""
+    monkeypatch.setattr(jobs.multiprocessing, "get_context", lambda *_: PREPARED)  # spawned ones import all
     render_boxes(tmp_path / "out", scans, 3, 1, settings=SMALL, workers=2)
     assert contents(tmp_path / "out") == reference
 

@@ -47,7 +47,7 @@ def test_singular_vectors_stay_and_singular_values_become_one(shape):
     """Beside U V^T of the decomposition, in float64: close to one is what the polynomials promise."""
     matrices = torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     u, _, v = torch.linalg.svd(matrices, full_matrices=False)
-    inside = u.mT @ orthogonalized(matrices) @ v.mT
+    inside = u.mT @ torch.stack(orthogonalized(matrices)) @ v.mT
     values = inside.diagonal(dim1=-2, dim2=-1)
     assert (inside - torch.diag_embed(values)).abs().max() < 1e-9
     assert values.max() < 1.2
@@ -59,23 +59,24 @@ def test_float32_is_enough():
     matrices = torch.randn(4, 32, 64, generator=torch.Generator().manual_seed(1))
     u, _, v = torch.linalg.svd(matrices, full_matrices=False)
     matrices = u @ torch.diag(torch.logspace(0, -3, 32)) @ v
-    expected = orthogonalized(matrices.double()).float()
-    torch.testing.assert_close(orthogonalized(matrices), expected, atol=5e-4, rtol=0)
+    for found, expected in zip(orthogonalized(matrices), orthogonalized(matrices.double()), strict=True):
+        torch.testing.assert_close(found, expected.float(), atol=5e-4, rtol=0)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e12])
 def test_scale_does_not_matter(scale):
     """Zeros stay zeros; tiny and huge gradients give the steps of others."""
-    matrix = torch.randn(1, 16, 20, generator=torch.Generator().manual_seed(2))
-    expected = orthogonalized(matrix) if scale else torch.zeros(1, 16, 20)
-    torch.testing.assert_close(orthogonalized(scale * matrix), expected, atol=1e-4, rtol=0)
+    matrix = torch.randn(16, 20, generator=torch.Generator().manual_seed(2))
+    expected = orthogonalized([matrix]) if scale else [torch.zeros(16, 20)]
+    torch.testing.assert_close(orthogonalized([scale * matrix]), expected, atol=1e-4, rtol=0)
 
 
-def test_matrices_of_one_shape_do_not_meet():
-    """One whose squares underflow beside an ordinary one."""
-    pair = torch.randn(2, 16, 20, generator=torch.Generator().manual_seed(4))
-    alone = torch.cat([orthogonalized(pair[:1]), orthogonalized(pair[1:])])
-    scaled = pair * torch.tensor([1.0, 1e-30])[:, None, None]
+def test_matrices_of_one_size_do_not_meet():
+    """One whose squares underflow beside an ordinary one, a tall one and a longer one."""
+    generator = torch.Generator().manual_seed(4)
+    several = [torch.randn(shape, generator=generator) for shape in ((16, 20), (16, 20), (20, 16), (16, 99))]
+    alone = [orthogonalized([matrix])[0] for matrix in several]
+    scaled = [scale * matrix for scale, matrix in zip((1, 1e-30, 1, 1), several, strict=True)]
     torch.testing.assert_close(orthogonalized(scaled), alone, atol=1e-4, rtol=0)
 
 

@@ -66,7 +66,7 @@ def activate(
     )
     count = len(pixel)
     out = [raw[0].new_empty(count, *size) for size in ((3,), (4,), (3,), (), (3,))]
-    arrays = [x.contiguous().numpy() for x in inputs]
+    arrays = [x.detach().contiguous().numpy() for x in inputs]
     numbers = tuple(np.float32(x) for x in constants)
     ends = np.searchsorted(image.numpy(), np.arange(len(turns) + 1)).tolist()
     pool.run(

@@ -24,9 +24,9 @@ def attributes(
         descriptors: of pixels.
     """
     from ghgs_lit.heads.cpu.networks_kernel import attributes as compiled  # here: it loads a compiler
-    from ghgs_lit.kernels.layers import packed
+    from ghgs_lit.kernels.layers import packed, parameters
 
-    layers = np.concatenate([packed(network[k]) for network in networks for k in (0, 2, 4)])
+    layers = packed(parameters([layer for network in networks for layer in network]))
     outputs = [len(network[4].bias) for network in networks]
     rows = descriptors.reshape(-1, descriptors.shape[-1]).contiguous()
     found = rows.new_empty(len(rows), sum(outputs))

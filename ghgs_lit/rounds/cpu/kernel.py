@@ -39,7 +39,7 @@ def remember():
 
 
 @helper
-def _see(view, hidden, views, shown, seen):
+def see(view, hidden, views, shown, seen):
     """Put what a view shows into ``seen``: the own view's, then the others' mean and their maximum."""
     size = hidden * PANEL
     share = ONE / np.float32(views - 1)
@@ -76,7 +76,7 @@ def _remember(each, known, before, layers, after, first, last):
             rectify(layers, 0, hidden, channels, two)
             linear(layers, to_deep, hidden, hidden, two, one)
             rectify(layers, to_deep, hidden, hidden, one)
-            _see(view, hidden, views, one, seen)
+            see(view, hidden, views, one, seen)
         put_rows(known, start, count, 3 * hidden, seen)
         put_rows(before, start, count, inputs - hidden, seen)
         linear(layers, to_update, 2 * hidden, inputs, seen, one)

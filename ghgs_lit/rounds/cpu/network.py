@@ -1,8 +1,7 @@
-"""The kernel distributed over threads; the result has the same bits with any number of them."""
+"""The kernels distributed over threads; the result has the same bits with any number of them."""
 
 from functools import partial
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -12,6 +11,8 @@ from ghgs_lit.kernels.parts import even_parts
 
 #: Gaussians of one task, and how many of the pool's pieces of work one of them is.
 _TASK, _WORK = 512, 8
+#: Gaussians of one task of the gradients: each adds up sums of its own.
+_LEARNED = 2048
 
 
 def remembered(
@@ -24,6 +25,8 @@ def remembered(
 ) -> Float[Tensor, "N h"]:
     """``tanh(before + memory(update(seen, known, before)))``; see :meth:`ghgs_lit.rounds.Rounds._remembered`.
 
+    Differentiable in ``before`` and the layers.
+
     Args:
         view, update: of two layers each; ``seen`` is ``view`` of the own view, and of the others the mean and
             the largest.
@@ -32,30 +35,19 @@ def remembered(
         known: what is known beside it.
         before: what was remembered.
     """
-    from ghgs_lit.kernels.layers import packed  # here, like the kernel: it loads a compiler
-    from ghgs_lit.rounds.cpu.kernel import remember
+    from ghgs_lit.kernels.layers import parameters  # here, like the kernels: it loads a compiler
 
-    layers = np.concatenate([packed(x) for x in (*view, *update, memory) if isinstance(x, nn.Linear)])
-    after = torch.empty_like(before)
-    rows = [x.contiguous().numpy() for x in (each, known, before)]
-    pool.run(
-        [
-            partial(remember(), *rows, layers, after.numpy(), part.start, part.stop)
-            for part in even_parts(len(before), _TASK)
-        ],
-        _WORK * len(before),
-    )
-    return after
+    return _Remember.apply(each, known, before, *parameters((*view, *update, memory)))
 
 
 def answered(
     hear: nn.Linear, change: nn.Linear, heard: Float[Tensor, "N e"], before: Float[Tensor, "N h"]
 ) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
-    """``after = before + hear(relu(heard))``, and ``change(after)``."""
-    from ghgs_lit.kernels.layers import packed
+    """``after = before + hear(relu(heard))``, and ``change(after)``; without a gradient."""
+    from ghgs_lit.kernels.layers import packed, parameters
     from ghgs_lit.rounds.cpu.kernel import answer
 
-    layers = np.concatenate([packed(hear), packed(change)])
+    layers = packed(parameters((hear, change)))
     after, changed = torch.empty_like(before), before.new_empty(len(before), len(change.bias))
     rows = [x.contiguous().numpy() for x in (heard, before)]
     pool.run(
@@ -66,3 +58,41 @@ def answered(
         len(before),
     )
     return after, changed
+
+
+class _Remember(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, each, known, before, *numbers):
+        from ghgs_lit.kernels.layers import packed
+        from ghgs_lit.rounds.cpu.kernel import remember
+
+        layers, after = packed(numbers), torch.empty_like(before)
+        rows = [x.detach().contiguous() for x in (each, known, before)]
+        arrays = [x.numpy() for x in rows]
+        pool.run(
+            [
+                partial(remember(), *arrays, layers, after.numpy(), part.start, part.stop)
+                for part in even_parts(len(before), _TASK)
+            ],
+            _WORK * len(before),
+        )
+        ctx.save_for_backward(*rows, after, *numbers)
+        return after
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, slope):
+        from ghgs_lit.kernels.layers import Sums, packed
+        from ghgs_lit.rounds.cpu.gradients import remember_back
+
+        *rows, numbers = *ctx.saved_tensors[:4], ctx.saved_tensors[4:]
+        parts = even_parts(len(slope), _LEARNED)
+        sums, d_before = Sums(numbers, len(parts)), torch.empty_like(slope)
+        arrays = [x.numpy() for x in (*rows, slope.contiguous())]
+        layers = packed(numbers), packed(numbers, transposed=True), sums.places
+        tasks = [
+            partial(remember_back(), *arrays, *layers, own, d_before.numpy(), part.start, part.stop)
+            for own, part in zip(sums.of_task, parts, strict=True)
+        ]
+        pool.run(tasks, 4 * _WORK * len(slope))
+        return None, None, d_before, *sums.gradients()

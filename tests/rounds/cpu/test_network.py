@@ -1,5 +1,7 @@
 """The kernel of the rounds' network against plain PyTorch."""
 
+import functools
+
 import pytest
 import torch
 from torch import nn
@@ -37,6 +39,26 @@ def test_the_kernel_remembers_what_plain_pytorch_does(hidden, views, count):
     torch.testing.assert_close(found.double(), expected, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize(("hidden", "views", "count"), [(48, 4, 2500), (17, 2, 33), (5, 3, 1), (64, 5, 32)])
+def test_gradients_are_those_of_plain_pytorch(hidden, views, count):
+    """Those of more Gaussians than one task has, of views that show the same, and of a single Gaussian."""
+    rounds, (each, known, before) = scene(hidden, views, count)
+    each[::3, 1] = each[::3, -1]  # two views without the Gaussian show the same
+    weights = torch.randn(count, hidden)
+
+    def gradients(forward, dtype):
+        rounds.to(dtype)
+        rows = [x.to(dtype) for x in (each, known, before)]
+        layers = [p for part in (rounds.view, rounds.update, rounds.memory) for p in part.parameters()]
+        after = forward(*rows[:2], rows[2].requires_grad_())
+        return torch.autograd.grad((after * weights.to(dtype)).sum(), [rows[2], *layers])
+
+    fused = functools.partial(cpu.remembered, rounds.view, rounds.update, rounds.memory)
+    found = gradients(fused, torch.float32)
+    for mine, expected in zip(found, gradients(rounds._remembered, torch.float64), strict=True):
+        assert (mine - expected).norm() < 2e-6 * expected.norm()
+
+
 @pytest.mark.parametrize(("hidden", "channels", "count"), [(48, 16, 1111), (17, 5, 33)])
 @torch.no_grad()
 def test_the_kernel_answers_as_plain_pytorch_does(hidden, channels, count):
@@ -50,16 +72,19 @@ def test_the_kernel_answers_as_plain_pytorch_does(hidden, channels, count):
 
 
 def test_the_number_of_threads_and_other_gaussians_change_no_bit():
-    rounds, rows = scene(48, 4, 3000)
-    threads = torch.get_num_threads()
+    rounds, rows = scene(48, 4, 5000)
+    layers = [rounds.view[0].weight, rounds.update[0].weight, rounds.memory.bias]
+    threads, found = torch.get_num_threads(), []
     try:
-        torch.set_num_threads(1)
-        one = fused(rounds, rows)
-        torch.set_num_threads(3)
-        assert torch.equal(fused(rounds, rows), one)
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            after = cpu.remembered(rounds.view, rounds.update, rounds.memory, *rows)
+            found.append((after, *torch.autograd.grad(after.square().sum(), layers)))
     finally:
         torch.set_num_threads(threads)
-    assert torch.equal(fused(rounds, [x[1000:1010] for x in rows]), one[1000:1010])
+    for one, three in zip(*found, strict=True):
+        assert torch.equal(one, three)
+    assert torch.equal(fused(rounds, [x[1000:1010] for x in rows]), found[0][0][1000:1010])
 
 
 @pytest.mark.parametrize("row", [0, 1, 2])
@@ -74,14 +99,12 @@ def test_what_is_not_finite_reaches_no_other_gaussian(row):
 
 
 def test_where_the_kernel_is_used(monkeypatch):
-    """Not with a gradient, in another precision, or where a processor has no fused products."""
+    """Not in another precision, or where a processor has no fused products."""
     monkeypatch.setattr(pool, "features", lambda: {"avx2", "fma"})
     x = torch.ones(3)
-    assert not pool.multiplies(x)
-    with torch.no_grad():
-        assert pool.multiplies(x)
-        assert not pool.multiplies(x, x.double())
-        with torch.autocast("cpu", torch.bfloat16):
-            assert not pool.multiplies(x)
-        monkeypatch.setattr(pool, "features", lambda: {"avx2"})
+    assert pool.multiplies(x)
+    assert not pool.multiplies(x, x.double())
+    with torch.autocast("cpu", torch.bfloat16):
         assert not pool.multiplies(x)
+    monkeypatch.setattr(pool, "features", lambda: {"avx2"})
+    assert not pool.multiplies(x)

@@ -1,0 +1,114 @@
+"""Gradients of what the rounds remember; values inside are computed again, in the cache."""
+
+from functools import cache
+
+import numpy as np
+from numba.core import types
+
+from ghgs_lit.kernels import memory, simd
+from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.layers import learn, linear, lines, put_ones, put_rows, put_slopes, rectify, unrectify
+from ghgs_lit.kernels.simd import LANES
+from ghgs_lit.kernels.tile import PANEL
+from ghgs_lit.rounds.cpu.kernel import FLOATS, ONE, ZERO, see
+
+PLACES = types.Array(types.int64, 2, "C")
+
+
+@cache
+def remember_back():
+    """The compiled :func:`_remember_back`."""
+    rows, layers = [FLOATS[3], *[FLOATS[2]] * 4], [FLOATS[1], FLOATS[1], PLACES, FLOATS[1]]
+    return kernel_for(_remember_back, *rows, *layers, FLOATS[2], *[types.int64] * 2)
+
+
+@helper
+def _unsee(view, hidden, views, shown, seen, slopes, own):
+    """Put the slopes of what a view shows into ``own``; the largest of equal maxima takes the slope."""
+    size = hidden * PANEL
+    share = ONE / np.float32(views - 1)
+    for i in range(0, size, LANES):
+        if view == 0:
+            memory.store(own, i, memory.load(slopes, i))
+        else:
+            most, slope = memory.load(seen, 2 * size + i), memory.load(slopes, 2 * size + i)
+            is_most = memory.load(shown, i) == most
+            mean = share * memory.load(slopes, size + i)
+            memory.store(own, i, mean + simd.select(is_most, slope, ZERO))
+            memory.store(slopes, 2 * size + i, simd.select(is_most, ZERO, slope))
+
+
+@helper
+def _of(view, views, buffer):
+    """The part of a buffer that a view has."""
+    each = len(buffer) // views
+    return buffer[view * each : (view + 1) * each]
+
+
+@helper
+def _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow):
+    """Fill the inputs of all layers: of the views' two, of the update's two and of the last."""
+    views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
+    inputs, wide = 4 * hidden + known.shape[1], 2 * hidden
+    for view in range(views):
+        x, a, b = _of(view, views, given), _of(view, views, one), _of(view, views, two)
+        put_rows(each[:, view], start, count, 0, x)
+        put_ones(channels, x)
+        linear(layers, places[0, 0], hidden, channels, x, a)
+        rectify(layers, places[0, 0], hidden, channels, a)
+        put_ones(hidden, a)
+        linear(layers, places[1, 0], hidden, hidden, a, b)
+        rectify(layers, places[1, 0], hidden, hidden, b)
+        see(view, hidden, views, b, seen)
+    put_rows(known, start, count, 3 * hidden, seen)
+    put_rows(before, start, count, inputs - hidden, seen)
+    put_ones(inputs, seen)
+    linear(layers, places[2, 0], wide, inputs, seen, up)
+    rectify(layers, places[2, 0], wide, inputs, up)
+    put_ones(wide, up)
+    linear(layers, places[3, 0], hidden, wide, up, narrow)
+    rectify(layers, places[3, 0], hidden, wide, narrow)
+    put_ones(hidden, narrow)
+
+
+def _remember_back(
+    each, known, before, after, slopes, layers, backs, places, sums, d_before, first, last
+):  # fmt: skip
+    """Write ``d_before`` of rows ``first`` to ``last``, add up ``sums``; see :func:`.network.remembered`."""
+    views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
+    inputs, wide = 4 * hidden + known.shape[1], 2 * hidden
+    line, most = lines(hidden + 1) * PANEL, lines(inputs + 1) * PANEL
+    given = simd.aligned(views * lines(channels + 1) * PANEL)
+    one, two = simd.aligned(views * line), simd.aligned(views * line)
+    seen, slope, turned = simd.aligned(most), simd.aligned(most), simd.aligned(most + PANEL * PANEL)
+    up, narrow, down = simd.aligned(2 * line), simd.aligned(line), simd.aligned(2 * line)
+    for buffer in (given, one, two, seen, up, narrow, turned):  # rows that no gradient is read of stay finite
+        buffer[:] = ZERO
+    for start in range(first, last, PANEL):
+        count = min(PANEL, last - start)
+        _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow)
+        put_slopes(slopes, start, count, down)
+        for lane in range(count):
+            for channel in range(hidden):
+                value = after[start + lane, channel]
+                down[channel * PANEL + lane] *= ONE - value * value
+                d_before[start + lane, channel] = down[channel * PANEL + lane]
+        learn(narrow, hidden, down, hidden, turned, places[4, 2], sums)
+        linear(backs, places[4, 1], hidden, hidden, down, slope)
+        unrectify(narrow, hidden, slope)
+        learn(up, wide, slope, hidden, turned, places[3, 2], sums)
+        linear(backs, places[3, 1], wide, hidden, slope, down)
+        unrectify(up, wide, down)
+        learn(seen, inputs, down, wide, turned, places[2, 2], sums)
+        linear(backs, places[2, 1], inputs, wide, down, slope)
+        for lane in range(count):
+            for channel in range(hidden):
+                d_before[start + lane, channel] += slope[(inputs - hidden + channel) * PANEL + lane]
+        for view in range(views):
+            x, a, b = _of(view, views, given), _of(view, views, one), _of(view, views, two)
+            _unsee(view, hidden, views, b, seen, slope, down)
+            unrectify(b, hidden, down)
+            learn(a, hidden, down, hidden, turned, places[1, 2], sums)
+            linear(backs, places[1, 1], hidden, hidden, down, up)
+            unrectify(a, hidden, up)
+            learn(x, channels, up, hidden, turned, places[0, 2], sums)
