@@ -13,6 +13,7 @@ from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.crops import Photograph
+from ghgs_lit.readers import read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.synthesis import jobs
 from ghgs_lit.synthesis.rig import Rig
@@ -79,6 +80,7 @@ def test_weights_learn_and_are_written(calibration, tmp_path, monkeypatch, capsy
     assert ghgs("adapt", f"cameras={calibration}", f"out={out}", f"hydra.run.dir={run}", *small) == 0
     printed = capsys.readouterr().out
     assert printed.splitlines()[-1] == f"wrote {out}"
+    assert read_yaml(run / "config.yaml")["optimizer"]["freeze_until"] == {}
     means = [read_results(path / "metrics.json") for path in (run / "before", run)]
     assert [len(result["rows"]) for result in means] == [4, 4]
     before, after = (result["summary"][0]["psnr"] for result in means)

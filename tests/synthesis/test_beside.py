@@ -4,10 +4,11 @@ import pytest
 
 from ghgs_lit.data.completeness import Completeness
 from ghgs_lit.data.layout import Layout
-from ghgs_lit.synthesis import beside
+from ghgs_lit.synthesis import beside, datasets
 from ghgs_lit.synthesis.jobs import render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, write_obj_scan
+from tests.synthesis.test_capture_rig import ring
 
 NAMES = ["s0", "s1", "s2"]
 SMALL = TINY.replace(positions=(0, 4), views=(0,))
@@ -67,3 +68,19 @@ def test_people_who_cannot_be_made_are_said(begun, capfd):
     beside._running[root].join(60)
     assert "training goes on with the people rendered so far: " in capfd.readouterr().err
     assert list(joining(root)[1]) == ["s0"]
+
+
+@pytest.mark.parametrize("workers", [None, 0])
+def test_training_waits_for_the_first_people_only(workers, monkeypatch, tmp_path):
+    """Eight of both kinds, and who is measured; for all where no further process is allowed."""
+    waited, later = [], []
+    monkeypatch.setattr(datasets, "render_people", lambda root, names, *_: waited.append(names))
+    monkeypatch.setattr(datasets, "render_beside", lambda root, names, *_: later.append(names))
+    people, active = datasets.People(train=12, val=1), datasets.ActivePeople(train=6, val=1)
+    cameras = {str(i): camera.model_dump() for i, camera in enumerate(ring())}
+    options = {"people": people, "active": active, "cache_dir": tmp_path, "render_workers": workers}
+    datasets.PeopleInRig(cameras=cameras, **options).prepare()
+    pairs = [f"{kind}{i:07d}" for i in range(12) for kind in "pa" if kind == "p" or i < 6]
+    first = {"train": pairs if workers == 0 else pairs[:8], "val": ["p1000000", "a1000000"]}
+    assert waited == [first]
+    assert later == ([] if workers == 0 else [pairs])
