@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import mmap
 import threading
+import time
 
 import lightning.pytorch as L
 import pytest
@@ -152,6 +153,8 @@ def test_logs_resume_where_the_checkpoint_was(tmp_path):
     with open(tmp_path / "csv" / "metrics.csv", "a") as file:
         file.write("7")  # killed while it wrote
     first[0].experiment.close()
+    # TensorBoard reads files of one second in the order of their numbers as text: 10 before 9.
+    time.sleep(1 - time.time() % 1)
     second = loggers(tmp_path)
     resume(second, 6)
     for logger in second:
