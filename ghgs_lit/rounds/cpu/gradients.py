@@ -46,6 +46,14 @@ def _of(view, views, buffer):
 
 
 @helper
+def _layer(layers, place, outputs, inputs, before, after):
+    """Outputs of a layer, and the row of ones behind them by which biases of the next one learn."""
+    linear(layers, place, outputs, inputs, before, after)
+    rectify(layers, place, outputs, inputs, after)
+    put_ones(outputs, after)
+
+
+@helper
 def _look(each, known, before, layers, places, start, count, given, one, two, seen, up, narrow):
     """Fill the inputs of all layers: of the views' two, of the update's two and of the last."""
     views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
@@ -54,21 +62,14 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
         x, a, b = _of(view, views, given), _of(view, views, one), _of(view, views, two)
         put_rows(each[:, view], start, count, 0, x)
         put_ones(channels, x)
-        linear(layers, places[0, 0], hidden, channels, x, a)
-        rectify(layers, places[0, 0], hidden, channels, a)
-        put_ones(hidden, a)
-        linear(layers, places[1, 0], hidden, hidden, a, b)
-        rectify(layers, places[1, 0], hidden, hidden, b)
+        _layer(layers, places[0, 0], hidden, channels, x, a)
+        _layer(layers, places[1, 0], hidden, hidden, a, b)
         see(view, hidden, views, b, seen)
     put_rows(known, start, count, 3 * hidden, seen)
     put_rows(before, start, count, inputs - hidden, seen)
     put_ones(inputs, seen)
-    linear(layers, places[2, 0], wide, inputs, seen, up)
-    rectify(layers, places[2, 0], wide, inputs, up)
-    put_ones(wide, up)
-    linear(layers, places[3, 0], hidden, wide, up, narrow)
-    rectify(layers, places[3, 0], hidden, wide, narrow)
-    put_ones(hidden, narrow)
+    _layer(layers, places[2, 0], wide, inputs, seen, up)
+    _layer(layers, places[3, 0], hidden, wide, up, narrow)
 
 
 def _remember_back(
