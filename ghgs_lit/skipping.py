@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import model_validator
 from torch import Tensor
 
-from ghgs_lit.config.options import Amount, Index, Options, Text
+from ghgs_lit.config.options import Amount, Count, Index, Options, Text
 from ghgs_lit.types import Decision, DecodedPixels
 
 
@@ -55,6 +55,9 @@ class Preset(Options):
     pixels: DecodedPixels = "subject"
     """Pixels that the dense heads decode: whole views, or windows around the subject. The depth head decodes
     all where recalibration.tokens=all: all tokens need a depth."""
+    every: Count = 1
+    """Of so many instants of a sequence the first is predicted anew, the others move its Gaussians; 1: each
+    is predicted by itself."""
     budget_db: float | None = EXACT_LOSS
     """PSNR that may be lost against skip=none, in dB (`ghgs benchmark` checks it); null: no promise."""
     max_rel_diff: Amount | None = 1e-5

@@ -5,6 +5,7 @@ import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, predict, predict_batch
+from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
 from ghgs_lit.prediction.export import (
     REPORT,
     OutputOptions,
@@ -40,6 +41,7 @@ from ghgs_lit.prediction.export import (
     write_prediction,
 )
 from ghgs_lit.prediction.export.video import mp4_bytes
+from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import to_uint8
@@ -127,8 +129,9 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     begin = time.perf_counter()
+    temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     for capture, waited in captures_of(folder):
-        result = predict(capture, model, size, **refining, renderer=renderer)
+        result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
         gaussians, seconds = write_result(directories[capture.name], result, model, renderer, config, options)
         if several and "mp4" in options.formats:
@@ -146,6 +149,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         count, total = len(folder.instants), time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
+        if model.skip.every > 1:
+            print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
 
 
 def advice_of(directory: Path) -> Iterator[str]:

@@ -19,6 +19,7 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement, Report, pixels_moved
+from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.surroundings import side_multiple
 from ghgs_lit.types import Batch, Gaussians, Prediction
@@ -61,6 +62,7 @@ def predict(
     refine_masks: int | Literal["auto"] = "auto",
     refine: int = 0,
     renderer: Renderer | None = None,
+    temporal: Temporal | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a capture.
 
@@ -76,6 +78,8 @@ def predict(
             photographs show other outlines.
         refine: steps that bring the Gaussians nearer to the photographs, such as 15; 0: none.
         renderer: what refining draws with; None: that of the device.
+        temporal: what predicted the instants before, in their order; None: this one has nothing to do with
+            them.
 
     Raises:
         InputError: the checkpoint cannot be used, or the size does not fit the model.
@@ -94,15 +98,17 @@ def predict(
         why["refine_cameras"] = doubt_of_cameras(capture, batch)
         refine_cameras = ENOUGH if why["refine_cameras"] else 0
     batch = batch.to(next(model.parameters()).device)
-
-    def in_frame(batch: Batch) -> Prediction:
-        # Also for weights that see the world as it is (compat=release): no unit is wrong for a capture.
-        frame = Frame.of(batch)
-        return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
-
-    result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, in_frame)
+    forward = functools.partial(in_frame, model)
+    result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, forward, temporal)
     why = {name: doubt for name, doubt in why.items() if doubt}
     return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
+
+
+def in_frame(model: GHGS, batch: Batch) -> Prediction:
+    """A prediction in metres around the subject whatever the weights: no unit is wrong for a capture."""
+    # Weights that see the world as it is (compat=release) have no such frame of their own.
+    frame = Frame.of(batch)
+    return frame.leave(model(frame.enter(batch)), batch.cameras.extrinsics.dtype)
 
 
 def predict_batch(
@@ -112,6 +118,7 @@ def predict_batch(
     refine_cameras: int = 0,
     refine: int = 0,
     forward: Callable[[Batch], Prediction] | None = None,
+    temporal: Temporal | None = None,
 ) -> TimedPrediction:
     """The Gaussians of a batch of one subject, which keeps its targets.
 
@@ -120,6 +127,7 @@ def predict_batch(
         refine_cameras: rounds of the one, at most; 0: none.
         refine: steps of the other; 0: none.
         forward: the prediction of a batch without targets; None: the model's.
+        temporal: the same where instants before are known.
     """
     forward, moved, seconds, start = forward or model, (), {}, time.perf_counter()
     if refine_cameras:
@@ -127,7 +135,7 @@ def predict_batch(
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
-    prediction = forward(dataclasses.replace(batch, targets=None))
+    prediction = (temporal or forward)(dataclasses.replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start

@@ -41,7 +41,8 @@ NEAR = {
     "colors": Change(0.05, 0.001),
 }
 #: Weights of L1, 1 - SSIM (as in the paper's L_render) and L1 of the silhouette.
-WEIGHTS = (0.8, 0.2, 0.1)
+Weights = tuple[float, float, float]
+WEIGHTS: Weights = (0.8, 0.2, 0.1)
 
 BeforeAfter = tuple[float, float]
 
@@ -59,6 +60,69 @@ class Report:
         if self.held_out is None:
             return line
         return line + "; an input held out, from the others, {:.2f} -> {:.2f} dB".format(*self.held_out)
+
+
+class Descent:
+    """Gaussians with bounded changes, and the optimiser of these; at first nothing is changed.
+
+    Args:
+        gaussians: predicted from ``batch``, each at a pixel of an input.
+        changes: what may change, as of :class:`Refinement`.
+
+    Raises:
+        InputError: Gaussians that belong to no pixel.
+    """
+
+    def __init__(self, gaussians: Gaussians, batch: Batch, changes: Mapping[str, Change]):
+        require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
+        self.start, self.changes = gaussians.detach(), changes
+        self._footprint = _footprints(self.start, batch)
+        self._raw = {
+            name: torch.zeros_like(getattr(self.start, name), requires_grad=True) for name in changes
+        }
+        # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
+        groups = [{"params": [self._raw[name]], "lr": change.rate} for name, change in changes.items()]
+        self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95), eps=1e-15)
+
+    @property
+    @torch.no_grad()
+    def gaussians(self) -> Gaussians:
+        """As they are now, without a gradient."""
+        return self._changed()
+
+    def step(
+        self,
+        renderer: Renderer,
+        photographs: Tensor,
+        silhouettes: Tensor,
+        cameras: Cameras,
+        weights: Weights = WEIGHTS,
+    ) -> Rendering:
+        """One step towards photographs on black and silhouettes; the renders that it follows from."""
+        with torch.autocast(self._footprint.device.type, enabled=False), torch.enable_grad():
+            drawn = renderer(self._changed(), cameras, background=0.0)
+            self._optimizer.zero_grad()
+            _loss(drawn, photographs, silhouettes, weights).backward()
+            self._optimizer.step()
+        return drawn
+
+    def _changed(self) -> Gaussians:
+        """Gaussians with bounded changes; none where they are 0."""
+        start = self.start
+        change = {
+            name: allowed.limit * torch.tanh(self._raw[name] / allowed.limit)
+            for name, allowed in self.changes.items()
+        }
+        changed = {name: getattr(start, name) + value for name, value in change.items()}
+        if "means" in change:
+            changed["means"] = start.means + self._footprint * change["means"]
+        if "scales" in change:
+            changed["scales"] = start.scales * change["scales"].exp()
+        if "opacities" in change:
+            # No step could leave an opacity of exactly 0 or 1.
+            logit = torch.logit(start.opacities.clamp(1e-4, 1 - 1e-4))
+            changed["opacities"] = torch.sigmoid(logit + change["opacities"])
+        return dataclasses.replace(start, **changed)
 
 
 class Refinement:
@@ -91,40 +155,12 @@ class Refinement:
         self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None
     ) -> Iterator[Gaussians]:
         """The Gaussians before the first step and after each; arguments and errors as for a call."""
-        require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
         views = range(batch.images.shape[1]) if views is None else views
-        gaussians = gaussians.detach()
-        photographs, silhouettes, cameras = _of_views(batch, views)
-        footprint = _footprints(gaussians, batch)
-        raw = {name: torch.zeros_like(getattr(gaussians, name), requires_grad=True) for name in self.changes}
-        # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
-        groups = [{"params": [raw[name]], "lr": change.rate} for name, change in self.changes.items()]
-        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95), eps=1e-15)
-        yield gaussians
+        seen, search = seen_by(batch, views), Descent(gaussians, batch, self.changes)
+        yield gaussians.detach()
         for _ in range(self.steps):
-            with torch.autocast(footprint.device.type, enabled=False), torch.enable_grad():
-                drawn = self.renderer(self._changed(gaussians, raw, footprint), cameras, background=0.0)
-                optimizer.zero_grad()
-                _loss(drawn, photographs, silhouettes).backward()
-                optimizer.step()
-            yield self._changed(gaussians, raw, footprint).detach()
-
-    def _changed(self, gaussians: Gaussians, raw: dict[str, Tensor], footprint: Tensor) -> Gaussians:
-        """Gaussians with bounded changes; none where ``raw`` is 0."""
-        change = {
-            name: allowed.limit * torch.tanh(raw[name] / allowed.limit)
-            for name, allowed in self.changes.items()
-        }
-        changed = {name: getattr(gaussians, name) + value for name, value in change.items()}
-        if "means" in change:
-            changed["means"] = gaussians.means + footprint * change["means"]
-        if "scales" in change:
-            changed["scales"] = gaussians.scales * change["scales"].exp()
-        if "opacities" in change:
-            # No step could leave an opacity of exactly 0 or 1.
-            logit = torch.logit(gaussians.opacities.clamp(1e-4, 1 - 1e-4))
-            changed["opacities"] = torch.sigmoid(logit + change["opacities"])
-        return dataclasses.replace(gaussians, **changed)
+            search.step(self.renderer, *seen)
+            yield search.gaussians
 
     def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Predict) -> Report:
         """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
@@ -147,12 +183,13 @@ class Refinement:
 
     @torch.no_grad()
     def _psnr(self, gaussians: Gaussians, batch: Batch, views: Sequence[int]) -> float:
-        photographs, _, cameras = _of_views(batch, views)
+        photographs, _, cameras = seen_by(batch, views)
         drawn = self.renderer(gaussians, cameras, background=0.0).image
         return float(psnr(drawn.flatten(0, 1).clamp(0, 1), photographs.flatten(0, 1)).mean())
 
 
-def _of_views(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
+def seen_by(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
+    """Photographs on black, silhouettes and cameras of some views."""
     part = batch.of_views(views)
     return on_black(part), coverage(part)[:, :, None], part.cameras
 
@@ -166,11 +203,10 @@ def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:
     return (depth / focal)[:, None]
 
 
-def _loss(drawn: Rendering, photographs: Tensor, silhouettes: Tensor) -> Tensor:
-    l1, dissimilar, outline = WEIGHTS
+def _loss(drawn: Rendering, photographs: Tensor, silhouettes: Tensor, weights: Weights) -> Tensor:
+    l1, dissimilar, outline = weights
+    loss = l1 * (drawn.image - photographs).abs().mean() + outline * (drawn.alpha - silhouettes).abs().mean()
+    if not dissimilar:
+        return loss
     structure = ssim(drawn.image.flatten(0, 1), photographs.flatten(0, 1), padding="valid").mean()
-    return (
-        l1 * (drawn.image - photographs).abs().mean()
-        + dissimilar * (1 - structure)
-        + outline * (drawn.alpha - silhouettes).abs().mean()
-    )
+    return loss + dissimilar * (1 - structure)

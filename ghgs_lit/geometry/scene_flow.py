@@ -1,0 +1,177 @@
+"""Scene flow: how surface points move between two instants, by the photographs of all cameras.
+
+A point keeps its colour in each view that shows it. How far it moved follows from the slopes of photographs
+(Lucas and Kanade, IJCAI 1981), in space and for all views at once (Vedula et al., ICCV 1999), from coarse to
+fine ones. What a single point leaves open its neighbours say: the equations of all points are summed at the
+nodes of a grid and spread to the nodes around, far where photographs are coarse.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.projection import project, world_to_camera
+from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.types import Cameras
+
+#: Metres between the nodes of the grid.
+_CELL = 0.08
+#: One point in so many has equations; all of them move.
+_EVERY = 3
+#: Deviation of a colour at which an equation counts half.
+_OUTLIER = 0.06
+#: Longest step in metres, and the weight of steps of 0: absolute, and as a share of the equations' own.
+_LONGEST, _STILL, _STIFF = 0.05, 1e-3, 0.01
+
+
+class _Level(NamedTuple):
+    """How much smaller photographs are, how often equations spread to the next nodes, and the steps."""
+
+    smaller: int
+    spread: int
+    steps: int
+
+
+_LEVELS = (_Level(4, 4, 2), _Level(2, 2, 2), _Level(1, 1, 1))
+
+
+class Instant(NamedTuple):
+    """Photographs on black and their cameras, in metres."""
+
+    images: Float[Tensor, "V 3 H W"]
+    cameras: Cameras
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Nodes around points: ``low`` is the first one's position, ``shape`` their number along z, y and x."""
+
+    low: Float[Tensor, " 3"]
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def around(cls, points: Float[Tensor, "N 3"]) -> "_Grid":
+        low = points.amin(0) - _CELL
+        counts = ((points.amax(0) - low) / _CELL).ceil().int() + 2
+        return cls(low, tuple(counts.flip(0).tolist()))
+
+    def summed(self, points: Float[Tensor, "n 3"], values: Float[Tensor, "n c"]) -> Float[Tensor, "c z y x"]:
+        """The sums of values at the nodes nearest to their points."""
+        x, y, z = ((points - self.low) / _CELL).round().long().unbind(-1)
+        sums = values.new_zeros(self.shape[0] * self.shape[1] * self.shape[2], values.shape[1])
+        sums.index_add_(0, (z * self.shape[1] + y) * self.shape[2] + x, values)
+        return sums.mT.reshape(-1, *self.shape)
+
+    def at(self, nodes: Float[Tensor, "c z y x"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
+        """Values between the nodes."""
+        last = points.new_tensor(self.shape[::-1]) - 1
+        place = 2 * (points - self.low) / (_CELL * last) - 1
+        found = F.grid_sample(nodes[None], place[None, None, None], align_corners=True)
+        return found[0, :, 0, 0].mT
+
+
+def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y x"]:
+    kernel = nodes.new_tensor([0.25, 0.5, 0.25])
+    nodes = nodes[:, None]
+    for _ in range(times):
+        for axis in range(3):
+            shape = [1, 1, 1, 1, 1]
+            shape[2 + axis] = 3
+            pads = [0, 0, 0]
+            pads[axis] = 1
+            nodes = F.conv3d(nodes, kernel.view(shape), padding=pads)
+    return nodes[:, 0]
+
+
+def _pyramid(images: Float[Tensor, "V 3 H W"]) -> Iterator[tuple[_Level, Float[Tensor, "V 3 h w"]]]:
+    for level in _LEVELS:
+        smaller = F.avg_pool2d(images, level.smaller, ceil_mode=True) if level.smaller > 1 else images
+        yield level, F.avg_pool2d(F.pad(smaller, (1, 1, 1, 1)), 3, 1)
+
+
+def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
+    """Values, and their slopes to the right and down."""
+    rim = F.pad(images, (1, 1, 1, 1), mode="replicate")
+    right = (rim[..., 1:-1, 2:] - rim[..., 1:-1, :-2]) / 2
+    down = (rim[..., 2:, 1:-1] - rim[..., :-2, 1:-1]) / 2
+    return torch.cat((images, right, down), 1)
+
+
+@torch.no_grad()
+def scene_flow(
+    points: Float[Tensor, "N 3"], shown: Bool[Tensor, "N V"], before: Instant, after: Instant
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """How points moved, in metres, and turned: rotation vectors.
+
+    Args:
+        points: on the surface, in the first instant.
+        shown: which views show them there.
+        before, after: the same views in their order; a camera may be cropped otherwise, but stands still.
+    """
+    if not len(points):
+        return torch.zeros_like(points), torch.zeros_like(points)
+    some, seen = points[::_EVERY], shown[::_EVERY]
+    grid, (index, view) = _Grid.around(points), seen.nonzero().unbind(-1)
+    moved = points.new_zeros(3, *grid.shape)
+    from_, _ = _seen(some[index], view, before.cameras)
+    for (level, was), (_, now) in zip(_pyramid(before.images), _pyramid(after.images), strict=True):
+        colors = sample(was, view, from_ / level.smaller)
+        maps = _with_slopes(now)
+        for _ in range(level.steps):
+            at = (some + grid.at(moved, some))[index]
+            equations = _equations(at, view, colors, maps, after.cameras, level.smaller)
+            sums = _spread(grid.summed(some[index], equations), level.spread)
+            moved = moved + _steps(sums)
+    return grid.at(moved, points), grid.at(_turns(moved), points)
+
+
+def _seen(
+    points: Float[Tensor, "n 3"], view: Int[Tensor, " n"], cameras: Cameras
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+    return project(points, cameras.intrinsics[view], cameras.extrinsics[view])
+
+
+def _equations(
+    points: Float[Tensor, "n 3"],
+    view: Int[Tensor, " n"],
+    colors: Float[Tensor, "n 3"],
+    maps: Float[Tensor, "V 9 h w"],
+    cameras: Cameras,
+    smaller: int,
+) -> Float[Tensor, "n 12"]:
+    """The normal equations of a step of each point in one view: a matrix and the right side."""
+    pixels, depth = _seen(points, view, cameras)
+    value, right, down = sample(maps, view, pixels / smaller).split(3, -1)
+    lens, pose = cameras.intrinsics[view], cameras.extrinsics[view]
+    inside = world_to_camera(points, pose)
+    across = torch.stack((right, down), -1) * (lens[:, [0, 1], [0, 1]] / depth[:, None])[:, None] / smaller
+    ahead = -(across * (inside[:, :2] / depth[:, None])[:, None]).sum(-1, keepdim=True)
+    slopes = torch.cat((across, ahead), -1) @ pose[:, :3, :3]
+    missing = colors - value
+    weights = 1 / (1 + (missing / _OUTLIER).square().sum(-1))
+    weighted = weights[:, None, None] * slopes
+    return torch.cat(((weighted.mT @ slopes).flatten(1), (weighted.mT @ missing[..., None])[..., 0]), 1)
+
+
+def _steps(sums: Float[Tensor, "12 z y x"]) -> Float[Tensor, "3 z y x"]:
+    shape = sums.shape[1:]
+    matrices, right = sums.flatten(1).mT.split((9, 3), 1)
+    matrices = matrices.reshape(-1, 3, 3)
+    still = _STILL + _STIFF * matrices.diagonal(dim1=1, dim2=2).mean(1)
+    matrices = matrices + still[:, None, None] * torch.eye(3, dtype=sums.dtype, device=sums.device)
+    steps = torch.linalg.solve_ex(matrices, right).result
+    length = steps.norm(dim=1, keepdim=True)
+    return (steps * (_LONGEST / length.clamp(min=_LONGEST))).mT.reshape(3, *shape)
+
+
+def _turns(moved: Float[Tensor, "3 z y x"]) -> Float[Tensor, "3 z y x"]:
+    """Half the curl."""
+    slopes = torch.gradient(moved, spacing=_CELL, dim=(3, 2, 1))
+    x, y, z = 0, 1, 2
+    turns = [slopes[b][c] - slopes[c][b] for b, c in ((y, z), (z, x), (x, y))]
+    return torch.stack(turns) / 2

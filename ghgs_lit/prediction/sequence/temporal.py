@@ -1,0 +1,174 @@
+"""Instants that start from the last: Gaussians move with the photographs and are predicted anew now and then.
+
+A body moves little from one instant to the next, and a rig not at all. So the Gaussians of the last instant
+follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few gradient steps on the inputs' renders,
+whose optimiser goes on over the instants, take back what flow leaves and what light changes (the streams of
+Luiten et al., 3DV 2024, begin with an optimised scene; these with a prediction). What appears is seen by the
+renders: where they no longer fit the photographs, and every few instants, all is predicted anew.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.projection import at_least_float32, project, unproject_maps
+from ghgs_lit.geometry.rotations import multiply_quaternions
+from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.scene_flow import Instant, scene_flow
+from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.prediction.refinement.refinement import Change, Descent, Renderer, seen_by
+from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
+
+#: Metres behind the rendered surface up to which a view shows a Gaussian.
+_SHOWN = 0.03
+#: Steps at each instant. They may go farther than those of a single one: an error of the flow is larger than
+#: that of a prediction.
+_STEPS = 3
+_CHANGES = {
+    "means": Change(10.0, 0.1),
+    "scales": Change(1.0, 0.02),
+    "opacities": Change(2.0, 0.04),
+    "colors": Change(0.1, 0.004),
+}
+#: Of L1 and of the silhouettes' L1; without SSIM, which takes as long as the renders.
+_WEIGHTS = (0.8, 0.0, 0.1)
+#: Times the inputs' error after a new prediction at which Gaussians no longer fit.
+_WORSE = 1.5
+
+
+@dataclass(frozen=True)
+class _Last:
+    """The last instant: its batch, its prediction, and the depth [1, V, 1, H, W] of its inputs' renders."""
+
+    batch: Batch
+    prediction: Prediction
+    depth: Tensor
+
+
+class Temporal:
+    """``temporal(batch)``: the prediction of each instant of a sequence in turn.
+
+    An instant that equals the last one has the same prediction, bit for bit.
+
+    Args:
+        predict: gives the prediction of a batch of one subject, as a model does.
+        every: of so many instants the first is predicted anew; 1: all are, and nothing is kept.
+        renderer: draws the inputs, with gradients.
+
+    Attributes:
+        anew: how many instants were predicted anew.
+    """
+
+    def __init__(self, predict: Callable[[Batch], Prediction], every: int, renderer: Renderer):
+        self.predict, self.every, self.renderer = predict, every, renderer
+        self.anew = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last instant: the next one has nothing to do with it."""
+        self._last: _Last | None = None
+        self._age, self._error = 0, math.inf
+
+    @torch.no_grad()
+    def __call__(self, batch: Batch) -> Prediction:
+        last = self._last
+        if self.every == 1:
+            self.anew += 1
+            return self.predict(batch)
+        if last is not None and _are_equal(last.batch, batch):
+            return last.prediction
+        if last is not None and last.batch.views == batch.views and self._age + 1 < self.every:
+            self._descent.start = _moved(self._descent.start, last, batch)
+            found, error = self._improved(last.prediction, batch)
+            if error <= _WORSE * self._error:
+                self._age += 1
+                return found
+        prediction = self.predict(batch)
+        self.anew, self._age = self.anew + 1, 0
+        self._descent = Descent(prediction.gaussians, batch, _CHANGES)
+        found, self._error = self._improved(prediction, batch)
+        return found
+
+    def _improved(self, prediction: Prediction, batch: Batch) -> tuple[Prediction, float]:
+        """The prediction after some steps, and the error of its inputs before the last one."""
+        photographs, silhouettes, cameras = seen_by(batch, range(batch.images.shape[1]))
+        for _ in range(_STEPS):
+            drawn = self._descent.step(self.renderer, photographs, silhouettes, cameras, _WEIGHTS)
+        masks, depth = batch.masks[:, :, None], drawn.depth.detach()
+        error = ((drawn.image - photographs).abs() * masks).sum() / (3 * masks.sum()).clamp(min=1)
+        found = _as_drawn(prediction, self._descent.gaussians, batch, depth[:, :, 0])
+        self._last = _Last(batch, found, depth)
+        return found, float(error)
+
+
+def _are_equal(first: Batch, second: Batch) -> bool:
+    """Whether two instants have the same photographs, mattes and cameras."""
+    pairs = [(first.images, second.images), (coverage(first), coverage(second))]
+    for name in ("intrinsics", "extrinsics"):
+        pairs.append((getattr(first.cameras, name), getattr(second.cameras, name)))
+    return all(torch.equal(one, other) for one, other in pairs)
+
+
+def _moved(gaussians: Gaussians, last: _Last, batch: Batch) -> Gaussians:
+    """Gaussians that go where those of the last instant went."""
+    seen = last.prediction.gaussians
+    metre = 1.0 if seen.metre is None else float(seen.metre[0])
+    # Near the origin and in metres: the world may be anywhere, and have any unit.
+    origin = seen.means.double().mean(0)
+    points = ((seen.means.double() - origin) / metre).to(at_least_float32(batch.images))
+    before, after = (
+        Instant(at_least_float32(on_black(each))[0], _around(each.cameras, origin, metre).to(points.dtype))
+        for each in (last.batch, batch)
+    )
+    shown = _shown(points, before.cameras, (last.depth[0] / metre).to(points))
+    moved, turned = scene_flow(points, shown, before, after)
+    half = torch.cat((torch.ones_like(turned[:, :1]), turned / 2), -1)
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means + (metre * moved).to(gaussians.means),
+        quaternions=multiply_quaternions(unit(half).to(gaussians.quaternions), gaussians.quaternions),
+    )
+
+
+def _around(cameras: Cameras, origin: Float[Tensor, " 3"], metre: float) -> Cameras:
+    """The cameras [V] of one element in metres around a point of the world."""
+    extrinsics = cameras.extrinsics[0].double().clone()
+    extrinsics[:, :3, 3] = (extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]) / metre
+    return dataclasses.replace(cameras, intrinsics=cameras.intrinsics[0], extrinsics=extrinsics)
+
+
+def _shown(
+    points: Float[Tensor, "N 3"], cameras: Cameras, depth: Float[Tensor, "V 1 H W"]
+) -> Bool[Tensor, "N V"]:
+    """Which views show points: those whose rendered surface is not before them."""
+    lens, pose = cameras.intrinsics[:, None], cameras.extrinsics[:, None]
+    pixels, z = project(points.expand(len(depth), -1, -1), lens, pose)
+    view = torch.arange(len(depth), device=z.device)[:, None].expand(z.shape)
+    return ((z - sample(depth, view, pixels)[..., 0]).abs() < _SHOWN).mT
+
+
+def _as_drawn(
+    prediction: Prediction, gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "1 V H W"]
+) -> Prediction:
+    """A prediction with other Gaussians, and with the depths of their renders."""
+    valid = batch.masks & (depth > 0)
+    depth = torch.where(valid, depth, 1)
+    pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
+    points = dataclasses.replace(prediction.points, pixels=pixels, valid=valid)
+    maps = dataclasses.replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
+    return dataclasses.replace(
+        prediction,
+        gaussians=gaussians,
+        depth=depth,
+        depth_valid=valid,
+        points=points,
+        depth_maps=maps,
+        rounds=(),
+        drafts=(),
+    )

@@ -1,0 +1,138 @@
+"""Instants that start from the last: they follow, and begin anew where they must."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from ghgs_lit.metrics.functional import psnr
+from ghgs_lit.prediction.sequence.temporal import Temporal
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Cameras
+from tests.helpers.motion import BETWEEN, at_true_depth, instant, motion, photographed
+
+RENDERER = Renderer(backend="cpu")
+
+
+def counted():
+    """A prediction that notes the batches that it is asked for."""
+    asked = []
+
+    def predict(batch):
+        asked.append(batch)
+        return at_true_depth(batch)
+
+    return predict, asked
+
+
+def quality(prediction, moved):
+    image = RENDERER(prediction.gaussians, BETWEEN).image[0]
+    return float(psnr(image.clamp(0, 1), photographed(BETWEEN, moved)[0][0]).mean())
+
+
+def steps(count):
+    """A subject that walks and turns."""
+    return [motion((0.006 * n, 0.0, 0.004 * n), (0.0, 0.02 * n, 0.0)) for n in range(count)]
+
+
+def test_gaussians_follow_the_subject_without_another_prediction():
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    found = [temporal(instant(moved)) for moved in steps(6)]
+    assert len(asked) == temporal.anew == 1
+    for prediction, moved in zip(found[1:], steps(6)[1:], strict=True):
+        by_itself = quality(at_true_depth(instant(moved)), moved)
+        assert quality(prediction, moved) > by_itself - 1.0
+    assert quality(found[0], steps(6)[5]) < quality(found[5], steps(6)[5]) - 2
+
+
+def test_depths_and_points_are_those_of_the_instant():
+    temporal = Temporal(at_true_depth, 99, RENDERER)
+    *_, last = (temporal(instant(moved)) for moved in steps(4))
+    batch = instant(steps(4)[3])
+    assert last.depth_valid.sum() > 0.97 * batch.masks.sum()
+    off = (last.depth - batch.depths)[last.depth_valid].abs()
+    assert off.median() < 0.03  # these splats are round: one sees through to what lies behind
+    assert torch.equal(last.depth_valid, last.points.valid)
+    assert not (last.depth_valid & ~batch.masks).any()
+
+
+def test_an_instant_that_equals_the_last_has_the_same_bits():
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    first, second, third = (temporal(instant(motion())) for _ in range(3))
+    assert first is second is third
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_every_so_many_instants_one_is_predicted_anew(every):
+    predict, asked = counted()
+    temporal = Temporal(predict, every, RENDERER)
+    for moved in steps(7):
+        temporal(instant(moved))
+    assert temporal.anew == len(asked) == (7 if every == 1 else 3)
+
+
+def test_every_instant_by_itself_is_the_prediction_as_it_is():
+    temporal, batch = Temporal(at_true_depth, 1, RENDERER), instant(motion())
+    assert torch.equal(temporal(batch).gaussians.means, at_true_depth(batch).gaussians.means)
+    assert temporal(batch) is not temporal(batch)
+
+
+def test_a_jump_is_predicted_anew():
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    for shift in (0.0, 0.005, 0.5, 0.505):
+        last = temporal(instant(motion((shift, 0.0, 0.0))))
+    assert [float(b.depths.max()) for b in asked] == [
+        float(instant(motion((shift, 0.0, 0.0))).depths.max()) for shift in (0.0, 0.5)
+    ]
+    there = motion((0.505, 0.0, 0.0))
+    assert quality(last, there) > quality(at_true_depth(instant(there)), there) - 1
+
+
+def test_a_camera_that_is_missing_for_an_instant_is_predicted_without_it_and_with_it_again():
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    whole = [instant(moved) for moved in steps(4)]
+    for batch in (whole[0], whole[1].of_views([0, 1, 3]), whole[2].of_views([0, 1, 3]), whole[3]):
+        temporal(batch)
+    assert [b.masks.shape[1] for b in asked] == [4, 3, 4]
+
+
+def test_what_was_forgotten_is_predicted_anew():
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    temporal(instant(motion()))
+    temporal.reset()
+    temporal(instant(motion()))
+    assert len(asked) == 2
+
+
+def test_unit_and_origin_of_the_world_do_not_matter():
+    """A world in millimetres, a kilometre away."""
+    shift = torch.tensor([1e3, -5e2, 2e2], dtype=torch.float64)
+
+    def elsewhere(batch):
+        extrinsics = batch.cameras.extrinsics.double().clone()
+        extrinsics[..., :3, 3] -= (extrinsics[..., :3, :3] @ shift[:, None])[..., 0]
+        extrinsics[..., :3, 3] *= 1e3
+        cameras = Cameras(
+            batch.cameras.intrinsics.double(), extrinsics, batch.cameras.height, batch.cameras.width
+        )
+        return dataclasses.replace(batch, cameras=cameras)
+
+    def predict(batch):
+        found = at_true_depth(dataclasses.replace(batch, cameras=instant(motion()).cameras))
+        g = found.gaussians
+        means = 1e3 * (g.means.double() + shift)
+        g = dataclasses.replace(g, means=means, scales=1e3 * g.scales, metre=torch.tensor([1e3]))
+        return dataclasses.replace(found, gaussians=g)
+
+    here, there = Temporal(at_true_depth, 99, RENDERER), Temporal(predict, 99, RENDERER)
+    for moved in steps(3):
+        one, other = here(instant(moved)), there(elsewhere(instant(moved)))
+    assert there.anew == 1
+    back = other.gaussians.means / 1e3 - shift
+    assert (back - one.gaussians.means).abs().mean() < 1e-4
