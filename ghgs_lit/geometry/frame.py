@@ -44,6 +44,12 @@ class Frame:
             origin = subject_center(batch.masks, cameras)
             return cls(origin, _axes(cameras), _size(batch.masks, cameras, origin) / HEIGHT)
 
+    @property
+    def shared(self) -> "Frame":
+        """One frame for elements of one world: at their mean place, by their median size."""
+        one = (self.origin.mean(0), self.axes[0], self.metre.median())
+        return Frame(*(each.expand(len(self.metre), *each.shape) for each in one))
+
     @torch.no_grad()
     def enter(self, batch: Batch) -> Batch:
         """The batch as the stages see it: its input cameras are in the frame, in the photographs' precision.

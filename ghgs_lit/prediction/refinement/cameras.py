@@ -69,11 +69,18 @@ class CameraRefinement:
             keeps its cameras from the first round on that does not make its photographs agree better.
         predict: gives the Gaussians of a batch, as a model does.
         renderer: draws them, with gradients.
+        shared: the elements of a batch are instants of one rig, whose cameras move alike in all of them.
     """
 
-    def __init__(self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer):
+    def __init__(
+        self,
+        rounds: int,
+        predict: Callable[[Batch], Prediction],
+        renderer: Renderer,
+        shared: bool = False,
+    ):
         require(rounds >= 1, "refine_cameras", "1 or more rounds", rounds)
-        self.rounds, self.predict, self.renderer = rounds, predict, renderer
+        self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
 
     def __call__(self, batch: Batch) -> Batch:
         """The batch with corrected cameras; targets stay as they are.
@@ -81,7 +88,7 @@ class CameraRefinement:
         Args:
             batch: photographs, masks and cameras, of two views or more.
         """
-        frame = Frame.of(batch)
+        frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
         inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
             with torch.no_grad():
@@ -103,7 +110,7 @@ class CameraRefinement:
 
         The third is which cameras may be wrong: all, but where silhouettes and prediction agree on a few.
         """
-        cameras, free, distance = coherent_cameras(batch)
+        cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
@@ -119,7 +126,12 @@ class CameraRefinement:
     def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
         """The loss of the rounds with the cameras as they are."""
         views = _views(self.predict(batch), batch)
-        return _loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
+        return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
+
+    def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Float[Tensor, " B"]:
+        """:func:`_loss`, or its mean over the instants."""
+        loss = _loss(drawn, views, batch)
+        return loss.mean().expand(len(loss)) if self.shared else loss
 
     def _corrected(
         self,
@@ -132,22 +144,23 @@ class CameraRefinement:
         cameras, losses = batch.cameras, []
         views = _views(prediction, batch)
         axes = cameras.extrinsics[..., 2, :3]
-        raw = torch.zeros(*axes.shape[:2], 6, dtype=axes.dtype, device=axes.device, requires_grad=True)
+        rigs = 1 if self.shared else len(axes)
+        raw = torch.zeros(rigs, axes.shape[1], 6, dtype=axes.dtype, device=axes.device, requires_grad=True)
         # Without an epsilon: gradients shrink with the size of the photographs.
         optimizer = torch.optim.Adam([raw], lr=_RATE, betas=(0.8, 0.95), eps=1e-15)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
         for _ in range(_STEPS):
             with torch.autocast(axes.device.type, enabled=False), torch.enable_grad():
-                motion = _of_free(raw, axes, free)
+                motion = _of_free(raw.expand(len(axes), -1, -1), axes, free)
                 drawn = self.renderer(_moved(views, motion), views.cameras, background=0.0)
-                losses.append(_loss(drawn, views, batch))
+                losses.append(self._loss(drawn, views, batch))
                 optimizer.zero_grad()
                 (losses[-1].sum() + _STAY * motion.square().sum()).backward()
                 optimizer.step()
             schedule.step()
         is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
         with torch.autocast(axes.device.type, enabled=False):
-            motion = _of_free(raw.detach(), axes, free)
+            motion = _of_free(raw.detach().expand(len(axes), -1, -1), axes, free)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
         corrected = dataclasses.replace(cameras, extrinsics=extrinsics)
         return _chosen(is_better[:, None] & free, corrected, cameras), is_better

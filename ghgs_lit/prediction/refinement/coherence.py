@@ -10,32 +10,24 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 from itertools import combinations
+from operator import add
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.frame import HEIGHT
+from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.motion import after_motions, without_common
-from ghgs_lit.geometry.outlines import signed_distance, soft_signed_distance
-from ghgs_lit.geometry.projection import pixel_centers, project, unproject, world_to_camera
-from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.projection import project, unproject, world_to_camera
+from ghgs_lit.prediction.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.types import Batch, Cameras
 
-#: Depths along a ray, and size of the distance maps over that of the photographs.
-_DEPTHS, _FINER = 48, 4
-#: Farther than this from an outline, in pixels, distances are all the same.
-_FAR = 20.0
-#: Pixels inside their outline whose rays are tried: from, and to.
-_FROM, _TO = 0.25, 8.0
-#: Of a look: size of the maps, pixels inside outlines to which rays are tried, and of how many one is.
-_CAREFUL, _QUICK = (_FINER, _TO, 1), (1, 1.5, 2)
-#: Half the width in pixels over which a slope of a distance map is taken.
-_REACH = 0.75
+#: Depths along a ray.
+_DEPTHS = 48
 #: Mean distance in pixels of rays near outlines below which silhouettes explain one another.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
@@ -72,88 +64,25 @@ class _Phase:
         return (r < 0) * self.scale / r.abs().clamp(min=self.scale)
 
 
-_MEET, _LIE = _Phase(12, _TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=True)
-
-
-@dataclass(frozen=True)
-class _Outlines:
-    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it.
-
-    Ray ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside the outline."""
-
-    maps: Float[Tensor, "V 1 h w"]
-    view: Int[Tensor, " R"]
-    pixels: Float[Tensor, "R 2"]
-    depth: Float[Tensor, " R"]
-    size: tuple[int, int]
-    finer: int = _FINER
-
-    @classmethod
-    def of(cls, mattes: Float[Tensor, "V H W"], look: tuple[int, float, int] = _CAREFUL) -> "_Outlines":
-        (finer, to, every), size = look, (mattes.shape[1], mattes.shape[2])
-        larger = F.interpolate(mattes[:, None], scale_factor=finer, mode="bilinear", align_corners=False)
-        distance = soft_signed_distance if finer == 1 else lambda matte: signed_distance(matte > 0.5)
-        maps = torch.from_numpy(np.stack([distance(one) for one in larger[:, 0].numpy()]))[:, None] / finer
-        maps = maps.clamp(-_FAR, _FAR).to(mattes)
-        view = torch.arange(len(mattes))[:, None, None].expand(-1, *size)
-        pixels = pixel_centers(*size, mattes).expand(*view.shape, 2)
-        depth = sample(maps, view, finer * pixels)[..., 0]
-        near = (depth >= _FROM) & (depth <= to)
-        return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
-
-    def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
-        """Distances at pixels; beyond the photograph those of its border, where a subject may go on."""
-        height, width = self.size
-        half = 0.5 / self.finer
-        within = [
-            side.clamp(half, whole - half)
-            for side, whole in zip(pixels.unbind(-1), (width, height), strict=True)
-        ]
-        return sample(self.maps, view, self.finer * torch.stack(within, -1))[..., 0]
-
-    def along(
-        self,
-        view: int,
-        lens: Float[Tensor, "3 3"],
-        pose: Float[Tensor, "4 4"],
-        start: Float[Tensor, "3"],
-        ahead: Float[Tensor, "R 3"],
-        depths: Float[Tensor, " D"],
-    ) -> Float[Tensor, "R D"]:
-        """Distances in one silhouette at ``start + depth * ahead``."""
-        # From -1 to 1 over the photograph; what is seen of a ray is a ratio of two lines.
-        height, width = self.size
-        onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
-        first, slope = onto @ (pose[:3, :3] @ start + pose[:3, 3]), ahead @ (onto @ pose[:3, :3]).mT
-        x, y, z = (first[axis] + slope[:, axis, None] * depths for axis in range(3))
-        z = torch.where(z > 0, z, 1)
-        places = torch.stack((x / z, y / z), -1)[None]
-        return F.grid_sample(self.maps[view : view + 1], places, padding_mode="border", align_corners=False)[
-            0, 0
-        ]
-
-    def slopes(self, view: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
-        steps = _REACH * torch.eye(2).to(pixels)
-        return torch.stack(
-            [(self.at(view, pixels + step) - self.at(view, pixels - step)) / (2 * _REACH) for step in steps],
-            -1,
-        )
+_MEET, _LIE = _Phase(12, TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=True)
 
 
 @dataclass(frozen=True)
 class _Alignment:
-    """Cameras after some steps of those that are ``free``, and the mean distance of rays before each step."""
+    """Cameras after some steps of those that are ``free``, and the mean distance of rays before each step.
 
-    lens: Float[Tensor, "V 3 3"]
+    Crops of ``K`` instants have lenses of their own, which zoom alike."""
+
+    lens: Float[Tensor, "K V 3 3"]
     pose: Float[Tensor, "V 4 4"]
     free: Bool[Tensor, " V"]
     distances: tuple[float, ...] = ()
 
-    def after(self, phase: _Phase, outlines: _Outlines) -> "_Alignment":
+    def after(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
         """The same after the steps of a phase."""
         found = self
         for _ in range(phase.steps):
-            equations = _equations(outlines, found.lens, found.pose, phase)
+            equations = silhouettes.equations(found.lens, found.pose, phase)
             steps, are_all = equations.solved(self.free), bool(self.free.all())
             moved = _stepped(steps, found.lens, found.pose, are_all)
             found = _Alignment(*moved, self.free, (*found.distances, equations.distance))
@@ -164,7 +93,7 @@ class _Alignment:
 
         Growth is that of a focal length, which is only known beside those of the others: then all are free.
         """
-        scale, before = (each.lens[:, 0, 0] / each.pose[:, 2, 3] for each in (self, start))
+        scale, before = (each.lens[0, :, 0, 0] / each.pose[:, 2, 3] for each in (self, start))
         seen, was = (s[:, None] * each.pose[:, :2, 3] for s, each in ((scale, self), (before, start)))
         growth = HEIGHT / 2 * before * (scale / before).log().abs()
         return bool(((seen - was).norm(dim=-1) > growth)[self.free].all())
@@ -177,14 +106,16 @@ def contradiction(batch: Batch) -> Float[Tensor, " B"]:
     """
     parts, found = (coverage(batch), batch.cameras.intrinsics, batch.cameras.extrinsics), []
     for mattes, lens, pose in zip(*(part.float().cpu() for part in parts), strict=True):
-        outlines = _Outlines.of(mattes, _QUICK)
+        outlines = Outlines.of(mattes, QUICK)
         depth = _best_points(outlines, lens, pose, outlines.view, outlines.pixels)[2]
         found.append(-depth.clamp(max=0).sum() / max(len(depth), 1))
     return torch.stack(found)
 
 
 @torch.no_grad()
-def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
+def coherent_cameras(
+    batch: Batch, shared: bool = False
+) -> tuple[Cameras, Bool[Tensor, "B V"], Float[Tensor, " B"]]:
     """Cameras whose silhouettes explain one another; those of an element whose silhouettes do already stay.
 
     Where moving a minority of the cameras explains the silhouettes as well as moving all, the others stay.
@@ -197,45 +128,52 @@ def coherent_cameras(batch: Batch) -> tuple[Cameras, Bool[Tensor, "B V"], Float[
 
     Args:
         batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
+        shared: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
     """
     cameras = batch.cameras
     parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)
     # A small problem of many short steps, and distances to outlines are computed on a CPU.
-    elements = zip(*(part.float().cpu() for part in parts), strict=True)
+    mattes, lens, pose = (part.float().cpu() for part in parts)
+    middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
+    each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
     with torch.autocast("cpu", enabled=False):
-        lenses, poses, free, distances = zip(*(_coherent(*element) for element in elements), strict=True)
+        rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part]) for part in each]
+    lenses, poses, free, distances = zip(*rigs, strict=True)
+    count, device = len(pose) // len(rigs), batch.masks.device
+    poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
     moved = dataclasses.replace(
         cameras,
-        intrinsics=torch.stack(lenses).to(cameras.intrinsics),
-        extrinsics=torch.stack(poses).to(cameras.extrinsics),
+        intrinsics=torch.cat(lenses).to(cameras.intrinsics),
+        extrinsics=poses.to(cameras.extrinsics),
     )
-    device = batch.masks.device
-    return moved, torch.stack(free).to(device), torch.tensor(distances, device=device)
+    return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
 
 
 def _coherent(
-    mattes: Float[Tensor, "V H W"],
-    lens: Float[Tensor, "V 3 3"],
+    mattes: Float[Tensor, "K V H W"],
+    lens: Float[Tensor, "K V 3 3"],
     pose: Float[Tensor, "V 4 4"],
-) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"], Bool[Tensor, " V"], float]:
-    """Of one element: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
-    outlines, every = _Outlines.of(mattes), torch.ones(len(pose), dtype=torch.bool)
-    if not len(outlines.depth):
+    middle: Float[Tensor, "K 3"],
+) -> tuple[Float[Tensor, "K V 3 3"], Float[Tensor, "V 4 4"], Bool[Tensor, " V"], float]:
+    """Of one rig: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
+    silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
+    every = torch.ones(len(pose), dtype=torch.bool)
+    if not any(len(outlines.depth) for outlines in silhouettes.outlines):
         return lens, pose, every, math.inf
-    given = _equations(outlines, lens, pose, _MEET)
+    given = silhouettes.equations(lens, pose, _MEET)
     if given.distance < _COHERENT:
         return lens, pose, every, given.distance
     start = _Alignment(lens, pose, every)
-    found = start.after(_MEET, outlines)
+    found = start.after(_MEET, silhouettes)
     is_telling = len(pose) >= _TELLING
     enough = max(_AS_WELL * found.distances[-1], _COHERENT if is_telling else 0.1 * _COHERENT)
     for free in _minorities(given, len(pose)) if given.distance > _BUMPED else ():
-        few = _Alignment(lens, pose, free).after(_MEET, outlines)
+        few = _Alignment(lens, pose, free).after(_MEET, silhouettes)
         rest = _REST * given.distance if is_telling and free.sum() == 1 else 0.0
         if few.distances[-1] < max(enough, rest) and few.shows_motions_from(start):
             found = few
             break
-    found = found.after(_LIE, outlines)
+    found = found.after(_LIE, silhouettes)
     return found.lens, found.pose, found.free, given.distance
 
 
@@ -255,7 +193,16 @@ class _Equations:
 
     normal: Float[Tensor, "n n"]
     right: Float[Tensor, " n"]
-    distance: float
+    rays: int
+    total: float
+
+    @property
+    def distance(self) -> float:
+        return self.total / max(self.rays, 1)
+
+    def __add__(self, other: "_Equations") -> "_Equations":
+        sums = (getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(self))
+        return _Equations(*sums)
 
     def solved(self, free: Bool[Tensor, " V"]) -> Float[Tensor, "V 7"]:
         """The step of the free cameras; that of the others is 0."""
@@ -268,50 +215,73 @@ class _Equations:
         return float((self.solved(free).flatten() * self.right).sum())
 
 
+@dataclass(frozen=True)
+class _Silhouettes:
+    """Those of each instant, and where its subject is in the frame."""
+
+    outlines: tuple[Outlines, ...]
+    middle: Float[Tensor, "K 3"]
+
+    def equations(
+        self, lens: Float[Tensor, "K V 3 3"], pose: Float[Tensor, "V 4 4"], phase: _Phase
+    ) -> "_Equations":
+        """The sum over the instants."""
+        pixel = _pixel(lens, pose)
+        parts = zip(self.outlines, lens, self.middle, strict=True)
+        return reduce(add, (_equations(*part, pose, phase, pixel) for part in parts))
+
+
 def _equations(
-    outlines: _Outlines, lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"], phase: _Phase
+    outlines: Outlines,
+    lens: Float[Tensor, "V 3 3"],
+    middle: Float[Tensor, " 3"],
+    pose: Float[Tensor, "V 4 4"],
+    phase: _Phase,
+    pixel: Float[Tensor, ""],
 ) -> _Equations:
-    """The unknowns are motions and zooms of all cameras, each in about a pixel."""
+    """The unknowns are motions about the frame's origin and zooms of all cameras, each in about a pixel."""
     count = len(pose)
+    # Rays are searched around the subject's middle.
+    pose = after_motions(pose, F.pad(middle, (3, 0)).expand(count, 6), pose.new_zeros(3))
     near = outlines.depth <= phase.to
     view, depth_at_home = outlines.view[near], outlines.depth[near]
     points, other, depth = _best_points(outlines, lens, pose, view, outlines.pixels[near])
     distances = phase.distances(depth, depth_at_home)
     rays = max(len(distances), 1)
-    gradients = _gradients(outlines, lens, pose, points, other) / _pixel(lens, pose)
+    gradients = _gradients(outlines, lens, pose, points, other) / pixel
     jacobian = gradients.new_zeros(len(gradients), count, 7)
     index = torch.arange(len(gradients))
-    jacobian[index, other] = _rows(points, gradients, pose[other])
-    jacobian[index, view] -= _rows(points, gradients, pose[view])
+    jacobian[index, other] = _rows(points, gradients, pose[other], middle)
+    jacobian[index, view] -= _rows(points, gradients, pose[view], middle)
     jacobian = jacobian.flatten(1)
     weighted = phase.weights(distances)[:, None] * jacobian
     stay = _STAY * rays * torch.tensor([*[1.0] * 6, _KNOWN]).to(gradients).repeat(count)
     normal = weighted.mT @ jacobian + stay.diag()
-    return _Equations(normal, -(weighted.mT @ distances), float(distances.abs().sum() / rays))
+    return _Equations(normal, -(weighted.mT @ distances), len(distances), float(distances.abs().sum()))
 
 
-def _pixel(lens: Float[Tensor, "V 3 3"], pose: Float[Tensor, "V 4 4"]) -> Float[Tensor, ""]:
+def _pixel(lens: Float[Tensor, "K V 3 3"], pose: Float[Tensor, "V 4 4"]) -> Float[Tensor, ""]:
     """Pixels of half a height of the subject."""
-    return HEIGHT / 2 * (lens[:, 0, 0] / pose[:, 2, 3]).mean()
+    return HEIGHT / 2 * (lens[..., 0, 0] / pose[:, 2, 3]).mean()
 
 
 def _stepped(
     steps: Float[Tensor, "V 7"],
-    lens: Float[Tensor, "V 3 3"],
+    lens: Float[Tensor, "K V 3 3"],
     pose: Float[Tensor, "V 4 4"],
     are_all_free: bool,
-) -> tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]]:
+) -> tuple[Float[Tensor, "K V 3 3"], Float[Tensor, "V 4 4"]]:
     """Intrinsics and extrinsics after a step; where all cameras are free they move beside one another."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
     if are_all_free:
         motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
     zoomed = lens.clone()
-    zoomed[:, [0, 1], [0, 1]] *= zooms.exp()
+    zoomed[..., [0, 1], [0, 1]] *= zooms.exp()
     return zoomed, after_motions(pose, motions, pose.new_zeros(3), HEIGHT / 2)
 
 
 def _best_points(
-    outlines: _Outlines,
+    outlines: Outlines,
     lens: Float[Tensor, "V 3 3"],
     pose: Float[Tensor, "V 4 4"],
     view: Int[Tensor, " R"],
@@ -343,7 +313,7 @@ def _best_points(
 
 
 def _gradients(
-    outlines: _Outlines,
+    outlines: Outlines,
     lens: Float[Tensor, "V 3 3"],
     pose: Float[Tensor, "V 4 4"],
     points: Float[Tensor, "R 3"],
@@ -359,13 +329,16 @@ def _gradients(
 
 
 def _rows(
-    points: Float[Tensor, "R 3"], gradients: Float[Tensor, "R 3"], pose: Float[Tensor, "R 4 4"]
+    points: Float[Tensor, "R 3"],
+    gradients: Float[Tensor, "R 3"],
+    pose: Float[Tensor, "R 4 4"],
+    middle: Float[Tensor, " 3"],
 ) -> Float[Tensor, "R 7"]:
     """Derivatives of the distances by small changes of a camera.
 
-    These are rotation vectors of the points, their shifts in half heights, and the logarithm of the focal
-    length, which moves points away from the optical axis.
+    These are rotation vectors of the points, which lie around ``middle``, their shifts in half heights, and
+    the logarithm of the focal length, which moves points away from the optical axis.
     """
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
-    return torch.cat((torch.linalg.cross(points, gradients), HEIGHT / 2 * gradients, zoom), -1)
+    return torch.cat((torch.linalg.cross(points + middle, gradients), HEIGHT / 2 * gradients, zoom), -1)

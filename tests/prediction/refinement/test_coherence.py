@@ -10,6 +10,7 @@ from ghgs_lit.geometry.motion import after_motions, rigid, without_common
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.prediction.refinement import coherence
 from ghgs_lit.prediction.refinement.coherence import coherent_cameras, contradiction
+from ghgs_lit.prediction.refinement.outlines import Outlines
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import CENTER, ellipsoid, off, ring
 
@@ -163,10 +164,11 @@ def test_gradients_are_those_of_finite_differences():
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
     u, v = torch.meshgrid(torch.arange(4 * 126.0), torch.arange(4 * 126.0), indexing="xy")
     ramps = torch.stack([a * u + b * v for a, b in ((0.1, 0.0), (0.0, 0.1), (0.05, 0.1), (0.1, -0.02))])
-    outlines = coherence._Outlines(ramps[:, None], None, None, None, (126, 126))
+    outlines = Outlines(ramps[:, None], None, None, None, (126, 126))
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
-    rows = coherence._rows(points, coherence._gradients(outlines, lens, pose, points, other), pose[other])
+    gradients = coherence._gradients(outlines, lens, pose, points, other)
+    rows = coherence._rows(points, gradients, pose[other], torch.zeros(3))
 
     def distances(step):
         rotation, shift = rigid(step[:6], HEIGHT / 2)
@@ -245,7 +247,7 @@ def test_a_wrong_focal_length_comes_back(zoomed):
 def test_a_ray_is_looked_up_in_the_other_silhouettes():
     """The depth is the least one in the others, at a point of the ray that no other point of it beats."""
     truth = figure()
-    outlines = coherence._Outlines.of(truth.alpha[0])
+    outlines = Outlines.of(truth.alpha[0])
     lens, pose = truth.cameras.intrinsics[0], truth.cameras.extrinsics[0]
     view, pixels = outlines.view[::23], outlines.pixels[::23]
     points, other, depth = coherence._best_points(outlines, lens, pose, view, pixels)

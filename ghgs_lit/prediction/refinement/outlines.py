@@ -1,0 +1,89 @@
+"""Outlines of the silhouettes of one instant, as maps of distances, and the rays that pass near them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghgs_lit.geometry.outlines import signed_distance, soft_signed_distance
+from ghgs_lit.geometry.projection import pixel_centers
+from ghgs_lit.geometry.sampling import sample
+
+#: Size of the distance maps over that of the photographs.
+_FINER = 4
+#: Farther than this from an outline, in pixels, distances are all the same.
+_FAR = 20.0
+#: Pixels inside their outline whose rays are tried: from, and to.
+_FROM, TO = 0.25, 8.0
+#: Of a look: size of the maps, pixels inside outlines to which rays are tried, and of how many one is.
+CAREFUL, QUICK = (_FINER, TO, 1), (1, 1.5, 2)
+#: Half the width in pixels over which a slope of a distance map is taken.
+_REACH = 0.75
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Signed distances in pixels to the outline of each silhouette, above 0 inside, and the rays near it.
+
+    Ray ``r`` passes ``pixels[r]`` of silhouette ``view[r]``, ``depth[r]`` pixels inside the outline."""
+
+    maps: Float[Tensor, "V 1 h w"]
+    view: Int[Tensor, " R"]
+    pixels: Float[Tensor, "R 2"]
+    depth: Float[Tensor, " R"]
+    size: tuple[int, int]
+    finer: int = _FINER
+
+    @classmethod
+    def of(cls, mattes: Float[Tensor, "V H W"], look: tuple[int, float, int] = CAREFUL) -> "Outlines":
+        (finer, to, every), size = look, (mattes.shape[1], mattes.shape[2])
+        larger = F.interpolate(mattes[:, None], scale_factor=finer, mode="bilinear", align_corners=False)
+        distance = soft_signed_distance if finer == 1 else lambda matte: signed_distance(matte > 0.5)
+        maps = torch.from_numpy(np.stack([distance(one) for one in larger[:, 0].numpy()]))[:, None] / finer
+        maps = maps.clamp(-_FAR, _FAR).to(mattes)
+        view = torch.arange(len(mattes))[:, None, None].expand(-1, *size)
+        pixels = pixel_centers(*size, mattes).expand(*view.shape, 2)
+        depth = sample(maps, view, finer * pixels)[..., 0]
+        near = (depth >= _FROM) & (depth <= to)
+        return cls(maps, *(each[near][::every] for each in (view, pixels, depth)), size, finer)
+
+    def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
+        """Distances at pixels; beyond the photograph those of its border, where a subject may go on."""
+        height, width = self.size
+        half = 0.5 / self.finer
+        within = [
+            side.clamp(half, whole - half)
+            for side, whole in zip(pixels.unbind(-1), (width, height), strict=True)
+        ]
+        return sample(self.maps, view, self.finer * torch.stack(within, -1))[..., 0]
+
+    def along(
+        self,
+        view: int,
+        lens: Float[Tensor, "3 3"],
+        pose: Float[Tensor, "4 4"],
+        start: Float[Tensor, "3"],
+        ahead: Float[Tensor, "R 3"],
+        depths: Float[Tensor, " D"],
+    ) -> Float[Tensor, "R D"]:
+        """Distances in one silhouette at ``start + depth * ahead``."""
+        # From -1 to 1 over the photograph; what is seen of a ray is a ratio of two lines.
+        height, width = self.size
+        onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
+        first, slope = onto @ (pose[:3, :3] @ start + pose[:3, 3]), ahead @ (onto @ pose[:3, :3]).mT
+        x, y, z = (first[axis] + slope[:, axis, None] * depths for axis in range(3))
+        z = torch.where(z > 0, z, 1)
+        places = torch.stack((x / z, y / z), -1)[None]
+        return F.grid_sample(self.maps[view : view + 1], places, padding_mode="border", align_corners=False)[
+            0, 0
+        ]
+
+    def slopes(self, view: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
+        steps = _REACH * torch.eye(2).to(pixels)
+        return torch.stack(
+            [(self.at(view, pixels + step) - self.at(view, pixels - step)) / (2 * _REACH) for step in steps],
+            -1,
+        )
