@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import binary_dilation
 
 from ghgs_lit.cli.photographs import check_cameras
 from ghgs_lit.cli.predict import captures_of
@@ -87,7 +88,8 @@ def test_videos_are_read_in_order(place):
     for camera, photograph in enumerate(first):
         assert photograph.matte.shape == (SIDE, SIDE)
         assert (photograph.mask ^ FIGURE.masks[camera]).mean() < 0.01
-        assert (photograph.matte[:8] == 0).all()  # coding leaves no haze
+        beside = ~binary_dilation(FIGURE.masks[camera], iterations=3)
+        assert (photograph.matte[beside] == 0).all()  # coding leaves no haze
 
 
 @pytest.mark.parametrize(
@@ -364,11 +366,11 @@ def test_cameras_that_are_exchanged_half_way(place, capsys):
         one, other = ([*frames(camera)] for camera in (0, 1))
         write_video(place / folder / "cam0.mp4", one[:3] + other[3:])
         write_video(place / folder / "cam1.mp4", other[:3] + one[3:])
-    check_cameras(opened(place))
+    check_cameras(opened(place, sequence={"step": 3}))
     out = capsys.readouterr().out
     assert "cameras and masks agree" in out
     wrong = [line for line in out.splitlines() if "cameras do not fit" in line]
-    assert [line.split()[1] for line in wrong] == ["000004:", "000005:"]
+    assert [line.split()[1] for line in wrong] == ["000003:"]
     assert all("cam0 and cam1 are exchanged" in line for line in wrong)
     with pytest.raises(InputError, match="cam0 and cam1 are exchanged"):
         check_cameras(opened(place, sequence={"start": 4}))
