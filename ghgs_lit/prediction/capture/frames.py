@@ -49,9 +49,14 @@ class VideoFrame:
     def matte(self, pixels: Pixels) -> np.ndarray:
         """[h, w] uint8, where ``masks`` has it. InputError: it is missing or has another size."""
         if isinstance(self.masks, Reader):
-            grey = self.masks.frame(self.number)
-            place, expected = str(self.masks.video.path), f"the size of its video, {pixels.size}"
-            require(grey.shape == pixels.size, place, f"{expected} (height, width)", grey.shape)
+            known, drawn = self.video.video.numbers, self.masks.video.numbers
+            # Masks that were drawn of frame after frame know of none that the camera dropped.
+            number = (
+                self.number if len(known) != len(drawn) else int(drawn[np.searchsorted(known, self.number)])
+            )
+            grey, place = self.masks.frame(number), str(self.masks.video.path)
+            expected = f"the size of its video, {pixels.size} (height, width)"
+            require(grey.shape == pixels.size, place, expected, grey.shape)
             return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
         path = self.masks.get(self.number)
         require(path is not None, str(self), "a mask of this number", "none")
@@ -117,11 +122,9 @@ def find_frames(
         numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
     else:
         numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
-    counts = {name: video.count for name, video in videos.items()}
-    note = ""
-    if len(set(counts.values())) > 1:
-        each = ", ".join(f"{name} {count}" for name, count in counts.items())
-        note = f"videos differ in length ({each} frames): the {len(numbers)} instants that all show are used"
+    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
+    differ = len({video.count for video in videos.values()}) > 1
+    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
     readers = {name: Reader(video, "rgb24", step) for name, video in videos.items()}
     mattes = {name: _masks_of(video, folder, masks, step) for name, video in videos.items()}
     known = {name: set(video.numbers.tolist()) for name, video in videos.items()}
@@ -133,7 +136,7 @@ def find_frames(
         }
         for instant, shown in numbers.items()
     }
-    return instants, note
+    return instants, note if differ else ""
 
 
 def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:
@@ -200,17 +203,19 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> Read
         if spelled in videos:
             return Reader(read_video(videos[spelled]), "gray", step)
         if masks is not None and (place / spelled).is_dir():
-            return _numbered(place / spelled, video.count)
+            return _numbered(place / spelled, video)
     expected = f"a video {name} or a folder of it"
     require(masks is None, str(masks), expected, "none")
     return None
 
 
-def _numbered(folder: Path, count: int) -> dict[int, Path]:
+def _numbered(folder: Path, video: Video) -> dict[int, Path]:
     """Images by the number of their frame; programs count them from 0 or from 1."""
     digits = {"".join(filter(str.isdigit, name)): path for name, path in images_in(folder).items()}
     numbered = {int(number): path for number, path in digits.items() if number}
-    from_one = count in numbered
-    expected = f"masks numbered from 0 to {count - 1} or from 1 to {count}"
+    if len(numbered) == len(video.numbers):
+        return dict(zip(video.numbers.tolist(), (numbered[n] for n in sorted(numbered)), strict=True))
+    from_one = video.count in numbered
+    expected = f"masks numbered from 0 to {video.count - 1} or from 1 to {video.count}"
     require(from_one != (0 in numbered), str(folder), expected, f"{len(numbered)} masks")
     return {number - from_one: path for number, path in numbered.items()}

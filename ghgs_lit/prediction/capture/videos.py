@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import require_file
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
-# ffmpeg says on stderr when each frame that it writes is shown, and writes every one just once.
+# ffmpeg says on stderr when each frame that it writes is shown.
 _TELL = "metadata=add:key=k:value=v,metadata=print"
 _TIME = re.compile(r"pts_time:(\S+)")
 _SIZE = re.compile(r"Output #0.*?Video:.*? (\d+)x(\d+)[ ,]", re.DOTALL)
 # Colours as they were before they were coded: without it green is a level too dark.
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
-# How framecrc lists a packet that says no time, and the flag of one that is not shown.
-_UNTIMED, _HIDDEN = -(2**63), 4
+# How framecrc lists a packet that says no time, and one that is not shown.
+_UNTIMED, _HIDDEN = -(2**63), re.compile("F=0x[4-7]")
 #: Seconds of a video that are decoded for nothing before it is sought in.
 _PATIENCE = 10.0
 # Seconds until a decoder that says nothing of its frames is given up.
@@ -56,12 +56,6 @@ class Video:
         """Frames a second; 1 where there is one frame."""
         return (self.count - 1) / (self.seconds[-1] - self.seconds[0]) if self.count > 1 else 1.0
 
-    @property
-    def is_steady(self) -> bool:
-        """Whether frames follow one another evenly, so that their times say which they are."""
-        even = self.seconds[0] + self.numbers / self.rate
-        return bool(np.abs(self.seconds - even).max() < 0.25 / self.rate)
-
     def number_at(self, seconds: float) -> int | None:
         """The frame that is shown at a time; None: there is none within half a frame."""
         place = int(nearest(self.seconds, np.array([seconds]))[0])
@@ -91,29 +85,20 @@ def _read_video(path: Path, changed: int) -> Video:
     time, size = _TIME.search(told), _SIZE.search(told)
     listing = [*_source(path), "-c", "copy", "-f", "framecrc", "-"]
     listed = subprocess.run(listing, capture_output=True).stdout.decode().splitlines()
-    times = [_times(line) for line in listed if line[:1].isdigit()]
-    times = np.array(times, np.int64).reshape(-1, 3)
-    times = times[times[:, 2] & _HIDDEN == 0]
-    if time is None or size is None or not len(times):
+    packets = [line.split(",")[1:3] for line in listed if line[:1].isdigit() and not _HIDDEN.search(line)]
+    decoded, shown = np.array(packets, np.int64).reshape(-1, 2).T
+    if time is None or size is None or not packets:
         found = told.strip().splitlines()[-1:] or ["no output of ffmpeg"]
         raise InputError(f"{path}: expected a video with frames that ffmpeg can decode; found {found[0]}")
     unit = next(Fraction(line.split(":")[1].strip()) for line in listed if line.startswith("#tb"))
-    is_timed = times[:, 1].min() > _UNTIMED
-    seconds = np.sort(times[:, 1] if is_timed else times[:, 0]) * float(unit)
+    is_timed = shown.min() > _UNTIMED
+    seconds = np.sort(shown if is_timed else decoded) * float(unit)
     if not is_timed:  # packets of AVI are in the order of decoding: frames follow later
         seconds += float(time[1]) - seconds[0]
     steps = np.diff(seconds)
-    usual = float(np.median(steps)) if len(steps) else 1.0
-    steps = np.rint(steps / usual).clip(1) if usual > 0 else np.ones(len(steps))
-    numbers = np.concatenate(([0], np.cumsum(steps))).astype(np.int64)
+    usual = max(float(np.median(steps)), 1e-6) if len(steps) else 1.0
+    numbers = np.cumsum([0, *np.rint(steps / usual).clip(1)]).astype(np.int64)
     return Video(path, (int(size[2]), int(size[1])), seconds, numbers)
-
-
-def _times(line: str) -> tuple[int, int, int]:
-    """Times of decoding and of showing of a packet in framecrc's unit, and its flags."""
-    _, decoded, shown, *rest = (part.strip() for part in line.split(","))
-    flags = next((part[2:] for part in rest if part.startswith("F=")), "0x1")
-    return int(decoded), int(shown), int(flags, 16)
 
 
 def _source(path: Path, seek: float = 0.0) -> list[str]:
@@ -129,22 +114,9 @@ def _source(path: Path, seek: float = 0.0) -> list[str]:
 
 
 def _command(path: Path, pixels: str, *options: str, select: str = "1", seek: float = 0.0) -> list[str]:
-    filters = f"select='{select}',{_TELL}"
-    output = [
-        "-vf",
-        filters,
-        "-fps_mode",
-        "passthrough",
-        "-sws_flags",
-        _EXACT,
-        *options,
-        "-pix_fmt",
-        pixels,
-        "-f",
-        "rawvideo",
-        "-",
-    ]
-    return [*_source(path, seek), *output]
+    filters = ["-vf", f"select='{select}',{_TELL}", "-sws_flags", _EXACT]
+    output = ["-fps_mode", "passthrough", *options, "-pix_fmt", pixels, "-f", "rawvideo", "-"]
+    return [*_source(path, seek), *filters, *output]
 
 
 class Reader:
@@ -171,17 +143,16 @@ class Reader:
                 self._open(number)
             while self._at < number and self._advance():
                 pass
-            if self._at != number:
-                raise InputError(
-                    f"{self.video.path}: expected a frame {number} that ffmpeg can decode; found none"
-                )
+            expected = f"a frame {number} that ffmpeg can decode"
+            require(self._at == number, str(self.video.path), expected, "none")
             return self._frame
 
     def _open(self, number: int) -> None:
         video, select = self.video, "1"
         place = min(np.searchsorted(video.numbers, number), len(video.numbers) - 1)
         time, length = float(video.seconds[place]), 1 / video.rate
-        if self.step > 1 and video.is_steady:
+        uneven = np.abs(video.seconds - video.seconds[0] - video.numbers * length).max()
+        if self.step > 1 and uneven < length / 4:
             select = f"lt(mod(t-{time - length / 2:.6f},{self.step * length:.9f}),{length:.6f})"
         seek = time - float(video.seconds[0]) - 1.0
         if self._end is not None:

@@ -3,11 +3,13 @@
 import csv
 import re
 import shutil
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 import torch
+from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
@@ -123,6 +125,16 @@ def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
         assert number_of(reader.frame(number)) == number
 
 
+def test_frames_that_were_cut_off_do_not_count(tmp_path):
+    """A phone that cuts a video leaves the frames before in its file, and says that they are not shown."""
+    write_video(tmp_path / "whole.mp4", frames_of(0), codec="libx264")
+    cut = [get_ffmpeg_exe(), "-v", "error", "-ss", "0.15", "-i", tmp_path / "whole.mp4"]
+    subprocess.run([*cut, "-c", "copy", tmp_path / "cut.mp4"], check=True)
+    video = read_video(tmp_path / "cut.mp4")
+    reader = Reader(video, "gray")
+    assert [number_of(reader.frame(n)) for n in range(video.count)] == list(range(2, FRAMES))
+
+
 def test_a_long_video_is_sought(tmp_path):
     """Also where one frame of many is decoded at a time."""
     rng = np.random.default_rng(0)
@@ -143,6 +155,17 @@ def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
         f"{n:06d}": alike(n, [name for name in FIGURE.names if n != 2 or name != "cam1"])
         for n in range(FRAMES)
     }
+
+
+def test_masks_of_the_frames_that_there_are(place):
+    """Drawn of one after another they know of no dropped frame: masks of other frames are no use."""
+    keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
+    write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
+    drawn = [np.roll(mask(1), 2 * number, 0) for number in range(FRAMES)]
+    write_video(place / "masks" / "cam1.mp4", drawn[:2] + drawn[3:])
+    for number in (1, 3, 5):
+        found = {p.name: p.mask for p in opened(place).photographs(f"{number:06d}")}
+        assert (found["cam1"] ^ (drawn[number] > 127)).mean() < 0.01
 
 
 def test_videos_of_different_length(place, capsys):
