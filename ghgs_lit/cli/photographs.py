@@ -79,7 +79,7 @@ def check_cameras(folder: CaptureFolder) -> None:
         if len(parts) > 1:
             print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
         if not diagnosis.consistent and last:
-            print(f"instant {name}: cameras do not fit: {'; '.join(diagnosis.lines)}", flush=True)
+            print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
     sound = [diagnosis for diagnosis in found.values() if diagnosis.consistent]
     for diagnosis in (sound or list(found.values()))[:1]:
         require_consistent(diagnosis)

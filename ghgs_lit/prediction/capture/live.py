@@ -91,24 +91,27 @@ def _arriving(
     clock: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> Iterator[tuple[Capture, int]]:
-    done, dropped, before, last = "", 0, {}, clock()
+    done, before, unread, last = (0, ""), {}, {}, clock()
     while idle is None or clock() - last < idle:
         folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
-        sizes = {name: [_sizes(place / name) for place in places] for name in folders if name > done}
-        whole = [name for name, found in sizes.items() if before.get(name) == found and is_whole(name)]
-        before = sizes
-        if not whole:
+        sizes = {name: [_sizes(place / name) for place in places] for name in folders if _order(name) > done}
+        still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
+        newest, before = max(filter(is_whole, still), key=_order, default=None), sizes
+        if newest is None:
             sleep(_POLL)
             continue
-        done, last = max(whole), clock()
-        dropped += sum(name < done for name in sizes)
         try:
-            capture = read(done)
-        except InputError:
-            dropped += 1
+            capture = read(newest)
+        except InputError:  # until its files change: masks may come later
+            unread[newest] = sizes[newest]
             continue
-        yield capture, dropped
-        dropped = 0
+        done, last = _order(newest), clock()
+        yield capture, sum(_order(name) < done for name in sizes)
+
+
+def _order(name: str) -> tuple[int, str]:
+    """By which numbers follow one another, whether zeros are before them or not."""
+    return len(name), name
 
 
 def _sizes(folder: Path) -> dict[str, int]:

@@ -59,15 +59,19 @@ def cut(place, instant, name):
     return plan
 
 
+def wait():
+    """A plan: nothing."""
+
+
 def arriving(place, time):
     return live_frames(place / "images", place / "cameras.json", idle=0.5, clock=time.clock, sleep=time.sleep)
 
 
 def test_an_instant_counts_when_it_is_whole(source):
-    """Not before the last camera's photograph is there, nor while a file of it grows."""
+    """Not before the last camera's photograph and mask are there, nor while a file of it grows."""
     half = [f"cam{v}{end}" for v in (0, 1, 2) for end in (".png", "_mask.png")]
-    time = Time(put(source, "000", *half), lambda: None, lambda: None, cut(source, "000", "cam3.png"))
-    time.plans += [put(source, "000")]
+    time = Time(put(source, "000", *half), wait, wait, put(source, "000", "cam3.png"), wait, wait)
+    time.plans += [cut(source, "000", "cam3.png"), put(source, "000")]
     frames = arriving(source, time)
     capture, dropped = next(frames)
     assert (capture.name, dropped, len(capture.photographs)) == ("000", 0, 4)
@@ -76,19 +80,22 @@ def test_an_instant_counts_when_it_is_whole(source):
 
 
 def test_instants_that_come_while_one_is_in_use_are_dropped(source):
-    """The newest is taken; one that cannot be read is dropped, too, and later ones come."""
-    put(source, "000")()
+    """The newest that can be read is taken; one that cannot be is dropped, too, when later ones come."""
+    put(source, "8")()
     frames = arriving(source, Time())
-    assert next(frames)[0].name == "000"
-    for instant in ("001", "002", "003"):
+    assert next(frames)[0].name == "8"
+    for instant in ("9", "10", "11"):
         put(source, instant)()
     capture, dropped = next(frames)
-    assert (capture.name, dropped) == ("003", 2)
-    cut(source, "004", "cam1.png")()
+    assert (capture.name, dropped) == ("11", 2)
+    cut(source, "12", "cam1.png")()
     assert list(frames) == []
-    frames = arriving(source, Time(lambda: None, put(source, "005")))
+    frames = arriving(source, Time())
     capture, dropped = next(frames)
-    assert (capture.name, dropped) == ("005", 5)
+    assert (capture.name, dropped) == ("11", 3)
+    put(source, "13")()
+    capture, dropped = next(frames)
+    assert (capture.name, dropped) == ("13", 1)
 
 
 def test_videos_play_at_their_rate(source):

@@ -384,7 +384,7 @@ def test_photographs_are_not_synchronised(place):
 def test_cameras_that_are_exchanged_half_way(place, capsys):
     """The first half is right: what follows is said, with which of them, and nothing is refused."""
     check_cameras(opened(place))
-    assert "cameras do not fit" not in capsys.readouterr().out
+    assert "masks do not fit" not in capsys.readouterr().out
     for folder, frames in (("images", frames_of), ("masks", lambda camera: [mask(camera)] * FRAMES)):
         one, other = ([*frames(camera)] for camera in (0, 1))
         write_video(place / folder / "cam0.mp4", one[:3] + other[3:])
@@ -392,7 +392,7 @@ def test_cameras_that_are_exchanged_half_way(place, capsys):
     check_cameras(opened(place, sequence={"step": 3}))
     out = capsys.readouterr().out
     assert "cameras and masks agree" in out
-    wrong = [line for line in out.splitlines() if "cameras do not fit" in line]
+    wrong = [line for line in out.splitlines() if "masks do not fit" in line]
     assert [line.split()[1] for line in wrong] == ["000003:"]
     assert all("cam0 and cam1 are exchanged" in line for line in wrong)
     with pytest.raises(InputError, match="cam0 and cam1 are exchanged"):
