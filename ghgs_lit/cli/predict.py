@@ -153,7 +153,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
     if left_out:
-        print(f"{left_out} instants left out", flush=True)
+        print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
 
 
 def advice_of(directory: Path) -> Iterator[str]:

@@ -189,8 +189,8 @@ class CaptureFolder:
                 self.missing[instant][name] = str(error)
         missing = self.missing[instant] if len(self.instants) > 1 else {}
         why = "; ".join(f"{name}: {text}" for name, text in missing.items())
-        enough = not missing or len(found) >= ENOUGH
-        require(enough, f"{self.images}: {instant}", f"{ENOUGH} photographs or more", f"{len(found)} ({why})")
+        least, why = (ENOUGH, f"{len(found)} ({why})") if missing else (2, len(found))
+        require(len(found) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
         return found
 
     def begin(self, instant: str) -> None:
