@@ -151,8 +151,8 @@ class CaptureFolder:
     @property
     def input_files(self) -> list[Path]:
         """The files that may be read, such as photographs with what lies beside them, and the calibration."""
-        photographs = (path for paths in self.paths.values() for path in paths.values())
-        folders = {path.parent for path in photographs}
+        sources, videos = (path for paths in self.paths.values() for path in paths.values()), self.images
+        folders = {path.parent if isinstance(path, Path) else Path(videos).expanduser() for path in sources}
         given = (self.cameras, self.masks, self.backgrounds)
         given = [Path(path).expanduser() for path in given if path is not None]
         files = [path for folder in folders for path in folder.iterdir()]
@@ -256,7 +256,7 @@ class CaptureFolder:
             return pixels.alpha
         raise InputError(
             f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
-            f" segment=rembg, {path.stem}_mask beside the photograph, or an alpha channel; found none"
+            f" segment=rembg, <name>_mask beside the photograph, or an alpha channel; found none"
         )
 
 

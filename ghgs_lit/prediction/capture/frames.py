@@ -12,7 +12,14 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera, calibrate
 from ghgs_lit.prediction.capture.masks import matte_of_file
-from ghgs_lit.prediction.capture.photographs import MASK_ENDING, Pixels, by_camera, composed, images_in
+from ghgs_lit.prediction.capture.photographs import (
+    MASK_ENDING,
+    Pixels,
+    by_camera,
+    composed,
+    image_named,
+    images_in,
+)
 from ghgs_lit.prediction.capture.videos import SUFFIXES, Reader, Video, nearest, read_video
 from ghgs_lit.readers import read_rows
 
@@ -31,16 +38,6 @@ class VideoFrame:
 
     def __str__(self) -> str:
         return f"{self.video.video.path}, frame {self.number}"
-
-    @property
-    def parent(self) -> Path:
-        """The folder of the video."""
-        return self.video.video.path.parent
-
-    @property
-    def stem(self) -> str:
-        """The name of the video."""
-        return self.video.video.path.stem
 
     def pixels(self) -> Pixels:
         """The frame. InputError: it cannot be decoded."""
@@ -63,25 +60,13 @@ class VideoFrame:
         return matte_of_file(path, pixels)
 
 
-def videos_in(folder: Path) -> dict[str, Path]:
-    """Videos of a folder by name without suffix, sorted, masks among them included. InputError: two of them
-    have one name."""
-    paths: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
-            name = composed(path.stem)
-            require(name not in paths, str(path), "one video for each camera", str(paths.get(name)))
-            paths[name] = path
-    return paths
-
-
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
     """Whether a folder is one of videos: it holds one of a camera, or nothing else."""
-    videos = videos_in(folder)
-    if not videos or images_in(folder):
+    if not folder.is_dir() or images_in(folder):
         return False
+    videos = images_in(folder, SUFFIXES)
     is_known = any(names.get(name, name) in cameras for name in videos)
-    return is_known or not any(path.is_dir() for path in folder.iterdir())
+    return is_known or (bool(videos) and not any(path.is_dir() for path in folder.iterdir()))
 
 
 def find_frames(
@@ -109,8 +94,7 @@ def find_frames(
     Raises:
         InputError: videos and cameras, or videos and one another, do not fit together.
     """
-    listed = {name: path for name, path in videos_in(folder).items() if not name.endswith(MASK_ENDING)}
-    paths = by_camera(folder, listed, cameras, names)
+    paths = by_camera(folder, images_in(folder, SUFFIXES), cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():
@@ -145,16 +129,12 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
     require(not unknown, "sequence.sync", f"cameras among {', '.join(videos)}", unknown)
     wrong = {name: value for name, value in offsets.items() if type(value) is not int}
     require(not wrong, "sequence.sync", "whole numbers of frames", wrong)
-    first, *others = videos
+    rates = {name: round(video.rate, 4) for name, video in videos.items() if video.count > 1}
     length = min(video.count for video in videos.values())
-    for other in others:
-        drift = abs(videos[other].rate / videos[first].rate - 1) * length
-        if min(videos[other].count, videos[first].count) > 1 and drift > 0.5:
-            rates = ", ".join(f"{name} {video.rate:.4g}" for name, video in videos.items())
-            raise InputError(
-                f"{videos[other].path}: expected as many frames a second as the others, or"
-                f" sequence.sync=<CSV of camera,frame,seconds>; found {rates}"
-            )
+    drift = (max(rates.values(), default=1) / min(rates.values(), default=1) - 1) * length
+    expected = "as many frames a second of all, or the path of a CSV with camera,frame,seconds"
+    require(drift < 0.5, "sequence.sync", expected, rates)
+    first = next(iter(videos))
     shift = {name: offsets.get(name, 0) - offsets.get(first, 0) for name in videos}
     begin = max(-n for n in shift.values())
     end = min(video.count - shift[name] for name, video in videos.items())
@@ -196,17 +176,18 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> Reader | dict[int, Path] | None:
+    """Where the masks of a video are."""
     name, place = composed(video.path.stem), folder if masks is None else masks
-    beside = place.resolve() == folder.resolve()
-    videos = videos_in(place)
-    for spelled in (f"{name}{MASK_ENDING}",) if beside else (name, f"{name}{MASK_ENDING}"):
-        if spelled in videos:
-            return Reader(read_video(videos[spelled]), "gray", step)
-        if masks is not None and (place / spelled).is_dir():
-            return _numbered(place / spelled, video)
-    expected = f"a video {name} or a folder of it"
-    require(masks is None, str(masks), expected, "none")
-    return None
+    marked = f"{name}{MASK_ENDING}"
+    names = (marked,) if place.resolve() == folder.resolve() else (name, marked)
+    path = image_named(place, *names, suffixes=SUFFIXES)
+    if path is not None:
+        return Reader(read_video(path), "gray", step)
+    if masks is None:
+        return None
+    below = next((place / spelled for spelled in names if (place / spelled).is_dir()), None)
+    require(below is not None, str(masks), f"a video {name} or a folder of it", "none")
+    return _numbered(below, video)
 
 
 def _numbered(folder: Path, video: Video) -> dict[int, Path]:

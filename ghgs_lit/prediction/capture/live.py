@@ -11,8 +11,8 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats import read_cameras
-from ghgs_lit.prediction.capture.frames import videos_in
 from ghgs_lit.prediction.capture.photographs import composed, images_in
+from ghgs_lit.prediction.capture.videos import SUFFIXES
 
 #: Seconds after which a folder is looked at again.
 _POLL = 0.02
@@ -44,7 +44,7 @@ def live_frames(
     """
     folder = Path(images).expanduser()
     require(folder.is_dir(), str(images), "a folder", "no such folder")
-    if videos_in(folder):
+    if images_in(folder, SUFFIXES):
         return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
     said = options.get("calibration", {})
     names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}

@@ -84,12 +84,12 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def images_in(folder: Path) -> dict[str, Path]:
+def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
     """Photographs of a folder by name without suffix, sorted; masks beside them are left out. InputError: two
     of them have one name."""
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not path.is_dir()
+        is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
         if not is_image or path.stem.endswith(MASK_ENDING):
             continue
         name = composed(path.stem)
@@ -98,10 +98,10 @@ def images_in(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def image_named(folder: Path, *names: str) -> Path | None:
+def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
     """The image of a folder with one of these names (without suffix), None where there is none."""
     paths = _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
-    keys = ((composed(name), suffix) for name in names for suffix in SUFFIXES)
+    keys = ((composed(name), suffix) for name in names for suffix in suffixes)
     return next((paths[key] for key in keys if key in paths), None)
 
 

@@ -54,7 +54,8 @@ class Video:
     @property
     def rate(self) -> float:
         """Frames a second; 1 where there is one frame."""
-        return (self.count - 1) / (self.seconds[-1] - self.seconds[0]) if self.count > 1 else 1.0
+        length = max(float(self.seconds[-1] - self.seconds[0]), 1e-6)
+        return (self.count - 1) / length if self.count > 1 else 1.0
 
     def number_at(self, seconds: float) -> int | None:
         """The frame that is shown at a time; None: there is none within half a frame."""
