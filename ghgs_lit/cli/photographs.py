@@ -17,7 +17,9 @@ _VIDEO_SIDE = 720
 #: The folder that is being read, if any.
 _BEGUN: list[CaptureFolder] = []
 
-_SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration")
+_SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration", "sequence")
+#: How many instants of a sequence the check of cameras looks at.
+_CHECKED = 5
 
 
 def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
@@ -28,7 +30,7 @@ def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
     """
     for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
         require(config[name] is not None, name, example, None)
-    folder = CaptureFolder(**{name: config[name] for name in _SOURCES})
+    folder = CaptureFolder(**{name: config[name] for name in _SOURCES if name in config})
     return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 
@@ -54,6 +56,34 @@ def require_consistent(diagnosis: "Diagnosis") -> None:
             "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"
             f" check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
         )
+
+
+def check_cameras(folder: CaptureFolder) -> None:
+    """Print how cameras and masks agree, in a few instants of a sequence, and which contradict.
+
+    Raises:
+        InputError: all contradict, or the only instant cannot be read.
+    """
+    from ghgs_lit.prediction.capture.camera_report import diagnose, in_parts
+
+    names, found = folder.instants, {}
+    last = len(names) - 1
+    for place in sorted({round(last * i / (_CHECKED - 1)) for i in range(_CHECKED)}):
+        try:
+            found[names[place]] = diagnose(folder, names[place])
+        except InputError:
+            if not last:
+                raise
+    for name, diagnosis in found.items():
+        parts = in_parts(diagnosis.ranking[0].views)
+        if len(parts) > 1:
+            print(f"instant {name}: masks of {', '.join(parts)} have two large parts, taken for one subject")
+        if not diagnosis.consistent and last:
+            print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
+    sound = [diagnosis for diagnosis in found.values() if diagnosis.consistent]
+    for diagnosis in (sound or list(found.values()))[:1]:
+        require_consistent(diagnosis)
+        print("\n".join(diagnosis.lines), flush=True)
 
 
 def fixed_camera(capture: "Capture") -> "Cameras":

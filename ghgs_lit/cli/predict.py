@@ -22,13 +22,12 @@ from ghgs_lit.cli.inputs import (
     pick_device,
     with_trained_data,
 )
-from ghgs_lit.cli.photographs import capture_folder, fixed_camera, require_consistent
+from ghgs_lit.cli.photographs import capture_folder, check_cameras, fixed_camera
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.model import GHGS
-from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
@@ -106,7 +105,10 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 
 
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
-    """Predict each instant of a folder of photographs; several get a folder each, and one video."""
+    """Predict each instant of a folder of photographs; several get a folder each, and one video.
+
+    InputError: none of them can be read.
+    """
     folder, options = capture_folder(config), output_options(config)
     several, inputs = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
@@ -116,16 +118,17 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     video = directory / "instants.mp4"
     expected = "no file, or one beside the instants of an earlier prediction"
     require(is_again or not (several and video.exists()), str(video), expected, "another file")
+    if folder.note:
+        print(folder.note, flush=True)
     if config["check_cameras"]:
-        diagnosis = diagnose(folder)
-        require_consistent(diagnosis)
-        print("\n".join(diagnosis.lines), flush=True)
+        check_cameras(folder)
     device = pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
     size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
     totals: dict[str, float] = {}
     camera: Cameras | None = None
     pictures: list[np.ndarray] = []
+    count = 0
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
     begin = time.perf_counter()
@@ -137,7 +140,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         if several and "mp4" in options.formats:
             camera = camera or fixed_camera(capture).to(device)
             pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))
-        if capture.name == folder.instants[0]:
+        count += 1
+        if count == 1:
             for line in advice_of(directories[capture.name]):
                 print(line, flush=True)
         for stage, value in seconds.items():
@@ -145,12 +149,16 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     if pictures:
         content = mp4_bytes(pictures, options.fps)
         write_atomically(video, lambda temporary: temporary.write_bytes(content))
+    left_out = len(folder.instants) - count
+    require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
     if several:
-        count, total = len(folder.instants), time.perf_counter() - begin
+        total = time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
         if model.skip.every > 1:
             print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
+    if left_out:
+        print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
 
 
 def advice_of(directory: Path) -> Iterator[str]:
@@ -177,17 +185,30 @@ def moved_line(moved: dict[str, float]) -> str:
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
-    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile."""
+    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile.
+
+    Of several instants those without enough photographs are left out; it prints what is missing.
+    """
     names = folder.instants
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])
         for name, after in zip(names, [*names[1:], None], strict=True):
             start = time.perf_counter()
-            capture = Capture(name, following.result())
+            photographs, missing = (), folder.missing[name]
+            try:
+                photographs = following.result()
+            except InputError as error:
+                if len(names) == 1:
+                    raise
+                print(f"instant {name} is left out: {error}", flush=True)
             waited = time.perf_counter() - start
             if after is not None:
                 following = pool.submit(folder.photographs, after)
-            yield capture, waited
+            if not photographs:
+                continue
+            for camera, why in missing.items() if len(names) > 1 else ():
+                print(f"instant {name} is without {camera}: {why}", flush=True)
+            yield Capture(name, photographs), waited
 
 
 def write_result(

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Count, Index, Options, Positive, Share, Side, Text
+from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Side, Text
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -35,6 +35,21 @@ class Calibration(Options):
     """Which pixels of a turned photograph the calibration is for."""
     names: Annotated[dict | None, Words("a mapping of photographs to cameras or null")] = None
     """Camera of a photograph with another name: {photograph: camera}."""
+
+
+class Sequence(Options):
+    """Which instants count, and how the videos of cameras fit together."""
+
+    group = "sequence"
+    start: int | None = 0
+    """Number of the first instant; negative: from the end."""
+    stop: int | None = None
+    """Number of the first one that no longer counts; negative: from the end."""
+    step: Count = 1
+    """Every so many of them."""
+    sync: Path | Annotated[dict, Words("a mapping of cameras to frames")] | None = None
+    """Of videos. null: their frames are numbered alike. {camera: frames} by which it began before the others.
+    A CSV (camera,frame,seconds): the frames nearest to those of the first camera."""
 
 
 class Turntable(Options):

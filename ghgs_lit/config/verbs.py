@@ -10,6 +10,7 @@ from ghgs_lit.config.nodes import (
     Miniature,
     PairedTest,
     PerScene,
+    Sequence,
     Texts,
     Timing,
     Turntable,
@@ -77,7 +78,7 @@ class Photographs(Options):
     """Photographs of one's own and their cameras."""
 
     images: Path | None = None
-    """Folder of photographs named after their cameras; of such folders: one for each instant."""
+    """Folder of photographs or videos named after their cameras; of such folders: one for each instant."""
     cameras: Path | None = None
     """Their calibration: JSON, transforms.json, COLMAP, YAML of OpenCV or EasyMocap, TOML of Pose2Sim."""
     masks: Path | None = None
@@ -131,6 +132,8 @@ class Predict(Photographs, Measured):
     """Gaussians in files are as large as the photographs' pixels: no gaps on larger screens."""
     turntable: Turntable = Turntable()
     """Pictures around the subject."""
+    sequence: Sequence = Sequence()
+    """Which instants count, and how the videos of cameras fit together."""
 
 
 class View(Predict):

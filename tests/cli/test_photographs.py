@@ -138,6 +138,39 @@ def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, 
     assert one == two
 
 
+def test_a_sequence_goes_on_where_an_instant_lacks_photographs(here, checkpoint, capsys):
+    """Three of four predict; two do not, which is said and counted. Of nothing else there is an error."""
+    for instant in ("000", "001", "002"):
+        cameras = Figure().write(here / "images" / instant)
+    for path in (here / "images" / "000" / "cam0.png", here / "images" / "001" / "cam1.png"):
+        path.write_bytes(b"broken")
+    (here / "images" / "001" / "cam3.png").unlink()
+    common = (
+        f"checkpoint={checkpoint}",
+        "formats=[ply]",
+        "turntable.frames=0",
+        "device=cpu",
+        "images=images",
+    )
+    assert ghgs("predict", f"cameras={cameras}", "out=splats", *common) == 0
+    out = capsys.readouterr().out
+    assert "instant 000 is without cam0: " in out
+    assert "instant 001 is left out: " in out
+    assert "2 instants, " in out
+    assert "left out: 1 of 3 instants\n" in out
+    reports = {p.parent.name: json.loads(p.read_text()) for p in (here / "splats").glob("*/report.json")}
+    assert {name: len(report["views"]) for name, report in reports.items()} == {"000": 3, "002": 4}
+    (here / "images" / "000" / "cam1.png").unlink()
+    assert ghgs("predict", f"cameras={cameras}", "out=none", "sequence.stop=2", *common) == 1
+    assert "images: expected an instant that can be read; found 'none of 2'" in capsys.readouterr().err
+    (here / "images" / "001" / "cam0.png").unlink()
+    for name in ("cam1", "cam2"):
+        (here / "images" / "000" / f"{name}.png").unlink(missing_ok=True)
+    (here / "images" / "000" / "cam0.png").unlink()
+    assert ghgs("predict", f"cameras={cameras}", "out=none", "sequence.stop=1", *common) == 1
+    assert "expected 2 photographs or more; found 1" in capsys.readouterr().err
+
+
 def test_wrong_cameras_are_refused_and_the_doctor_mends_them(here, checkpoint, capsys):
     """The doctor's picture and a calibration that fits without the option."""
     figure = Figure()

@@ -27,6 +27,8 @@ _MIDDLE = (0.3, 0.7)
 PERSON = (0.5, 2.5)
 # What photographs are resized by after a calibration.
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
+# A part of a mask is another person where it has this share of the largest part's area, or more.
+_PART = 1 / 3
 _UNITS = {"millimetres": 0.001, "centimetres": 0.01, "metres": 1.0, "kilometres": 1000.0}
 
 
@@ -139,7 +141,7 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
 def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
     """The photographs of an instant at a size at which many meanings can be tried."""
     views = []
-    for name, (camera, pixels, matte) in zip(folder.paths[instant], folder.decode(instant), strict=True):
+    for name, (camera, pixels, matte) in folder.decode(instant).items():
         height, width = pixels.size
         scale = min(_SIDE / max(height, width), 1)
         size = max(round(height * scale), 1), max(round(width * scale), 1)
@@ -149,6 +151,19 @@ def small_views(folder: CaptureFolder, instant: str) -> tuple[StoredView, ...]:
         mask = area_mask(np.ascontiguousarray(matte > 127), *size)
         views.append(StoredView(name, replace(camera, size=known), small, mask, folder.convention))
     return tuple(views)
+
+
+def in_parts(views: Sequence[StoredView]) -> list[str]:
+    """The photographs whose masks have a second large part, as two people have."""
+    from scipy import ndimage  # here: it takes time to import
+
+    found = []
+    for view in views:
+        regions, _ = ndimage.label(view.mask)
+        areas = np.sort(np.bincount(regions.ravel())[1:])
+        if len(areas) > 1 and areas[-2] >= _PART * areas[-1]:
+            found.append(view.name)
+    return found
 
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:

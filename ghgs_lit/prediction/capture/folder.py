@@ -1,14 +1,16 @@
-"""A folder of photographs with a calibration: one instant, or many."""
+"""A folder of photographs or videos with a calibration: one instant, or many."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ghgs_lit.config.nodes import Sequence
 from ghgs_lit.data.silhouettes import implausible
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.kernels.cores import allowed_cores
@@ -21,6 +23,7 @@ from ghgs_lit.prediction.capture.calibration import (
 )
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
+from ghgs_lit.prediction.capture.frames import VideoFrame, find_frames, has_videos
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
     Pixels,
@@ -35,6 +38,8 @@ if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     import torch
 
 EXIF = ("auto", "stored", "shown")
+#: Photographs that an instant needs where others of its are missing.
+ENOUGH = 3
 _CONVENTION = tuple(f.name for f in fields(Convention))
 
 
@@ -43,7 +48,8 @@ class CaptureFolder:
     """``folder.photographs(instant)`` for each of ``folder.instants``.
 
     Args:
-        images: folder of photographs named after their cameras; or of such folders, one for each instant.
+        images: folder of photographs named after their cameras; of such folders, one for each instant; or of
+            videos named after their cameras.
         cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`.
         masks: folder of masks, laid out and named as the photographs; None: ``backgrounds``, ``segment``,
             masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
@@ -52,6 +58,8 @@ class CaptureFolder:
         calibration: what the file does not say, or says wrongly: ``format``; the fields of
             :class:`Convention`; ``exif`` (:func:`fits_stored`); ``names``, the camera of a photograph whose
             name differs, as ``{photograph: camera}``. None and missing keys are as the format has it.
+        sequence: which instants count, and how videos fit together: the fields of
+            :class:`ghgs_lit.config.nodes.Sequence`.
 
     Raises:
         InputError: a folder or file is missing or wrong.
@@ -63,6 +71,7 @@ class CaptureFolder:
     backgrounds: str | Path | None = None
     segment: str | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
+    sequence: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         known = ("format", "exif", "names", *_CONVENTION)
@@ -80,7 +89,7 @@ class CaptureFolder:
         return default if value is None else value
 
     @functools.cached_property
-    def _begun(self) -> dict[str, list[Future]]:
+    def _begun(self) -> dict[str, dict[str, Future]]:
         """The views of one instant that are decoded, or are being decoded."""
         return {}
 
@@ -95,13 +104,44 @@ class CaptureFolder:
         said = {name: self._said(name, getattr(self.file.convention, name)) for name in _CONVENTION}
         return Convention(**said)
 
+    @property
+    def _part(self) -> Sequence:
+        return Sequence.read(self.sequence, "sequence")
+
     @functools.cached_property
-    def paths(self) -> dict[str, dict[str, Path]]:
-        """``{instant: {camera: path}}``."""
-        folder = Path(self.images).expanduser()
+    def _found(self) -> tuple[dict[str, dict[str, Path | VideoFrame]], str]:
+        """The photographs of all instants, and a line about what is left over."""
+        folder, cameras, part = Path(self.images).expanduser(), self.file.cameras, self._part
         # Numbers, too, are names of cameras.
         names = {composed(str(key)): composed(str(name)) for key, name in self._said("names", {}).items()}
-        return find_instants(folder, self.file.cameras, names)
+        if has_videos(folder, cameras, names):
+            masks = None if self.masks is None else Path(self.masks).expanduser()
+            return find_frames(folder, masks, cameras, names, self.convention, part.sync, part.step)
+        require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
+        return find_instants(folder, cameras, names), ""
+
+    @property
+    def note(self) -> str:
+        """A line about frames that are left over; empty where there are none."""
+        return self._found[1]
+
+    @functools.cached_property
+    def paths(self) -> dict[str, dict[str, Path | VideoFrame]]:
+        """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
+        found, part = self._found[0], self._part
+        names = list(found)[part.start : part.stop : part.step]
+        expected = f"a part of {len(found)} instants"
+        require(bool(names), "sequence.start", expected, f"none from {part.start} to {part.stop}")
+        return {name: found[name] for name in names}
+
+    @functools.cached_property
+    def missing(self) -> dict[str, dict[str, str]]:
+        """``{instant: {camera: why}}`` of photographs that are missing, or could not be read so far."""
+        cameras = dict.fromkeys(name for paths in self._found[0].values() for name in paths)
+        return {
+            instant: {name: "there is no photograph" for name in cameras if name not in paths}
+            for instant, paths in self.paths.items()
+        }
 
     @property
     def instants(self) -> list[str]:
@@ -111,27 +151,47 @@ class CaptureFolder:
     @property
     def input_files(self) -> list[Path]:
         """The files that may be read, such as photographs with what lies beside them, and the calibration."""
-        photographs = (path for paths in self.paths.values() for path in paths.values())
-        folders = {path.parent for path in photographs}
+        sources, videos = (path for paths in self.paths.values() for path in paths.values()), self.images
+        folders = {path.parent if isinstance(path, Path) else Path(videos).expanduser() for path in sources}
         given = (self.cameras, self.masks, self.backgrounds)
         given = [Path(path).expanduser() for path in given if path is not None]
         files = [path for folder in folders for path in folder.iterdir()]
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
     def photographs(self, instant: str) -> tuple[Photograph, ...]:
-        """The photographs of one instant, two or more. InputError: a photograph or mask is missing or
-        wrong."""
-        views = zip(self.paths[instant], self.decode(instant), strict=True)
+        """The photographs of one instant, two or more. InputError: as of :meth:`decode`."""
+        views = self.decode(instant)
         self._begun.clear()  # they take much memory
-        return tuple(self.photograph(name, *view, self.convention) for name, view in views)
+        upright = {n: partial(self.photograph, n, *view, self.convention) for n, view in views.items()}
+        return tuple(self._complete(instant, upright).values())
 
-    def decode(self, instant: str) -> list[tuple[StoredCamera, Pixels, np.ndarray]]:
+    def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied.
 
         They are kept until :meth:`photographs` has them, or those of another instant are decoded.
+
+        Raises:
+            InputError: a photograph or mask is missing or wrong; of several instants one may lack photographs
+                (:attr:`missing`) where three or more remain.
         """
         self.begin(instant)
-        return [view.result() for view in self._begun[instant]]
+        return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
+
+    def _complete(self, instant: str, views: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
+        """The values of all views, without those that cannot be had if the others are enough."""
+        found = {}
+        for name, view in views.items():
+            try:
+                found[name] = view()
+            except InputError as error:
+                if len(self.instants) == 1:
+                    raise
+                self.missing[instant][name] = str(error)
+        missing = self.missing[instant] if len(self.instants) > 1 else {}
+        why = "; ".join(f"{name}: {text}" for name, text in missing.items())
+        least, why = (ENOUGH, f"{len(found)} ({why})") if missing else (2, len(found))
+        require(len(found) >= least, f"{self.images}: {instant}", f"{least} photographs or more", why)
+        return found
 
     def begin(self, instant: str) -> None:
         """Decode the views of an instant in threads; :meth:`decode` waits for them."""
@@ -140,11 +200,14 @@ class CaptureFolder:
         self._begun.clear()
         # Segmentation has threads of its own, and one session.
         pool = ThreadPoolExecutor(allowed_cores() if self.segment is None else 1)
-        self._begun[instant] = [pool.submit(self._view, *view) for view in self.paths[instant].items()]
+        self._begun[instant] = {
+            name: pool.submit(self._view, name, path) for name, path in self.paths[instant].items()
+        }
         pool.shutdown(wait=False)
 
-    def _view(self, name: str, path: Path) -> tuple[StoredCamera, Pixels, np.ndarray]:
-        camera, pixels = self.file.cameras[name], read_pixels(path)
+    def _view(self, name: str, path: Path | VideoFrame) -> tuple[StoredCamera, Pixels, np.ndarray]:
+        camera = self.file.cameras[name]
+        pixels = path.pixels() if isinstance(path, VideoFrame) else read_pixels(path)
         matte = self._matte(name, camera, path, pixels)
         problem = implausible(matte > 127)
         if problem is not None:
@@ -169,9 +232,11 @@ class CaptureFolder:
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
         return Photograph(name, image, matte, calibration.intrinsics, calibration.extrinsics)
 
-    def _matte(self, name: str, camera: StoredCamera, path: Path, pixels: Pixels) -> np.ndarray:
+    def _matte(self, name: str, camera: StoredCamera, path: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
-        images = Path(self.images).expanduser()
+        images, is_frame = Path(self.images).expanduser(), isinstance(path, VideoFrame)
+        if is_frame and path.masks is not None:
+            return path.matte(pixels)
         if self.masks is not None:
             mask = mask_path(path, images, Path(self.masks).expanduser())
             require(mask is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
@@ -183,7 +248,7 @@ class CaptureFolder:
             return matte_of_background(pixels, background)
         if self.segment is not None:
             return _segmenter(self.segment)(pixels)
-        beside = mask_path(path, images, images)
+        beside = None if is_frame else mask_path(path, images, images)
         named = beside if beside is not None else camera.mask
         if named is not None:
             return matte_of_file(named, pixels)
@@ -191,7 +256,7 @@ class CaptureFolder:
             return pixels.alpha
         raise InputError(
             f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
-            f" segment=rembg, {path.stem}_mask.png beside the photograph, or an alpha channel; found none"
+            f" segment=rembg, <name>_mask beside the photograph, or an alpha channel; found none"
         )
 
 

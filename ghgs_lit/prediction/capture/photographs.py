@@ -84,12 +84,12 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def images_in(folder: Path) -> dict[str, Path]:
+def images_in(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> dict[str, Path]:
     """Photographs of a folder by name without suffix, sorted; masks beside them are left out. InputError: two
     of them have one name."""
     paths: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        is_image = path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not path.is_dir()
+        is_image = path.suffix.lower() in suffixes and not path.name.startswith(".") and not path.is_dir()
         if not is_image or path.stem.endswith(MASK_ENDING):
             continue
         name = composed(path.stem)
@@ -98,10 +98,10 @@ def images_in(folder: Path) -> dict[str, Path]:
     return paths
 
 
-def image_named(folder: Path, *names: str) -> Path | None:
+def image_named(folder: Path, *names: str, suffixes: tuple[str, ...] = SUFFIXES) -> Path | None:
     """The image of a folder with one of these names (without suffix), None where there is none."""
     paths = _listed(folder, folder.stat().st_mtime_ns) if folder.is_dir() else {}
-    keys = ((composed(name), suffix) for name in names for suffix in SUFFIXES)
+    keys = ((composed(name), suffix) for name in names for suffix in suffixes)
     return next((paths[key] for key in keys if key in paths), None)
 
 
@@ -117,7 +117,7 @@ def find_instants(
     """The photographs of each instant: those of the folder itself, or of its folders.
 
     Folders are instants, each with a photograph of every camera; folders with the names of cameras hold one
-    photograph for each instant.
+    photograph for each instant. Of several instants one may lack photographs.
 
     Args:
         names: the camera of a photograph (or of a camera's folder) whose name differs from the camera's.
@@ -131,7 +131,7 @@ def find_instants(
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)
     if photographs := images_in(folder):
-        return {folder.resolve().name: _by_camera(folder, photographs, cameras, names)}
+        return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     below = {
         composed(path.name): images_in(path)
         for path in sorted(folder.iterdir())
@@ -140,34 +140,41 @@ def find_instants(
     folders = {name: paths for name, paths in below.items() if paths}
     require(bool(folders), str(folder), f"photographs ({', '.join(SUFFIXES)})", "none")
     if all(names.get(name, name) in cameras for name in folders):
-        return _by_instant(folder, _by_camera(folder, folders, cameras, names))
-    return {name: _by_camera(folder / name, paths, cameras, names) for name, paths in folders.items()}
+        return _by_instant(folder, by_camera(folder, folders, cameras, names))
+    least = 2 if len(folders) == 1 else 1
+    return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
 
 
 def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
     """``{camera: {instant: path}}`` the other way around."""
     first, *others = by_camera
     for other in others:
-        differing = sorted(set(by_camera[first]) ^ set(by_camera[other]))
-        expected = f"photographs named as those of {first}"
-        require(not differing, f"{folder}: {other}", expected, f"others: {', '.join(differing[:3])}")
+        shared = by_camera[first].keys() & by_camera[other].keys()
+        expected, found = f"photographs named as those of {first}", ", ".join(list(by_camera[other])[:3])
+        require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
+    instants = sorted({instant for paths in by_camera.values() for instant in paths})
     return {
-        instant: {camera: paths[instant] for camera, paths in by_camera.items()}
-        for instant in by_camera[first]
+        instant: {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
+        for instant in instants
     }
 
 
-def _by_camera(
-    folder: Path, values: Mapping[str, Any], cameras: Mapping[str, StoredCamera], names: Mapping[str, str]
+def by_camera(
+    folder: Path,
+    values: Mapping[str, Any],
+    cameras: Mapping[str, StoredCamera],
+    names: Mapping[str, str],
+    least: int = 2,
 ) -> dict[str, Any]:
-    """Values by camera, given by the name of a photograph or of a camera's folder."""
+    """Values by camera, given by the name of a photograph, of a video or of a camera's folder. InputError: a
+    name is that of no camera, two are of one, or there are fewer than ``least``."""
     unknown = [name for name in values if names.get(name, name) not in cameras]
     if unknown:
         raise InputError(
             f"{folder}: expected photographs named after cameras ({', '.join(cameras)}), or"
             f" calibration.names={{photograph: camera}}; found {', '.join(unknown)}"
         )
-    require(len(values) >= 2, str(folder), "2 photographs or more", len(values))
-    by_camera = {names.get(name, name): value for name, value in values.items()}
-    require(len(by_camera) == len(values), "calibration.names", "one photograph for each camera", dict(names))
-    return by_camera
+    require(len(values) >= least, str(folder), f"{least} photographs or more", len(values))
+    found = {names.get(name, name): value for name, value in values.items()}
+    require(len(found) == len(values), "calibration.names", "one photograph for each camera", dict(names))
+    return found

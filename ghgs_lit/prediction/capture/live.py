@@ -1,0 +1,125 @@
+"""Captures of what goes on: instants of a folder that is being written, or videos at their own rate."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.capture.formats import read_cameras
+from ghgs_lit.prediction.capture.photographs import composed, images_in
+from ghgs_lit.prediction.capture.videos import SUFFIXES
+
+#: Seconds after which a folder is looked at again.
+_POLL = 0.02
+
+
+def live_frames(
+    images: str | Path,
+    cameras: str | Path,
+    masks: str | Path | None = None,
+    idle: float | None = None,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+    **options: Any,
+) -> Iterator[tuple[Capture, int]]:
+    """The newest capture whenever one is asked for, and how many were dropped since the one before.
+
+    Dropped is what comes while the one before is in use, and what cannot be read.
+
+    Args:
+        images: a folder of videos, which are shown at their own rate; or of instants, each a folder that
+            counts once it has a photograph of every camera and none of its files grows any more.
+        masks: a folder laid out as ``images``.
+        idle: seconds without a new instant after which a folder of instants ends; None: never.
+        clock, sleep: tells seconds, and lets some pass.
+        options: as for :class:`CaptureFolder`.
+
+    Raises:
+        InputError: the calibration, a video or the folder is missing or wrong.
+    """
+    folder = Path(images).expanduser()
+    require(folder.is_dir(), str(images), "a folder", "no such folder")
+    if images_in(folder, SUFFIXES):
+        return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
+    said = options.get("calibration", {})
+    names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}
+    wanted = set(read_cameras(cameras, said.get("format") or "auto").cameras)
+    places = [folder] if masks is None else [folder, Path(masks).expanduser()]
+
+    def read(name: str) -> Capture:
+        found = CaptureFolder(folder / name, cameras, None if masks is None else places[1] / name, **options)
+        return Capture(name, found.photographs(found.instants[0]))
+
+    def is_whole(name: str) -> bool:
+        return wanted <= {names.get(found, found) for found in images_in(folder / name)}
+
+    return _arriving(places, is_whole, read, idle, clock, sleep)
+
+
+def _played(
+    folder: CaptureFolder, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> Iterator[tuple[Capture, int]]:
+    names = folder.instants
+    first = next(iter(folder.paths[names[0]].values())).video.video
+    # Instants are named by the frame of the first camera.
+    due = (np.array([int(name) for name in names]) - int(names[0])) / first.rate
+    begin, place, dropped = clock(), 0, 0
+    while place < len(names):
+        newest = max(place, int(np.searchsorted(due, clock() - begin, side="right")) - 1)
+        dropped += newest - place
+        place = newest + 1
+        try:
+            capture = Capture(names[newest], folder.photographs(names[newest]))
+        except InputError:
+            dropped += 1
+            continue
+        sleep(max(float(due[newest]) - (clock() - begin), 0.0))
+        yield capture, dropped
+        dropped = 0
+
+
+def _arriving(
+    places: list[Path],
+    is_whole: Callable[[str], bool],
+    read: Callable[[str], Capture],
+    idle: float | None,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> Iterator[tuple[Capture, int]]:
+    done, before, unread, last = (0, ""), {}, {}, clock()
+    while idle is None or clock() - last < idle:
+        folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
+        sizes = {name: [_sizes(place / name) for place in places] for name in folders if _order(name) > done}
+        still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
+        newest, before = max(filter(is_whole, still), key=_order, default=None), sizes
+        if newest is None:
+            sleep(_POLL)
+            continue
+        try:
+            capture = read(newest)
+        except InputError:  # until its files change: masks may come later
+            unread[newest] = sizes[newest]
+            continue
+        done, last = _order(newest), clock()
+        yield capture, sum(_order(name) < done for name in sizes)
+
+
+def _order(name: str) -> tuple[int, str]:
+    """By which numbers follow one another, whether zeros are before them or not."""
+    return len(name), name
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """Bytes of each file; a file that is renamed meanwhile counts next time."""
+    found = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        try:
+            found[path.name] = path.stat().st_size
+        except FileNotFoundError:
+            found[path.name] = -1
+    return found

@@ -1,0 +1,424 @@
+"""Sequences: videos and folders of instants, right ones and what goes wrong in them."""
+
+import csv
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
+from scipy.ndimage import binary_dilation
+
+from ghgs_lit.cli.photographs import check_cameras
+from ghgs_lit.cli.predict import captures_of
+from ghgs_lit.errors import InputError
+from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.capture.videos import Reader, read_video
+from ghgs_lit.types import Cameras
+from tests.helpers.captures import truncate
+from tests.helpers.figures import Figure
+from tests.helpers.scenes import ellipsoid
+from tests.helpers.videos import number_of, numbered_frames, write_video
+
+SIDE, FRAMES, FPS = 64, 6, 10
+FIGURE = Figure(height=SIDE, width=SIDE)
+
+
+def frames_of(camera, count=FRAMES):
+    return numbered_frames(FIGURE, camera, count)
+
+
+def mask(camera):
+    return FIGURE.masks[camera] * np.uint8(255)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Four videos with masks, and the calibration."""
+    place = tmp_path_factory.mktemp("videos")
+    for camera, name in enumerate(FIGURE.names):
+        write_video(place / "images" / f"{name}.mp4", frames_of(camera))
+        write_video(place / "masks" / f"{name}.mp4", [mask(camera)] * FRAMES)
+    shutil.move(FIGURE.write(place / "still"), place / "cameras.json")
+    return place
+
+
+@pytest.fixture
+def place(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "place")
+
+
+def opened(place, images="images", masks="masks", **options):
+    masks = None if masks is None else place / masks
+    return CaptureFolder(place / images, place / "cameras.json", masks, **options)
+
+
+def instants(place, count=FRAMES):
+    """The same as a folder for each instant."""
+    for number in range(count):
+        folder = FIGURE.write(place / "instants" / f"{number:03d}").parent
+        for camera, name in enumerate(FIGURE.names):
+            Image.fromarray([*frames_of(camera)][number]).save(folder / f"{name}.png")
+    return place / "instants"
+
+
+def numbers(photographs):
+    """The number in the corner of each photograph, by camera."""
+    return {p.name: number_of(p.image) for p in photographs}
+
+
+def all_numbers(folder):
+    """What is predicted of a sequence: numbers by camera, by instant."""
+    return {capture.name: numbers(capture.photographs) for capture, _ in captures_of(folder)}
+
+
+def alike(number, names=FIGURE.names):
+    return dict.fromkeys(names, number)
+
+
+def test_videos_are_read_in_order(place):
+    """Every frame with its mask, by instants named by their frames; and the first again after the last."""
+    folder = opened(place)
+    assert all_numbers(folder) == {f"{n:06d}": alike(n) for n in range(FRAMES)}
+    assert folder.note == ""
+    first = folder.photographs("000000")
+    assert numbers(first) == alike(0)
+    for camera, photograph in enumerate(first):
+        assert photograph.matte.shape == (SIDE, SIDE)
+        assert (photograph.mask ^ FIGURE.masks[camera]).mean() < 0.01
+        beside = ~binary_dilation(FIGURE.masks[camera], iterations=3)
+        assert (photograph.matte[beside] == 0).all()  # coding leaves no haze
+
+
+@pytest.mark.parametrize(
+    ("part", "chosen"),
+    [
+        ({"start": 1, "stop": 5, "step": 2}, (1, 3)),
+        ({"start": -2}, (4, 5)),
+        ({"step": 5}, (0, 5)),
+        ({"stop": -4}, (0, 1)),
+    ],
+)
+@pytest.mark.parametrize("kind", ["videos", "instants"])
+def test_a_part_of_a_sequence(place, part, chosen, kind):
+    folder = opened(place, sequence=part) if kind == "videos" else None
+    folder = folder or CaptureFolder(instants(place), place / "cameras.json", sequence=part)
+    assert [set(found.values()) for found in all_numbers(folder).values()] == [{n} for n in chosen]
+    assert [int(name) for name in folder.instants] == list(chosen)
+
+
+@pytest.mark.parametrize("suffix", [".mov", ".mkv", ".avi", ".webm"])
+def test_frames_have_their_numbers_in_every_kind_of_file(tmp_path, suffix):
+    """With frames that are stored in another order than shown, sought from the end to the beginning."""
+    options = {"codec": "libvpx"} if suffix == ".webm" else {"codec": "libx264"}
+    path = tmp_path / f"a{suffix}"
+    write_video(path, frames_of(0), **options)
+    video = read_video(path)
+    assert (video.count, video.size) == (FRAMES, (SIDE, SIDE))
+    assert video.rate == pytest.approx(FPS, rel=0.01)
+    reader = Reader(video, "gray")
+    for number in [*range(FRAMES), *reversed(range(FRAMES))]:
+        assert number_of(reader.frame(number)) == number
+
+
+def test_frames_that_were_cut_off_do_not_count(tmp_path):
+    """A phone that cuts a video leaves the frames before in its file, and says that they are not shown."""
+    write_video(tmp_path / "whole.mp4", frames_of(0), codec="libx264")
+    cut = [get_ffmpeg_exe(), "-v", "error", "-ss", "0.15", "-i", tmp_path / "whole.mp4"]
+    subprocess.run([*cut, "-c", "copy", tmp_path / "cut.mp4"], check=True)
+    video = read_video(tmp_path / "cut.mp4")
+    reader = Reader(video, "gray")
+    assert [number_of(reader.frame(n)) for n in range(video.count)] == list(range(2, FRAMES))
+
+
+def test_a_long_video_is_sought(tmp_path):
+    """Also where one frame of many is decoded at a time."""
+    rng = np.random.default_rng(0)
+    order = rng.permutation(400) % 7
+    write_video(tmp_path / "a.mp4", (np.full((16, 16, 3), 30 * n, np.uint8) for n in order), fps=20)
+    video = read_video(tmp_path / "a.mp4")
+    for step, wanted in ((1, (350, 20, 21, 399, 0)), (25, (50, 75, 325, 350, 0))):
+        reader = Reader(video, "gray", step)
+        assert [round(float(reader.frame(n).mean()) / 30) for n in wanted] == [order[n] for n in wanted]
+
+
+def test_a_frame_that_a_camera_dropped_shifts_no_other(place):
+    """Its instant is predicted from the other three."""
+    keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
+    write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
+    found = all_numbers(opened(place))
+    assert found == {
+        f"{n:06d}": alike(n, [name for name in FIGURE.names if n != 2 or name != "cam1"])
+        for n in range(FRAMES)
+    }
+
+
+def test_masks_of_the_frames_that_there_are(place):
+    """Drawn of one after another they know of no dropped frame: masks of other frames are no use."""
+    keep = ["-vf", "select=not(eq(n\\,2))", "-fps_mode", "passthrough"]
+    write_video(place / "images" / "cam1.mp4", frames_of(1), output_params=keep)
+    drawn = [np.roll(mask(1), 2 * number, 0) for number in range(FRAMES)]
+    write_video(place / "masks" / "cam1.mp4", drawn[:2] + drawn[3:])
+    for number in (1, 3, 5):
+        found = {p.name: p.mask for p in opened(place).photographs(f"{number:06d}")}
+        assert (found["cam1"] ^ (drawn[number] > 127)).mean() < 0.01
+
+
+def test_videos_of_different_length(place, capsys):
+    write_video(place / "images" / "cam2.mp4", frames_of(2, 4))
+    folder = opened(place)
+    assert list(all_numbers(folder)) == ["000000", "000001", "000002", "000003"]
+    counts = "cam0 6, cam1 6, cam2 4, cam3 6 frames"
+    assert folder.note == f"videos differ in length ({counts}): the 4 instants that all show are used"
+
+
+def test_another_size_than_the_calibrations(place):
+    write_video(place / "images" / "cam1.mp4", (frame[:48] for frame in frames_of(1)))
+    with pytest.raises(InputError, match=r"cam1\.mp4: .*cam1.*64x64.*found 48x64"):
+        opened(place)
+
+
+def test_another_size_of_a_mask_video(place, capsys):
+    write_video(place / "masks" / "cam1.mp4", [mask(1)[:48]] * FRAMES)
+    assert all_numbers(opened(place))["000003"] == alike(3, ["cam0", "cam2", "cam3"])
+    assert "instant 000003 is without cam1: " in capsys.readouterr().out
+
+
+def test_another_rate(place):
+    write_video(place / "images" / "cam3.mp4", frames_of(3), fps=15)
+    line = r"sequence\.sync: expected as many frames a second .*found .*'cam2': 10\.0, 'cam3': 15\.0"
+    with pytest.raises(InputError, match=line):
+        opened(place)
+
+
+def test_a_broken_video(place):
+    (place / "images" / "cam1.mp4").write_bytes(b"no video" * 100)
+    with pytest.raises(
+        InputError, match=r"cam1\.mp4: expected a video with frames that ffmpeg can decode; found"
+    ):
+        opened(place)
+
+
+def test_a_broken_frame(place, capsys):
+    """Of a video whose frames stand alone one that is damaged is left out, and no other."""
+    path = place / "images" / "cam1.avi"
+    (place / "images" / "cam1.mp4").unlink()
+    write_video(path, frames_of(1), codec="mjpeg")
+    content = bytearray(path.read_bytes())
+    starts = [i for i in range(len(content)) if content[i : i + 3] == b"\xff\xd8\xff"]
+    content[starts[2] : starts[3] - 8] = bytes(starts[3] - 8 - starts[2])
+    path.write_bytes(content)
+    found = all_numbers(opened(place))
+    assert found["000002"] == alike(2, ["cam0", "cam2", "cam3"])
+    assert [found[f"{n:06d}"] for n in (0, 1, 3, 4, 5)] == [alike(n) for n in (0, 1, 3, 4, 5)]
+    assert "instant 000002 is without cam1: " in capsys.readouterr().out
+
+
+def test_empty_masks_for_a_while(place, capsys):
+    """Of one camera: the others predict. Of two: the instants are left out, and the rest is not."""
+    for camera, name, last in ((0, "cam0", 1), (1, "cam1", 2)):
+        masks = [mask(camera) * (not 1 <= number <= last) for number in range(FRAMES)]
+        write_video(place / "masks" / f"{name}.mp4", masks)
+    found = all_numbers(opened(place))
+    assert found == {"000000": alike(0), "000002": alike(2, ["cam0", "cam2", "cam3"])} | {
+        f"{n:06d}": alike(n) for n in (3, 4, 5)
+    }
+    out = capsys.readouterr().out
+    assert out.count("\n") == 2
+    assert "instant 000001 is left out: " in out
+    assert "3 photographs or more; found '2 (cam0: " in out
+    assert "instant 000002 is without cam1: " in out
+    assert "found 0 pixels" in out
+
+
+def test_photographs_that_are_missing_or_broken_in_some_instants(place, capsys):
+    folder = instants(place)
+    (folder / "001" / "cam2.png").unlink()
+    truncate(folder / "002" / "cam1.png")
+    for name in ("cam0", "cam1", "cam2"):
+        (folder / "004" / f"{name}.png").unlink()
+    found = all_numbers(CaptureFolder(folder, place / "cameras.json"))
+    assert found == {
+        "000": alike(0),
+        "001": alike(1, ["cam0", "cam1", "cam3"]),
+        "002": alike(2, ["cam0", "cam2", "cam3"]),
+        "003": alike(3),
+        "005": alike(5),
+    }
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "instant 001 is without cam2: there is no photograph"
+    assert lines[1].startswith("instant 002 is without cam1: ")
+    assert "cam1.png: expected a readable image" in lines[1]
+    assert lines[2].startswith("instant 004 is left out: ")
+    assert len(lines) == 3
+
+
+def test_a_single_instant_of_a_sequence_is_refused_as_one(place):
+    folder = instants(place)
+    truncate(folder / "002" / "cam1.png")
+    one = CaptureFolder(folder, place / "cameras.json", sequence={"start": 2, "stop": 3})
+    with pytest.raises(InputError, match=r"cam1\.png: expected a readable image"):
+        list(captures_of(one))
+
+
+def test_a_photograph_missing_in_a_folder_of_cameras(place):
+    folder = instants(place)
+    for name in FIGURE.names:
+        (place / "by_camera" / name).mkdir(parents=True)
+        for instant in sorted(folder.iterdir()):
+            shutil.copy(instant / f"{name}.png", place / "by_camera" / name / f"{instant.name}.png")
+    for camera, name in enumerate(FIGURE.names):
+        for number in range(FRAMES):
+            path = place / "still_masks" / name / f"{number:03d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(FIGURE.masks[camera]).save(path)
+    (place / "by_camera" / "cam0" / "000.png").unlink()
+    found = all_numbers(opened(place, "by_camera", "still_masks"))
+    assert found["000"] == alike(0, ["cam1", "cam2", "cam3"])
+    assert found["001"] == alike(1)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_masks_of_videos_in_folders_count_from_0_or_from_1(place, first):
+    shutil.rmtree(place / "masks")
+    for camera, name in enumerate(FIGURE.names):
+        (place / "masks" / name).mkdir(parents=True)
+        for number in range(FRAMES):
+            found = np.roll(FIGURE.masks[camera], number, 0)
+            Image.fromarray(found).save(place / "masks" / name / f"{number + first:05d}.png")
+    folder = opened(place)
+    for number in (0, 5):
+        for camera, photograph in enumerate(folder.photographs(f"{number:06d}")):
+            assert (photograph.mask == np.roll(FIGURE.masks[camera], number, 0)).all()
+    (place / "masks" / "cam1" / f"{(FRAMES - 1 if first else 0) + first:05d}.png").unlink()
+    with pytest.raises(InputError, match="masks numbered from 0 to 5 or from 1 to 6; found '5 masks'"):
+        opened(place)
+
+
+def test_offsets(place):
+    """A camera that began two frames before the others is two frames ahead."""
+    found = all_numbers(opened(place, sequence={"sync": {"cam1": 2}}))
+    assert found == {f"{n:06d}": alike(n) | {"cam1": n + 2} for n in range(4)}
+    found = all_numbers(opened(place, sequence={"sync": {"cam1": -2, "cam2": 1}}))
+    assert found == {f"{n:06d}": alike(n) | {"cam1": n - 2, "cam2": n + 1} for n in (2, 3, 4)}
+
+
+def write_csv(place, rows, header=("camera", "frame", "seconds")):
+    with (place / "times.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return {"sync": str(place / "times.csv")}
+
+
+def test_time_stamps(place):
+    """The nearest frame; a frame that is too far is missing, and its instant is predicted without it."""
+    late = {"cam0": 0.0, "cam1": 0.04, "cam2": -0.2, "cam3": 0.0}
+    rows = [(c, n, n / FPS + late[c]) for c in FIGURE.names for n in range(FRAMES) if (c, n) != ("cam3", 2)]
+    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
+    assert found == {
+        f"{n:06d}": {name: n + 2 * (name == "cam2") for name in FIGURE.names if (name, n) != ("cam3", 2)}
+        for n in range(4)
+    }
+
+
+def test_time_stamps_say_how_rates_fit(place):
+    write_video(place / "images" / "cam3.mp4", frames_of(3, 3), fps=FPS // 2)
+    write_video(place / "masks" / "cam3.mp4", [mask(3)] * 3)
+    rows = [(c, n, n / FPS * (2 if c == "cam3" else 1)) for c in FIGURE.names for n in range(FRAMES)]
+    found = all_numbers(opened(place, sequence=write_csv(place, rows)))
+    assert found["000004"] == alike(4) | {"cam3": 2}
+    assert found["000003"] == alike(3, ["cam0", "cam1", "cam2"])
+
+
+ROWS = [(name, n, n / FPS) for name in FIGURE.names for n in range(FRAMES)]
+WRONG = {
+    "a camera is missing": (ROWS[:-FRAMES], "the times of cam0, cam1, cam2, cam3"),
+    "other names": ([("left", n, t) for _, n, t in ROWS], "the times of .*found 'left'"),
+    "one more": ([*ROWS, ("cam9", 0, 0.0)], r"cameras among cam0, .*found \['cam9'\]"),
+    "no number": ([*ROWS, ("cam0", "x", 0.0)], "camera,frame,seconds with numbers; found"),
+    "no time": ([*ROWS, ("cam0", 3, "nan")], "camera,frame,seconds with numbers; found"),
+    "no shared time": ([(c, n, t + 9 * (c == "cam1")) for c, n, t in ROWS], "times that all cameras share"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_time_stamps(place, name):
+    rows, line = WRONG[name]
+    with pytest.raises(InputError, match=rf"times\.csv: expected .*{line}"):
+        opened(place, sequence=write_csv(place, rows))
+
+
+def test_other_columns(place):
+    with pytest.raises(InputError, match=r"times\.csv: expected camera,frame,seconds"):
+        opened(place, sequence=write_csv(place, ROWS, ("camera", "frame", "time")))
+
+
+REFUSED = {
+    "offsets of unknown cameras": ({"sync": {"cam9": 1}}, r"sequence\.sync: .*cam0, cam1.*found \['cam9'\]"),
+    "offsets of half frames": ({"sync": {"cam1": 0.5}}, r"sequence\.sync: .*whole numbers of frames"),
+    "offsets beyond the videos": ({"sync": {"cam1": 6}}, r"sequence\.sync: .*frames that all videos show"),
+    "nothing after the end": ({"start": 6}, r"sequence\.start: expected a part of 6 instants; found"),
+    "nothing before the start": ({"start": 3, "stop": 2}, "from 3 to 2"),
+    "no step": ({"step": 0}, r"sequence\.step: expected an integer >= 1; found 0"),
+    "no such key": ({"skip": 1}, "sequence key: expected one of .*found 'skip'"),
+    "no such file": ({"sync": "nowhere.csv"}, r"nowhere\.csv: expected"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_sequences_that_are_refused(place, name):
+    part, line = REFUSED[name]
+    with pytest.raises(InputError, match=line):
+        opened(place, sequence=part)
+
+
+def test_photographs_are_not_synchronised(place):
+    with pytest.raises(InputError, match=r"sequence\.sync: expected null for photographs"):
+        CaptureFolder(instants(place, 2), place / "cameras.json", sequence={"sync": {"cam0": 1}})
+
+
+def test_cameras_that_are_exchanged_half_way(place, capsys):
+    """The first half is right: what follows is said, with which of them, and nothing is refused."""
+    check_cameras(opened(place))
+    assert "masks do not fit" not in capsys.readouterr().out
+    for folder, frames in (("images", frames_of), ("masks", lambda camera: [mask(camera)] * FRAMES)):
+        one, other = ([*frames(camera)] for camera in (0, 1))
+        write_video(place / folder / "cam0.mp4", one[:3] + other[3:])
+        write_video(place / folder / "cam1.mp4", other[:3] + one[3:])
+    check_cameras(opened(place, sequence={"step": 3}))
+    out = capsys.readouterr().out
+    assert "cameras and masks agree" in out
+    wrong = [line for line in out.splitlines() if "masks do not fit" in line]
+    assert [line.split()[1] for line in wrong] == ["000003:"]
+    assert all("cam0 and cam1 are exchanged" in line for line in wrong)
+    with pytest.raises(InputError, match="cam0 and cam1 are exchanged"):
+        check_cameras(opened(place, sequence={"start": 4}))
+
+
+def test_two_people_are_said(place, capsys):
+    """They are read as one subject, and a line names the masks that show them apart."""
+    k, pose = (
+        torch.tensor([FIGURE.cameras[name][key] for name in FIGURE.names])[None].double()
+        for key in ("intrinsics", "extrinsics")
+    )
+    middle, radii = torch.tensor([0.8, 0.9, 0.0]).double(), torch.tensor([0.12, 0.6, 0.12]).double()
+    other = ellipsoid(Cameras(k, pose, SIDE, SIDE), middle, radii)[0][0].numpy()
+    for camera, name in enumerate(FIGURE.names):
+        both = (FIGURE.masks[camera] | other[camera]) * np.uint8(255)
+        write_video(place / "masks" / f"{name}.mp4", [both] * FRAMES)
+    folder = opened(place, sequence={"step": 5})
+    assert len(all_numbers(folder)) == 2
+    check_cameras(folder)
+    out = capsys.readouterr().out
+    assert re.search(
+        r"instant 000000: masks of cam\d, .*cam\d have two large parts, taken for one subject", out
+    )
+
+
+def test_videos_without_ffmpeg(place, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(InputError, match=r"expected the extra video .*ghgs-lit\[video\].*found none"):
+        opened(place)
