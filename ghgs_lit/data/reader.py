@@ -56,6 +56,11 @@ class Reader(ABC):
     def read_body(self, name: str) -> np.ndarray | None:
         """Body vertices [n, 3] float32 in the world (metres), or None if the data has none."""
 
+    def read_surface(self, name: str) -> np.ndarray | None:
+        """Points [n, 3] float32 of the surface in the world (metres), the same ones at all instants of a
+        subject in motion, or None if the data has none."""
+        return None
+
     @property
     def people(self) -> int:
         """Number of people; fewer than subjects where a subject is one frame of a person."""
