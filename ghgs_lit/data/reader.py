@@ -57,8 +57,7 @@ class Reader(ABC):
         """Body vertices [n, 3] float32 in the world (metres), or None if the data has none."""
 
     def read_surface(self, name: str) -> np.ndarray | None:
-        """Points [n, 3] float32 of the surface in the world (metres), the same ones at all instants of a
-        subject in motion, or None if the data has none."""
+        """Points [n, 3] of a person in motion, the same at all instants; None if the data has none."""
         return None
 
     @property

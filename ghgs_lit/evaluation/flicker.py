@@ -11,11 +11,7 @@ from ghgs_lit.types import Batch, Cameras
 
 
 class Flickers:
-    """Compares each instant with the one before, if that came just before.
-
-    Args:
-        builder: of the split that is measured.
-    """
+    """Compares each instant with the one before, if that came just before. ``builder``: of the split."""
 
     def __init__(self, builder: BatchBuilder) -> None:
         self._builder, self._last = builder, ("", ())

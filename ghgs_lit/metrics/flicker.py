@@ -1,9 +1,9 @@
 """Flicker: by how much the error of renders changes from one instant to the next.
 
-The field measures the change of frames along an estimated optical flow (warping error, Lai et al. 2018,
-"Learning blind video temporal consistency"), or the change of the output less that of the true video (tOF,
-tLP: Chu et al. 2020, TecoGAN). Here the motion of the surface is known, and the truth is subtracted: an error
-that moves with the surface does not flicker. The flicker of a black render is the change of the photographs.
+The field measures how frames change along an estimated optical flow (warping error: Lai et al. 2018, Learning
+Blind Video Temporal Consistency), or unlike the true video (tOF, tLP: Chu et al. 2020, TecoGAN). Here the
+motion of the surface is known and the truth subtracted: an error that moves with the surface does not
+flicker. A black render has the flicker of the photographs.
 """
 
 import torch

@@ -53,11 +53,6 @@ class _Renderable(Rendered):
     render_workers: Workers | None = None
     """Rendering processes; null: one for each core; 0: no further process."""
 
-    @property
-    def instants(self) -> int:
-        """Of each person in motion; 0: people stand still."""
-        return 0
-
     @abstractmethod
     def camera_rig(self) -> Rig | CaptureRig:
         """The cameras around each subject."""
@@ -66,8 +61,7 @@ class _Renderable(Rendered):
         self, root: Path, names: Mapping[str, Sequence[str]], source: PersonSource, seed: int
     ) -> int:
         """Render the people of each phase that ``root`` lacks; returns their number."""
-        rig, workers = self.camera_rig(), self.render_workers
-        return render_people(root, names, source, rig, self.render, seed, workers, instants=self.instants)
+        return render_people(root, names, source, self.camera_rig(), self.render, seed, self.render_workers)
 
 
 class _OnRing(_Renderable):
@@ -126,8 +120,8 @@ class _Generated(_Renderable):
     @property
     def root(self) -> str:
         """The cache's folder, which is named after everything that the photographs depend on."""
-        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED, self.instants)
-        made_with |= {"people": people_version()}
+        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED, self.source_of_people.instants)
+        made_with["people"] = people_version()
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         try:
@@ -142,6 +136,10 @@ class _Generated(_Renderable):
 
     def split_facts(self, split: str) -> dict[str, str]:
         return super().split_facts(split) | (bench.facts() if split == bench.SPLIT else {})
+
+    @property
+    def source_of_people(self) -> SyntheticSource:
+        return SyntheticSource(_PEOPLE_SEED)
 
     def subject_names(self, phase: str) -> list[str]:
         if phase == bench.SPLIT:
@@ -162,8 +160,7 @@ class _Generated(_Renderable):
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
         """Render these people, by phase."""
-        source = SyntheticSource(_PEOPLE_SEED, self.instants)
-        self.render_into(Path(self.root), names, source, _PEOPLE_SEED)
+        self.render_into(Path(self.root), names, self.source_of_people, _PEOPLE_SEED)
 
     def check_targets(self, targets: TargetProtocol) -> None:
         needed = {RING_VIEW} | targets.view_numbers
@@ -183,8 +180,8 @@ class Synthetic(_Generated, _OnRing):
     """Instants, 1/30 s apart, of each person in motion; each is a subject. 0: people stand still."""
 
     @property
-    def instants(self) -> int:
-        return self.motion
+    def source_of_people(self) -> SyntheticSource:
+        return SyntheticSource(_PEOPLE_SEED, self.motion)
 
     @property
     def split_names(self) -> tuple[str, ...]:

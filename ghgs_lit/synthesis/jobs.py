@@ -140,24 +140,18 @@ def render_subject(job: _Job) -> _Job:
     height, width = job.settings.size
     # Random numbers of their own: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
-    for name, instant in zip(job.subjects, _apart(person, len(job.subjects)), strict=True):
-        _photograph(job, name, Studio(instant, lights, job.settings.samples), rig, yaws, poses)
-        if instant.body_vertices is not None:
-            write_body(job.workspace, name, instant.body_vertices)
+    count = len(job.subjects)
+    for i, name in enumerate(job.subjects):
+        parts = person.parts[i * len(person.parts) // count : (i + 1) * len(person.parts) // count]
+        studio = Studio(replace(person, parts=parts), lights, job.settings.samples)
+        _photograph(job, name, studio, rig, yaws, poses)
         if job.instants:
-            vertices = np.concatenate([part.vertices for part in instant.parts])
+            vertices = np.concatenate([part.vertices for part in parts])
             followed = np.linspace(0, len(vertices) - 1, _FOLLOWED).astype(int)
             write_body(job.workspace, name, vertices[followed], "surface")
+        if person.body_vertices is not None:
+            write_body(job.workspace, name, np.split(person.body_vertices, count)[i])
     return job
-
-
-def _apart(person: Person, instants: int) -> Iterator[Person]:
-    """The instants of a person, whose rig was placed around all of them."""
-    size = len(person.parts) // instants
-    body = person.body_vertices
-    bodies = [None] * instants if body is None else np.split(body, instants)
-    for i, body in enumerate(bodies):
-        yield replace(person, parts=person.parts[i * size : (i + 1) * size], body_vertices=body)
 
 
 def _photograph(job: _Job, name: str, studio: Studio, rig: Rig, yaws: np.ndarray, poses: Poses) -> None:
@@ -191,17 +185,15 @@ def render_people(
     seed: int,
     workers: int | None = None,
     shown: bool = True,
-    instants: int = 0,
 ) -> int:
     """Render people below ``root``; those that are already there are kept.
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
 
     Args:
-        names: names of the subjects of each phase.
+        names: names of the subjects of each phase: of people, or of their instants if they are in motion.
         workers: number of processes (None: one for each core; 0: this one).
         shown: whether there is a progress bar.
-        instants: of each person in motion, whose names are then those of instants; 0: people stand still.
 
     Returns:
         How many people were rendered now.
@@ -213,6 +205,7 @@ def render_people(
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
+    instants = source.instants if isinstance(source, SyntheticSource) else 0
     progress, made_with = Progress(Path(root)), identity(rig, settings, seed, instants)
     progress.check_settings(made_with)
     missing = progress.complete.missing
@@ -225,6 +218,7 @@ def render_people(
         todo = [
             _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name), instants)
             for phase, listed in names.items()
+            # Without the instant's _t000.
             for name in dict.fromkeys(name[:-5] if instants else name for name in missing(phase, listed))
         ]
         with _bar(shown) as bar:

@@ -23,8 +23,6 @@ from ghgs_lit.synthesis.people.outfit import sample_outfit
 VERSION = 1
 #: Instants from one pose to the other: a second.
 PASSAGE = 30
-# Up to 1: the nearer, the more even the speed, and the faster a person turns back at a pose.
-_EVEN = 0.95
 
 
 def instant_names(person: str, instants: int) -> tuple[str, ...]:
@@ -34,8 +32,8 @@ def instant_names(person: str, instants: int) -> tuple[str, ...]:
 
 def shares(instants: int) -> np.ndarray:
     """How far [instants] a person is from the first pose (0) to the second (1): evenly but at the poses."""
-    turned = np.cos(np.pi * np.arange(instants) / PASSAGE)
-    return 0.5 - np.arcsin(_EVEN * turned) / (2 * np.arcsin(_EVEN))
+    even = 0.95  # at 1 a person would turn back at once
+    return 0.5 - np.arcsin(even * np.cos(np.pi * np.arange(instants) / PASSAGE)) / (2 * np.arcsin(even))
 
 
 @dataclass(frozen=True)
