@@ -1,6 +1,6 @@
 """People in motion, each instant predicted alone (exact) and from the last one (temporal).
 
-    python benchmarks/sequences.py [data.size=252] [--methods exact,temporal] [--people p2000015,a2000001]
+    python benchmarks/sequences.py [data.size=252] [--every 12] [--people p2000015,a2000001]
 
 Renders eight frozen sequences first (minutes), of people that no training reaches; the target is half-way
 between two of four inputs. Prints for each person, and on average, PSNR (whole and in the box), flicker along
@@ -15,7 +15,6 @@ from itertools import pairwise
 from statistics import mean
 
 import torch
-from torch import nn
 
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
@@ -29,9 +28,10 @@ from ghgs_lit.evaluation.flicker import Flickers
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.flicker import flicker_in_place
+from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs import results
 from ghgs_lit.synthesis.motion import instant_names
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Prediction
 
 #: What is frozen, with the people's own motion, the default rig and lights: people, and instants of each.
 PEOPLE = "p2000003,p2000006,p2000012,p2000015,a2000001,a2000006,a2000011,a2000016"
@@ -49,10 +49,10 @@ def black(batch: Batch) -> Estimate:
     return Estimate(torch.zeros_like(batch.targets.images))
 
 
-def temporal(model: GHGS) -> nn.Module:
+def temporal(model: GHGS, renderer: Renderer, every: int) -> Callable[[Batch], Prediction]:
     from ghgs_lit.prediction.sequence.temporal import Temporal
 
-    return Temporal(model)
+    return Temporal(model, every, renderer)
 
 
 def frozen(data: PhotographsDataModule, person: str) -> tuple[BatchBuilder, list[SampleSpec]]:
@@ -96,7 +96,7 @@ def measured(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", default="shipped")
-    parser.add_argument("--methods", default="exact,temporal", help="some of exact, temporal")
+    parser.add_argument("--every", type=int, default=0, help="temporal: instants of a new prediction; 0: no")
     parser.add_argument("--people", default=PEOPLE)
     parser.add_argument("overrides", nargs="*", help="of `ghgs evaluate`, such as data.size=140")
     options = parser.parse_intermixed_args()
@@ -104,15 +104,14 @@ def main() -> None:
     device, data = pick_device(config["device"]), build_data(config)
     renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
     model = GHGS.from_checkpoint(options.checkpoint, device).eval()
-    known: dict[str, Callable[[GHGS], nn.Module]] = {"exact": lambda model: model, "temporal": temporal}
-    methods: dict[str, Method] = {
-        name: ModelMethod(known[name](model), renderer) for name in options.methods.split(",")
-    }
+    methods: dict[str, Method] = {"exact": ModelMethod(model, renderer), "black": black}
+    if options.every:
+        methods["temporal"] = ModelMethod(temporal(model, renderer, options.every), renderer)
     print("| person | method | " + " | ".join(_COLUMNS) + " |\n|---|---" + "|---" * len(_COLUMNS) + "|")
     found: dict[str, list[dict]] = {}
     for person in options.people.split(","):
         builder, samples = frozen(data, person)
-        for name, method in {**methods, "black": black}.items():
+        for name, method in methods.items():
             if name == "temporal":
                 method.model.reset()
             found.setdefault(name, []).append(measured(method, builder, samples, metrics, device))
