@@ -13,6 +13,7 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor, nn
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.evaluation.flicker import Flickers
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
@@ -144,6 +145,7 @@ def measure(
     device: torch.device | str = "cpu",
     pictures: Path | None = None,
     picture_count: int = 0,
+    flickers: Flickers | None = None,
 ) -> list[Row]:
     """Measure one method; the targets of all protocols come from one prediction.
 
@@ -151,6 +153,7 @@ def measure(
         loader: batches with targets and their protocols.
         pictures: folder for pictures (None: none are written).
         picture_count: the number of subjects, the first ones, that are drawn.
+        flickers: compares people in motion with the instant before (None: nothing does).
 
     Returns:
         One row for each subject and target. ``seconds`` is the time of the prediction and all renders of a
@@ -173,7 +176,10 @@ def measure(
             for element in range(min(picture_count, len(batch.images))):
                 _draw(batch, estimate, element, pictures, name)
             picture_count = max(picture_count - len(batch.images), 0)
-        rows += [{"method": name, **row, "seconds": seconds} for row in _rows(batch, estimate, metrics)]
+        found = _rows(batch, estimate, metrics)
+        if flickers is not None:
+            found = [row | more for row, more in zip(found, flickers(batch, estimate.image), strict=True)]
+        rows += [{"method": name, **row, "seconds": seconds} for row in found]
     return rows
 
 
@@ -197,6 +203,7 @@ def measure_all(
         found: list[Row] = []
         for name, method in methods.items():
             batches = track(loader, f"measuring {name}, {count} views")
-            found += measure(method, name, batches, metrics, device, pictures, picture_count)
+            flickers = Flickers(data.builder(split))
+            found += measure(method, name, batches, metrics, device, pictures, picture_count, flickers)
         rows += [row for kind in targets for row in found if row["targets"] == kind]
     return rows

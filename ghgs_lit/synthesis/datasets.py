@@ -33,6 +33,7 @@ from ghgs_lit.synthesis.jobs import (
     identity,
     render_people,
 )
+from ghgs_lit.synthesis.motion import instant_names
 from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
 
@@ -119,7 +120,8 @@ class _Generated(_Renderable):
     @property
     def root(self) -> str:
         """The cache's folder, which is named after everything that the photographs depend on."""
-        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED) | {"people": people_version()}
+        made_with = identity(self.camera_rig(), self.render, _PEOPLE_SEED, self.source_of_people.instants)
+        made_with["people"] = people_version()
         key = hashlib.sha256(json.dumps(made_with, sort_keys=True).encode()).hexdigest()[:16]
         cache = self.cache_dir or os.environ.get("GHGS_CACHE") or "~/.cache/ghgs_lit"
         try:
@@ -134,6 +136,10 @@ class _Generated(_Renderable):
 
     def split_facts(self, split: str) -> dict[str, str]:
         return super().split_facts(split) | (bench.facts() if split == bench.SPLIT else {})
+
+    @property
+    def source_of_people(self) -> SyntheticSource:
+        return SyntheticSource(_PEOPLE_SEED)
 
     def subject_names(self, phase: str) -> list[str]:
         if phase == bench.SPLIT:
@@ -154,7 +160,7 @@ class _Generated(_Renderable):
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
         """Render these people, by phase."""
-        self.render_into(Path(self.root), names, SyntheticSource(_PEOPLE_SEED), _PEOPLE_SEED)
+        self.render_into(Path(self.root), names, self.source_of_people, _PEOPLE_SEED)
 
     def check_targets(self, targets: TargetProtocol) -> None:
         needed = {RING_VIEW} | targets.view_numbers
@@ -170,6 +176,20 @@ class Synthetic(_Generated, _OnRing):
 
     name: Text = "synthetic"
     rig: RigOptions = RigOptions(height=None)
+    motion: int = Field(0, ge=0, lt=1000)
+    """Instants, 1/30 s apart, of each person in motion; each is a subject. 0: people stand still."""
+
+    @property
+    def source_of_people(self) -> SyntheticSource:
+        return SyntheticSource(_PEOPLE_SEED, self.motion)
+
+    @property
+    def split_names(self) -> tuple[str, ...]:
+        return PHASES if self.motion else super().split_names  # the frozen people stand still
+
+    def subject_names(self, phase: str) -> list[str]:
+        people = super().subject_names(phase)
+        return [subject for person in people for subject in instant_names(person, self.motion)]
 
 
 class PeopleInRig(_Generated):

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -32,16 +32,18 @@ from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import naming
 from ghgs_lit.kernels.cores import allowed_cores
-from ghgs_lit.synthesis import people
+from ghgs_lit.synthesis import motion, people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.progress import Progress
-from ghgs_lit.synthesis.rig import STILL, Rig
+from ghgs_lit.synthesis.rig import STILL, Poses, Rig
 from ghgs_lit.synthesis.writing import write_body, write_view
 
 _GUARD = 'if __name__ == "__main__":'
 # Part of every cache key: increase it when photographs of the same settings would change.
 RENDER_VERSION = 2
+# Vertices of a person in motion that are noted at each instant.
+_FOLLOWED = 4000
 #: Of all people.
 LIGHTS = Lights()
 
@@ -61,12 +63,17 @@ ACTIVE = "a"
 
 @dataclass(frozen=True)
 class SyntheticSource:
-    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``."""
+    """Generated people, named ``p<index>``, and those in poses of sport and dance, ``a<index>``; all
+    ``instants`` of one in motion (0: none) are one person."""
 
     seed: int
+    instants: int = 0
 
     def load(self, name: str) -> Person:
-        return people.generate(self.seed, int(name[1:]), active=name.startswith(ACTIVE))
+        index, active = int(name[1:]), name.startswith(ACTIVE)
+        if self.instants:
+            return motion.generate_moving(self.seed, index, self.instants, active)
+        return people.generate(self.seed, index, active)
 
     def facing(self, name: str) -> float:
         return 0.0
@@ -99,6 +106,11 @@ class _Job:
     phase: str
     name: str
     workspace: Path
+    instants: int
+
+    @property
+    def subjects(self) -> tuple[str, ...]:
+        return motion.instant_names(self.name, self.instants)
 
 
 def everything(rig: Rig, settings: RenderOptions) -> dict:
@@ -107,8 +119,8 @@ def everything(rig: Rig, settings: RenderOptions) -> dict:
     return {"rig": cameras, "render": {**settings.model_dump(), "lights": asdict(LIGHTS)}}
 
 
-def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
-    """The same with the seed, as it names caches and is noted in data sets."""
+def identity(rig: Rig, settings: RenderOptions, seed: int, instants: int = 0) -> dict:
+    """The same with seed and instants, as it names caches and is noted in data sets."""
     cameras, render = everything(rig, settings).values()
     render["vids"] = render.pop("views")  # the name in stored data sets and in the keys of caches
     still = STILL.model_dump()
@@ -116,7 +128,8 @@ def identity(rig: Rig, settings: RenderOptions, seed: int) -> dict:
     varied = {name: value for name, value in cameras.pop("variation").items() if value != still[name]}
     if varied:
         cameras["variation"] = varied
-    return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render}
+    moving = {"motion": [motion.VERSION, instants]} if instants else {}
+    return {"version": RENDER_VERSION, "seed": seed, "rig": cameras, "render": render, **moving}
 
 
 def render_subject(job: _Job) -> _Job:
@@ -127,8 +140,25 @@ def render_subject(job: _Job) -> _Job:
     height, width = job.settings.size
     # Random numbers of their own: heights, yaws and lights do not depend on what is varied.
     rig, poses = job.rig.drawn(person, yaws, width / height, rng.spawn(1)[0])
-    studio = Studio(person, lights, job.settings.samples)
-    numbers = job.settings.views
+    count = len(job.subjects)
+    for i, name in enumerate(job.subjects):
+        parts = person.parts[i * len(person.parts) // count : (i + 1) * len(person.parts) // count]
+        studio = Studio(replace(person, parts=parts), lights, job.settings.samples)
+        _photograph(job, name, studio, rig, yaws, poses)
+        if job.instants:
+            vertices = np.concatenate([part.vertices for part in parts])
+            followed = np.linspace(0, len(vertices) - 1, _FOLLOWED).astype(int)
+            write_body(job.workspace, name, vertices[followed], "surface")
+        if person.body_vertices is not None:
+            write_body(job.workspace, name, np.split(person.body_vertices, count)[i])
+    return job
+
+
+def _photograph(job: _Job, name: str, studio: Studio, rig: Rig, yaws: np.ndarray, poses: Poses) -> None:
+    """Write all photographs of a subject."""
+    numbers, (height, width) = job.settings.views, job.settings.size
+    # Losses of compression would count as flicker.
+    quality = None if job.instants else job.settings.quality
     positions = range(job.rig.positions) if job.settings.positions is None else job.settings.positions
     for position in positions:
         index = (position, list(numbers))
@@ -143,11 +173,7 @@ def render_subject(job: _Job) -> _Job:
                 extrinsics=cameras.extrinsics[n].numpy(),
                 matte=np.round(photographs.alphas[n] * 255).astype(np.uint8),
             )
-            folder = position_name(job.name, position)
-            write_view(job.workspace, folder, number, view, job.settings.quality)
-    if person.body_vertices is not None:
-        write_body(job.workspace, job.name, person.body_vertices)
-    return job
+            write_view(job.workspace, position_name(name, position), number, view, quality)
 
 
 def render_people(
@@ -165,12 +191,12 @@ def render_people(
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
 
     Args:
-        names: names of the subjects of each phase.
+        names: names of the subjects of each phase: of people, or of their instants if they are in motion.
         workers: number of processes (None: one for each core; 0: this one).
         shown: whether there is a progress bar.
 
     Returns:
-        How many subjects were rendered now.
+        How many people were rendered now.
 
     Raises:
         InputError: ``root`` holds something else, a person is bad, or the script has no main guard.
@@ -179,26 +205,28 @@ def render_people(
     positions = settings.positions
     fits = positions is None or set(positions) <= set(range(rig.positions))
     require(fits, "data.render.positions", f"some of 0 to {rig.positions - 1}", positions)
-    progress = Progress(Path(root))
-    progress.check_settings(identity(rig, settings, seed))
+    instants = source.instants if isinstance(source, SyntheticSource) else 0
+    progress, made_with = Progress(Path(root)), identity(rig, settings, seed, instants)
+    progress.check_settings(made_with)
     missing = progress.complete.missing
     if not any(missing(phase, listed) for phase, listed in names.items()):
         return 0
     with progress.lock(), naming(progress.root):
-        progress.check_settings(identity(rig, settings, seed))  # another process may have been faster
+        progress.check_settings(made_with)  # another process may have been faster
         progress.clear_workspaces()
         progress.plan(names)
         todo = [
-            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name))
+            _Job(source, rig, settings, seed, phase, name, progress.workspace(phase, name), instants)
             for phase, listed in names.items()
-            for name in missing(phase, listed)
+            # Without the instant's _t000.
+            for name in dict.fromkeys(name[:-5] if instants else name for name in missing(phase, listed))
         ]
         with _bar(shown) as bar:
             task = bar.add_task(f"rendering into {root}", total=len(todo))
             try:
                 with contextlib.closing(_run(todo, workers)) as finished:
                     for job in finished:
-                        progress.publish(job.workspace, job.phase, job.name)
+                        progress.publish(job.workspace, job.phase, job.subjects)
                         bar.advance(task)
             finally:
                 progress.clear_workspaces()

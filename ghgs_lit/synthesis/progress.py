@@ -20,7 +20,7 @@ from ghgs_lit.readers import read_json
 
 log = logging.getLogger(__name__)
 
-_KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl")
+_KINDS = ("mask", "alpha", "depth", "parm", "img", "smpl", "surface")
 
 
 class Progress:
@@ -73,8 +73,8 @@ class Progress:
         path.mkdir(parents=True)
         return path
 
-    def publish(self, workspace: Path, phase: str, name: str) -> None:
-        """Move a complete subject from its workspace to its place, then mark it."""
+    def publish(self, workspace: Path, phase: str, names: Sequence[str]) -> None:
+        """Move the complete subjects of a workspace to their place, then mark them."""
         for kind in _KINDS:
             for source in sorted((workspace / kind).glob("*")):
                 target = self.root / phase / kind / source.name
@@ -82,9 +82,10 @@ class Progress:
                 if target.exists():  # left by a run that was killed between two moves
                     shutil.rmtree(target)
                 os.replace(source, target)
-        marker = self.complete.marker(phase, name)
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
+        for name in names:
+            marker = self.complete.marker(phase, name)
+            marker.parent.mkdir(parents=True, exist_ok=True)
+            marker.touch()
         shutil.rmtree(workspace, ignore_errors=True)
 
     def clear_workspaces(self) -> None:

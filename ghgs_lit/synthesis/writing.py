@@ -8,19 +8,20 @@ from PIL import Image
 from ghgs_lit.data.view import View
 
 
-def write_view(phase: Path, folder: str, number: int, view: View, quality: int = 98) -> None:
+def write_view(phase: Path, folder: str, number: int, view: View, quality: int | None = 98) -> None:
     """Write one view; the JPEG keeps the full resolution of colours.
 
     The mask has three equal channels: the authors' loader takes channel 0 of an image that has several.
 
     Args:
         folder: name of the subject's position, ``<id>_<position>``.
-        quality: of the JPEG, 1 to 100.
+        quality: of the JPEG, 1 to 100; None: a PNG, without loss.
     """
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():
         path.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(view.image).save(folders["img"] / f"{number}.jpg", quality=quality, subsampling=0)
+    path, lossy = folders["img"] / f"{number}.jpg", {"quality": quality, "subsampling": 0}
+    Image.fromarray(view.image).save(path.with_suffix(".png") if quality is None else path, **lossy)
     mask = np.repeat(view.mask[..., None].astype(np.uint8) * 255, 3, axis=-1)
     Image.fromarray(mask).save(folders["mask"] / f"{number}.png")
     if view.matte is not None:
@@ -31,8 +32,8 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int =
     np.save(folders["parm"] / f"{number}_extrinsic.npy", view.extrinsics[:3].astype(np.float64))
 
 
-def write_body(phase: Path, name: str, vertices: np.ndarray) -> None:
-    """Write the body vertices [n, 3] of a subject."""
-    folder = phase / "smpl" / name
+def write_body(phase: Path, name: str, vertices: np.ndarray, kind: str = "smpl") -> None:
+    """Write the vertices [n, 3] of a subject's body, or of another ``kind``: ``surface``."""
+    folder = phase / kind / name
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "vertices.npy", vertices.astype(np.float32))

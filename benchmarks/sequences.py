@@ -1,0 +1,129 @@
+"""People in motion, each instant predicted alone (exact) and from the last one (temporal).
+
+    python benchmarks/sequences.py [data.size=252] [--every 12] [--people p2000015,a2000001]
+
+Renders eight frozen sequences first (minutes), of people that no training reaches; the target is half-way
+between two of four inputs. Prints for each person, and on average, PSNR (whole and in the box), flicker along
+the motion of the surface and at fixed pixels of the box (in thousandths of white), and seconds of an instant
+with its render. A black render has the flicker of the photographs themselves: what shading and sampling
+change by.
+"""
+
+import argparse
+from collections.abc import Callable
+from itertools import pairwise
+from statistics import mean
+
+import torch
+
+from ghgs_lit import GHGS
+from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
+from ghgs_lit.config import build, compose, resolve
+from ghgs_lit.data.batches import BatchBuilder
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.layout import Layout
+from ghgs_lit.data.reader import Photographs
+from ghgs_lit.data.sampling import SampleSpec, evaluation_samples
+from ghgs_lit.evaluation.flicker import Flickers
+from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, measure
+from ghgs_lit.metrics import ImageMetrics
+from ghgs_lit.metrics.flicker import flicker_in_place
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.runs import results
+from ghgs_lit.synthesis.motion import instant_names
+from ghgs_lit.types import Batch, Prediction
+
+#: What is frozen, with the people's own motion, the default rig and lights: people, and instants of each.
+PEOPLE = "p2000003,p2000006,p2000012,p2000015,a2000001,a2000006,a2000011,a2000016"
+INSTANTS = 24
+_DATA = (
+    "data=synthetic", f"data.motion={INSTANTS}", "data.size=252",
+    "data.render.positions=[0,2,4,8,12]", "data.render.views=[0]", "views=v4", "targets=cameras",
+    "targets.positions=[2]", "metrics.lpips=off",
+)  # fmt: skip
+#: Factor and decimals of what is printed.
+_COLUMNS = {"psnr": (1, 2), "psnr_box": (1, 2), "flicker": (1e3, 2), "in_place": (1e3, 2), "seconds": (1, 3)}
+
+
+def black(batch: Batch) -> Estimate:
+    return Estimate(torch.zeros_like(batch.targets.images))
+
+
+def temporal(model: GHGS, renderer: Renderer, every: int) -> Callable[[Batch], Prediction]:
+    from ghgs_lit.prediction.sequence.temporal import Temporal
+
+    return Temporal(model, every, renderer)
+
+
+def frozen(data: PhotographsDataModule, person: str) -> tuple[BatchBuilder, list[SampleSpec]]:
+    """What reads the photographs of a person, and the sample of each instant; rendered on first use."""
+    names = instant_names(person, INSTANTS)
+    data.dataset.render_first({"val": names})
+    layout = Layout(data.dataset.folder, "val", names)
+    photographs = Photographs(layout, data.dataset.size)
+    samples = evaluation_samples(
+        layout.subjects, data.views.evaluation_count, [data.targets], data.dataset.ring, data.seed
+    )
+    return BatchBuilder(photographs, photographs), samples
+
+
+def measured(
+    method: Method,
+    builder: BatchBuilder,
+    samples: list[SampleSpec],
+    metrics: ImageMetrics,
+    device: torch.device,
+) -> dict[str, float | None]:
+    """Means over the instants of a person."""
+    errors, masks = [], []
+
+    def recorded(batch: Batch) -> Estimate:
+        estimate = method(batch)
+        errors.append(estimate.image[0].clamp(0, 1) - batch.targets.images[0])
+        masks.append(batch.targets.masks[0])
+        return estimate
+
+    batches = (builder.batch([sample]) for sample in samples)
+    rows = measure(recorded, "", batches, metrics, device, flickers=Flickers(builder))
+    in_place = [
+        flicker_in_place(torch.stack(pair), torch.stack(seen)).mean().item()
+        for pair, seen in zip(pairwise(errors), pairwise(masks), strict=True)
+    ]
+    found = {column: results.mean(row.get(column) for row in rows) for column in _COLUMNS}
+    return found | {"in_place": results.mean(in_place)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--checkpoint", default="shipped")
+    parser.add_argument("--every", type=int, default=0, help="temporal: instants of a new prediction; 0: no")
+    parser.add_argument("--people", default=PEOPLE)
+    parser.add_argument("overrides", nargs="*", help="of `ghgs evaluate`, such as data.size=140")
+    options = parser.parse_intermixed_args()
+    config = resolve(compose("evaluate", [*_DATA, *options.overrides]))
+    device, data = pick_device(config["device"]), build_data(config)
+    renderer, metrics = build_renderer(config, device), build(config["metrics"], "metrics").to(device)
+    model = GHGS.from_checkpoint(options.checkpoint, device).eval()
+    methods: dict[str, Method] = {"exact": ModelMethod(model, renderer), "black": black}
+    if options.every:
+        methods["temporal"] = ModelMethod(temporal(model, renderer, options.every), renderer)
+    print("| person | method | " + " | ".join(_COLUMNS) + " |\n|---|---" + "|---" * len(_COLUMNS) + "|")
+    found: dict[str, list[dict]] = {}
+    for person in options.people.split(","):
+        builder, samples = frozen(data, person)
+        for name, method in methods.items():
+            if name == "temporal":
+                method.model.reset()
+            found.setdefault(name, []).append(measured(method, builder, samples, metrics, device))
+            print(line(person, name, found[name][-1]), flush=True)
+    for name, rows in found.items():
+        print(line("mean", name, {column: mean(row[column] for row in rows) for column in _COLUMNS}))
+
+
+def line(person: str, name: str, values: dict[str, float]) -> str:
+    cells = [f"{factor * values[column]:.{digits}f}" for column, (factor, digits) in _COLUMNS.items()]
+    return f"| {person} | {name} | " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    main()
