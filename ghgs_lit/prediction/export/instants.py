@@ -15,7 +15,7 @@ from ghgs_lit.files import write_atomically
 from ghgs_lit.prediction.export.packed import COARSE, pack, unpack
 from ghgs_lit.prediction.export.page import page_of
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
-from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject
+from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
@@ -24,6 +24,8 @@ from ghgs_lit.visualization.turntable import orbit
 
 #: How far the video's camera swings to each side of the first photograph, in radians.
 _SWING = math.radians(20)
+#: The longer side of its pictures in pixels, at least.
+_VIDEO_SIDE = 720
 
 
 class Instants:
@@ -116,12 +118,14 @@ class Instants:
         seen = orbit(cameras, _SWING * turns.sin(), torch.cartesian_prod(*sides))
         shifts = torch.from_numpy(path).to(seen.extrinsics)
         seen.extrinsics[:, :3, 3] -= (seen.extrinsics[:, :3, :3] @ shifts[..., None])[..., 0]
+        larger = max(_VIDEO_SIDE / max(seen.height, seen.width), 1.0)
+        seen = seen.resized(round(larger * seen.height), round(larger * seen.width))
         pictures = []
         for frame, packed in enumerate(self._packed):
-            view = seen[frame : frame + 1][None]
             gaussians = unpack(packed, first.pixel, first.center, COARSE, first.gaussians)
-            image = first.renderer(gaussians.to(view.extrinsics.device), view).image[0, 0]
-            pictures.append(to_uint8(image))
+            # Large pictures would show gaps.
+            gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
+            pictures.append(to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0]))
         return mp4_bytes(pictures, self.options.fps)
 
 

@@ -81,11 +81,11 @@ def test_the_video_shows_all_of_a_subject_that_walks_away(tmp_path):
     """In the middle of every picture, not cut, and not from one side alone."""
     write(tmp_path, walk(4), "mp4")
     _, *frames = read_frames(str(tmp_path / "instants.mp4"))
-    pictures = [np.frombuffer(frame, np.uint8).reshape(60, 60, 3).max(-1) for frame in frames]
+    pictures = [np.frombuffer(frame, np.uint8).reshape(720, 720, 3).max(-1) for frame in frames]
     assert len(pictures) == 4
     for picture in pictures:
         rows, columns = np.nonzero(picture > 60)
-        assert np.allclose([rows.mean(), columns.mean()], 30, atol=2)
+        assert np.allclose([rows.mean(), columns.mean()], 360, atol=24)
         assert max(border.max() for border in (picture[0], picture[-1], picture[:, 0], picture[:, -1])) < 30
     assert np.abs(pictures[0].astype(int) - pictures[1]).max() > 100
 
