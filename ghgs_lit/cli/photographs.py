@@ -8,11 +8,6 @@ from ghgs_lit.prediction.capture.folder import CaptureFolder
 
 if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     from ghgs_lit.prediction.capture.camera_report import Diagnosis
-    from ghgs_lit.prediction.capture.capture import Capture
-    from ghgs_lit.types import Cameras
-
-#: Longer side of the pictures of a video of instants, in pixels.
-_VIDEO_SIDE = 720
 
 #: The folder that is being read, if any.
 _BEGUN: list[CaptureFolder] = []
@@ -84,17 +79,3 @@ def check_cameras(folder: CaptureFolder) -> None:
     for diagnosis in (sound or list(found.values()))[:1]:
         require_consistent(diagnosis)
         print("\n".join(diagnosis.lines), flush=True)
-
-
-def fixed_camera(capture: "Capture") -> "Cameras":
-    """The first camera of a capture with all that its photograph shows, [1, 1]: a video stays at it."""
-    import torch
-
-    from ghgs_lit.types import Cameras
-
-    photograph = capture.photographs[0]
-    height, width = photograph.mask.shape
-    matrices = (photograph.intrinsics, photograph.extrinsics)
-    camera = Cameras(*(torch.from_numpy(matrix).float()[None, None] for matrix in matrices), height, width)
-    share = min(_VIDEO_SIDE / max(height, width), 1.0)
-    return camera.resized(round(height * share), round(width * share))

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -22,28 +21,26 @@ from ghgs_lit.cli.inputs import (
     pick_device,
     with_trained_data,
 )
-from ghgs_lit.cli.photographs import capture_folder, check_cameras, fixed_camera
+from ghgs_lit.cli.photographs import capture_folder, check_cameras
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.files import write_atomically
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
 from ghgs_lit.prediction.export import (
     REPORT,
+    Instants,
     OutputOptions,
     output_files,
     output_options,
     require_free,
     write_prediction,
 )
-from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
-from ghgs_lit.types import Batch, Cameras, Gaussians
-from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import read_checkpoint
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
@@ -105,19 +102,18 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 
 
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
-    """Predict each instant of a folder of photographs; several get a folder each, and one video.
+    """Predict each instant of a folder of photographs; several get a folder each, and files of all.
 
     InputError: none of them can be read.
     """
     folder, options = capture_folder(config), output_options(config)
     several, inputs = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
-    is_again = any((path / REPORT).exists() for path in directories.values())
+    together = Instants(len(directories), options) if several else None
     for name, path in directories.items():
         require_free(path, output_files(options, list(folder.paths[name])), inputs)
-    video = directory / "instants.mp4"
-    expected = "no file, or one beside the instants of an earlier prediction"
-    require(is_again or not (several and video.exists()), str(video), expected, "another file")
+    if together:
+        require_free(directory, together.files, inputs)
     if folder.note:
         print(folder.note, flush=True)
     if config["check_cameras"]:
@@ -125,33 +121,28 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     device = pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
     size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
-    totals: dict[str, float] = {}
-    camera: Cameras | None = None
-    pictures: list[np.ndarray] = []
-    count = 0
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
-    begin = time.perf_counter()
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
+    totals: dict[str, float] = {}
+    count, begin = 0, time.perf_counter()
     for capture, waited in captures_of(folder):
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
-        gaussians, seconds = write_result(directories[capture.name], result, model, renderer, config, options)
-        if several and "mp4" in options.formats:
-            camera = camera or fixed_camera(capture).to(device)
-            pictures.append(to_uint8(renderer(gaussians, camera).image[0, 0]))
+        seconds = write_result(directories[capture.name], result, model, renderer, config, options)
+        if together:
+            together.add(directories[capture.name], result.batch, result.prediction, renderer)
         count += 1
         if count == 1:
             for line in advice_of(directories[capture.name]):
                 print(line, flush=True)
         for stage, value in seconds.items():
             totals[stage] = totals.get(stage, 0.0) + value
-    if pictures:
-        content = mp4_bytes(pictures, options.fps)
-        write_atomically(video, lambda temporary: temporary.write_bytes(content))
     left_out = len(folder.instants) - count
     require(count > 0, str(folder.images), "an instant that can be read", f"none of {left_out}")
-    if several:
+    if together:
+        paths = together.write(directory)
+        print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
         total = time.perf_counter() - begin
         stages = ", ".join(f"{stage} {value / count:.3g} s" for stage, value in totals.items())
         print(f"{count} instants, {count / total:.3g} a second (each: {stages})", flush=True)
@@ -218,12 +209,9 @@ def write_result(
     renderer: Renderer,
     config: dict[str, Any],
     options: OutputOptions,
-) -> tuple[Gaussians, dict[str, float]]:
-    """Write the files of a result, and print what was done and written.
-
-    Returns:
-        The Gaussians that were written, and the run time of each stage in seconds.
-    """
+) -> dict[str, float]:
+    """Write the files of a result, and print what was done and written. Returns: the run time of each stage
+    in seconds."""
     prediction, seconds = result.prediction, dict(result.seconds)
     facts: dict[str, Any] = {"checkpoint": config["checkpoint"], "seconds": seconds, "why": result.why}
     why = {name: f"; {doubt} ({name}=0 leaves it)" for name, doubt in result.why.items()}
@@ -243,4 +231,4 @@ def write_result(
     begin = time.perf_counter()
     paths = write_prediction(directory, result.batch, prediction, renderer, options, facts)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
-    return prediction.gaussians, {**seconds, "write": time.perf_counter() - begin}
+    return {**seconds, "write": time.perf_counter() - begin}

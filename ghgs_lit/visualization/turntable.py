@@ -73,7 +73,14 @@ def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Ca
     Args:
         points: of the subject [n, 3], n may be 0; None: they turn about where the optical axes meet.
     """
+    angles = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / max(frames, 1))
+    return orbit(cameras, angles, points)
+
+
+def orbit(cameras: Cameras, angles: Tensor, points: Tensor | None = None) -> Cameras:
+    """Such cameras [n] at ``angles`` [n] (float64, radians) from the side of the first given camera."""
     center = look_at_point(cameras) if points is None else center_of(points, cameras)
+    frames, angles = len(angles), angles.to(center.device)
     up = up_direction(cameras)
     offsets = cameras.centers.double() - center
     heights = offsets @ up
@@ -81,7 +88,6 @@ def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Ca
     radius = flat.norm(dim=-1).mean()
     start = torch.nn.functional.normalize(flat[0], dim=0)
     side = torch.linalg.cross(up, start)
-    angles = torch.arange(frames, dtype=torch.float64, device=center.device) * (2 * math.pi / max(frames, 1))
     around = angles.cos()[:, None] * start + angles.sin()[:, None] * side
     positions = center + radius * around + heights.mean() * up
     forward = torch.nn.functional.normalize(center - positions, dim=-1)

@@ -1,18 +1,19 @@
 """Predictions as files for other programs: one table of formats, one function that writes all."""
 
+from ghgs_lit.prediction.export.instants import Instants
 from ghgs_lit.prediction.export.prediction import (
     FORMATS,
-    REPORT,
     output_files,
     output_options,
-    require_free,
     write_prediction,
 )
+from ghgs_lit.prediction.export.reports import REPORT, require_free
 from ghgs_lit.prediction.export.subject import OutputOptions
 
 __all__ = [
     "FORMATS",
     "REPORT",
+    "Instants",
     "OutputOptions",
     "output_files",
     "output_options",

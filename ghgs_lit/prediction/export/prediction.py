@@ -1,6 +1,5 @@
 """Everything that is written of a prediction: one entry of ``FORMATS`` for each format."""
 
-import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +13,6 @@ from typing import Any
 import torch
 
 from ghgs_lit.errors import InputError, choice, require
-from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.metrics import psnr
@@ -24,12 +22,11 @@ from ghgs_lit.prediction.export.gltf import glb_bytes
 from ghgs_lit.prediction.export.maps import depth_files, depth_unit, input_files, png, points_ply
 from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
+from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
 from ghgs_lit.prediction.export.video import mp4_bytes
-from ghgs_lit.readers import read_json
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
-from ghgs_lit.runs.results import plain
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
 
@@ -78,9 +75,6 @@ def _html(s: ExportedSubject) -> bytes:
     return page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()
 
 
-#: The file that lists the others.
-REPORT = "report.json"
-
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
     **{name: _converted(name) for name in CONVERTED},
@@ -119,40 +113,10 @@ def output_options(config: Mapping[str, Any]) -> OutputOptions:
 
 
 def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
-    """The names below the directory of all files that :func:`write_prediction` writes of these views."""
+    """The names below the directory of the files that :func:`write_prediction` writes of these views beside
+    the report."""
     names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
-    return [*names, "sheet.png", REPORT]
-
-
-def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
-    """Refuse to replace an input, or a file that :func:`write_prediction` did not write. InputError: names
-    the first such file."""
-    read = {path.resolve() for path in inputs}
-    written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
-    for name in names:
-        path = directory / name
-        if path.resolve() in read:
-            raise InputError(
-                f"{path}: expected another folder (out=...) than that of an input; found the input"
-            )
-        if path.exists() and name not in written:
-            expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
-            raise InputError(f"{path}: expected {expected}; found another file")
-
-
-def _report_before(directory: Path) -> dict[str, Any]:
-    """The report of an earlier prediction in a directory; empty where there is none."""
-    try:
-        report = read_json(directory / REPORT)
-    except InputError:
-        return {}
-    return report if isinstance(report, dict) and isinstance(report.get("files"), dict) else {}
-
-
-def _written_before(directory: Path) -> list[str]:
-    report = _report_before(directory)
-    earlier = report.get("earlier_files")
-    return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]
+    return [*names, "sheet.png"]
 
 
 @torch.no_grad()
@@ -182,14 +146,9 @@ def write_prediction(
         InputError: several subjects, or a file of another origin is in the way.
     """
     subject = exported_subject(batch, prediction, renderer, options)
-    names = output_files(options, subject.views)
-    require_free(directory, names)
-    earlier = [n for n in _written_before(directory) if n not in names and (directory / n).exists()]
-    # Before the files: those of a run that is cut off are known as ours, too.
-    known = {"files": dict.fromkeys(names[:-1]), "earlier_files": earlier}
-    write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
-    paths, seconds = [directory / name for name in names[:-1]], {}
-    files = iter(paths)
+    names, seconds = output_files(options, subject.views), {}
+    earlier = begin_files(directory, names)
+    files = iter([directory / name for name in names])
     with ThreadPoolExecutor(allowed_cores()) as pool:
         pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
         tasks = {}
@@ -199,31 +158,19 @@ def write_prediction(
             count = len(FORMATS[name].names(subject.views, options.frames))
             places = islice(files, count)
             tasks[name] = [
-                pool.submit(_write, path, made) for made, path in zip(contents, places, strict=True)
+                pool.submit(write_file, path, made) for made, path in zip(contents, places, strict=True)
             ]
             seconds[f"write {name}"] = time.perf_counter() - begin
         seen = batch.cameras if batch.targets is None else batch.targets.cameras
         image = renderer(prediction.gaussians, seen).image
-        _write(next(files), partial(png, sheet(batch, image, 0, prediction.depth, prediction.depth_valid)))
+        overview = sheet(batch, image, 0, prediction.depth, prediction.depth_valid)
+        write_file(next(files), partial(png, overview))
         facts = dict(facts or {})
         report = {**_report(subject), **facts}
         for name, begun in tasks.items():
             seconds[f"write {name}"] += sum(task.result() for task in begun)
     report["seconds"] = {**facts.get("seconds", {}), **seconds}
-    report["files"] = {str(path.relative_to(directory)): path.stat().st_size for path in paths}
-    if earlier:
-        report["earlier_files"] = earlier
-    path = directory / REPORT
-    write_text_atomically(path, json.dumps(plain(report), indent=1, allow_nan=False))
-    return [*paths, path]
-
-
-def _write(path: Path, content: Callable[[], bytes]) -> float:
-    """Make and write a file; returns the seconds that it took."""
-    begin = time.perf_counter()
-    made = content()
-    write_atomically(path, lambda temporary: temporary.write_bytes(made))
-    return time.perf_counter() - begin
+    return end_files(directory, names, report, earlier)
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:

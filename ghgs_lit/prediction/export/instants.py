@@ -1,0 +1,140 @@
+"""What several instants become together: a page that plays them, numbered PLYs and a video."""
+
+import math
+import os
+import shutil
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ghgs_lit.files import write_atomically
+from ghgs_lit.prediction.export.packed import COARSE, pack, unpack
+from ghgs_lit.prediction.export.page import page_of
+from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
+from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
+from ghgs_lit.prediction.export.video import mp4_bytes
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.visualization.pictures import to_uint8
+from ghgs_lit.visualization.turntable import orbit
+
+#: How far the video's camera swings to each side of the first photograph, in radians.
+_SWING = math.radians(20)
+#: The longer side of its pictures in pixels, at least.
+_VIDEO_SIDE = 720
+
+
+class Instants:
+    """Files beside the folders of several instants: for ``html`` ``viewer.html``; for ``ply``
+    ``sequence/0000.ply`` and so on, which other programs import as a sequence; for ``mp4`` ``instants.mp4``.
+
+    The cameras of page and video follow the mean of the subject, smoothed over a second.
+
+    Args:
+        count: how many instants there may be.
+    """
+
+    def __init__(self, count: int, options: OutputOptions):
+        self.count, self.options, self._seconds = count, options, 0.0
+        self.folders: list[Path] = []
+        self._first: ExportedSubject | None = None
+        self._packed: list[bytes] = []
+        self._means: list[np.ndarray] = []
+        self._boxes: list[np.ndarray] = []
+
+    @property
+    def files(self) -> list[str]:
+        """The names below the directory of all instants that there may be."""
+        numbered = [f"sequence/{number:04d}.ply" for number in range(self.count)]
+        names = {"html": ["viewer.html"], "ply": numbered, "mp4": ["instants.mp4"]}
+        return [name for format in names if format in self.options.formats for name in names[format]]
+
+    def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:
+        """Keep of the next instant what the files need: a few bytes for each Gaussian. ``folder``: of its own
+        files; ``renderer``: draws the video."""
+        self.folders.append(folder)
+        if not {"html", "mp4"} & {*self.options.formats}:
+            return
+        begin = time.perf_counter()
+        subject = exported_subject(batch, prediction, renderer, self.options)
+        self._first = self._first or subject
+        self._packed.append(pack(subject.gaussians, self._first.pixel, self._first.center, COARSE))
+        points = subject.body if len(subject.body) else subject.center[None]
+        self._means.append(points.mean(0).cpu().numpy())
+        self._boxes.append(torch.stack((points.amin(0), points.amax(0))).cpu().numpy())
+        self._seconds += time.perf_counter() - begin
+
+    def write(self, directory: Path) -> list[Path]:
+        """Write the files after all instants are added and their own files are written.
+
+        Returns:
+            What was written, the report of these files last; nothing where ``formats`` has none of them.
+
+        Raises:
+            InputError: a file of another origin is in the way.
+        """
+        contents: dict[str, Callable[[], bytes]] = {"viewer.html": self._page, "instants.mp4": self._video}
+        self.count = len(self.folders)
+        names = self.files
+        if not names:
+            return []
+        earlier = begin_files(directory, names)
+        # Of a longer sequence: other programs would play these, too.
+        for name in [name for name in earlier if name.startswith("sequence/")]:
+            (directory / name).unlink()
+            earlier.remove(name)
+        seconds, sources = {"code": self._seconds}, iter(self.folders)
+        for name in names:
+            if name in contents:
+                seconds[f"write {name}"] = write_file(directory / name, contents[name])
+            else:
+                source = next(sources) / "gaussians.ply"
+                write_atomically(directory / name, partial(_link, source))
+        report = {"instants": [folder.name for folder in self.folders], "seconds": seconds}
+        return end_files(directory, names, report, earlier)
+
+    def _path(self) -> np.ndarray:
+        """How far the subject's smoothed mean is from that of the first instant [n, 3]."""
+        reach = self.options.fps // 2
+        # Turned about the ends, so that a steady walk stays what it is.
+        padded = np.pad(np.stack(self._means), ((reach, reach), (0, 0)), "reflect", reflect_type="odd")
+        weights = np.hanning(2 * reach + 3)[1:-1]
+        windows = np.lib.stride_tricks.sliding_window_view(padded, len(weights), axis=0)
+        means = windows @ (weights / weights.sum())
+        return means - means[0]
+
+    def _page(self) -> bytes:
+        first, name = self._first, self.folders[0].parent.name
+        facts = (first.gaussians, first.cameras, first.views, first.up, first.center, name)
+        return page_of(self._packed, COARSE, *facts, self._path().tolist(), self.options.fps).encode()
+
+    def _video(self) -> bytes:
+        """From a camera that swings about the subject and shows all of it."""
+        first, cameras, path = self._first, self._first.cameras, self._path()
+        low, high = (np.stack(self._boxes) - path[:, None]).swapaxes(0, 1)
+        sides = torch.from_numpy(np.stack((low.min(0), high.max(0)), 1)).to(cameras.extrinsics.device)
+        turns = torch.arange(len(path), dtype=torch.float64) * (2 * math.pi / len(path))
+        seen = orbit(cameras, _SWING * turns.sin(), torch.cartesian_prod(*sides))
+        shifts = torch.from_numpy(path).to(seen.extrinsics)
+        seen.extrinsics[:, :3, 3] -= (seen.extrinsics[:, :3, :3] @ shifts[..., None])[..., 0]
+        larger = max(_VIDEO_SIDE / max(seen.height, seen.width), 1.0)
+        seen = seen.resized(round(larger * seen.height), round(larger * seen.width))
+        pictures = []
+        for frame, packed in enumerate(self._packed):
+            gaussians = unpack(packed, first.pixel, first.center, COARSE, first.gaussians)
+            # Large pictures would show gaps.
+            gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
+            pictures.append(to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0]))
+        return mp4_bytes(pictures, self.options.fps)
+
+
+def _link(source: Path, target: Path) -> None:
+    """The same file under another name; a copy where the file system has no links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)

@@ -1,0 +1,82 @@
+"""``report.json`` of a directory: it says which files are ours, which alone are replaced."""
+
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.files import write_atomically, write_text_atomically
+from ghgs_lit.readers import read_json
+from ghgs_lit.runs.results import plain
+
+#: The file that lists the others.
+REPORT = "report.json"
+
+
+def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
+    """Refuse to replace an input, or a file of ``names`` or a report that no earlier prediction wrote.
+    InputError: names the first such file."""
+    read = {path.resolve() for path in inputs}
+    written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
+    for name in (*names, REPORT):
+        path = directory / name
+        if path.resolve() in read:
+            raise InputError(
+                f"{path}: expected another folder (out=...) than that of an input; found the input"
+            )
+        if path.exists() and name not in written:
+            expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
+            raise InputError(f"{path}: expected {expected}; found another file")
+
+
+def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
+    """Note files that are about to be written; those of a run that is cut off are known as ours, too.
+
+    Returns:
+        Files of earlier predictions that stay, for :func:`end_files`.
+
+    Raises:
+        InputError: a file of another origin is in the way.
+    """
+    require_free(directory, names)
+    earlier = [n for n in _written_before(directory) if n not in names and (directory / n).exists()]
+    known = {"files": dict.fromkeys(names), "earlier_files": earlier}
+    write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
+    return earlier
+
+
+def end_files(
+    directory: Path, names: Sequence[str], report: Mapping[str, Any], earlier: Sequence[str]
+) -> list[Path]:
+    """Write the report, with the sizes of the files. Returns: their paths, that of the report last."""
+    paths = [directory / name for name in names]
+    sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
+    kept = {"earlier_files": list(earlier)} if earlier else {}
+    text = json.dumps(plain({**report, "files": sizes, **kept}), indent=1, allow_nan=False)
+    write_text_atomically(directory / REPORT, text)
+    return [*paths, directory / REPORT]
+
+
+def write_file(path: Path, content: Callable[[], bytes]) -> float:
+    """Make and write a file. Returns: the seconds that it took."""
+    begin = time.perf_counter()
+    made = content()
+    write_atomically(path, lambda temporary: temporary.write_bytes(made))
+    return time.perf_counter() - begin
+
+
+def _report_before(directory: Path) -> dict[str, Any]:
+    """The report of an earlier prediction in a directory; empty where there is none."""
+    try:
+        report = read_json(directory / REPORT)
+    except InputError:
+        return {}
+    return report if isinstance(report, dict) and isinstance(report.get("files"), dict) else {}
+
+
+def _written_before(directory: Path) -> list[str]:
+    report = _report_before(directory)
+    earlier = report.get("earlier_files")
+    return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]
