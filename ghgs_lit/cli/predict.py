@@ -1,9 +1,10 @@
 """``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
 
+import contextlib
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,9 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
+from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
 from ghgs_lit.prediction.export import (
     REPORT,
     Instants,
@@ -109,7 +112,8 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     folder, options = capture_folder(config), output_options(config)
     several, inputs = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
-    together = Instants(len(directories), options) if several else None
+    others = ["rig.json"] if config["refine_cameras"] else []
+    together = Instants(len(directories), options, others) if several else None
     for name, path in directories.items():
         require_free(path, output_files(options, list(folder.paths[name])), inputs)
     if together:
@@ -126,7 +130,12 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: dict[str, float] = {}
     count, begin = 0, time.perf_counter()
-    for capture, waited in captures_of(folder):
+    rig = None
+    if together and refining["refine_cameras"]:
+        rig, together.others["rig.json"] = rig_of(folder, model, size, refining, renderer)
+        refining["refine_cameras"] = 0
+    for given, waited in captures_of(folder):
+        capture = rig.applied(given) if rig else given
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
         seconds = write_result(directories[capture.name], result, model, renderer, config, options)
@@ -150,6 +159,29 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
             print(f"skip.every={model.skip.every}: {temporal.anew} instants predicted anew", flush=True)
     if left_out:
         print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
+
+
+def rig_of(
+    folder: CaptureFolder,
+    model: GHGS,
+    size: tuple[int, int],
+    refining: Mapping[str, Any],
+    renderer: Renderer,
+) -> tuple[Rig | None, bytes]:
+    """The cameras of a sequence, corrected over some of its instants, and said; and the content of their
+    file. None: they stay, and have no file."""
+    begin, names, captures = time.perf_counter(), folder.instants, []
+    for name in dict.fromkeys(names[round((len(names) - 1) * i / (INSTANTS - 1))] for i in range(INSTANTS)):
+        with contextlib.suppress(InputError):  # one that is left out
+            captures.append(Capture(name, folder.photographs(name)))
+    rounds, masks = refining["refine_cameras"], refining["refine_masks"]
+    rig = corrected_rig(captures, model, size, rounds, masks, renderer) if captures else None
+    if rig is None:
+        return None, b""
+    why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
+    took = time.perf_counter() - begin
+    print(f"{moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
+    return rig, json_text(rig.calibrations(folder, captures[0])).encode()
 
 
 def advice_of(directory: Path) -> Iterator[str]:

@@ -11,6 +11,7 @@ import pytest
 from imageio_ffmpeg import read_frames
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation
+from scipy.spatial.transform import Rotation
 
 from ghgs_lit.cli.predict import moved_line
 from ghgs_lit.weights.checkpoint import write_checkpoint
@@ -136,6 +137,35 @@ def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, 
     assert np.abs(first.astype(int) - second).max() < 8
     one, two = ((here / "splats" / name / "gaussians.ply").read_bytes() for name in ("000", "001"))
     assert one == two
+
+
+def test_cameras_of_a_sequence_are_corrected_once_and_the_next_one_reads_them(here, checkpoint, capsys):
+    cameras = bumped_figure(here)
+    common = (f"checkpoint={checkpoint}", "formats=[ply,inputs]", "turntable.frames=0", "device=cpu")
+    common = (*common, "images=images", "refine_masks=0", "check_cameras=false")
+    assert ghgs("predict", f"cameras={cameras}", "out=splats", "refine_cameras=1", *common) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("refine_cameras: moved")]
+    assert len(said) == 1
+    assert " in all instants; " in said[0]
+    report = json.loads((here / "splats" / "report.json").read_text())
+    assert "rig.json" in report["files"]
+    assert ghgs("predict", "cameras=splats/rig.json", "out=again", "refine_cameras=0", *common) == 0
+    one, two = (json.loads((here / out / "001" / "cameras.json").read_text()) for out in ("splats", "again"))
+    for name, camera in one["cameras"].items():
+        for key in ("intrinsics", "extrinsics"):
+            np.testing.assert_allclose(camera[key], two["cameras"][name][key], atol=1e-5)
+
+
+def bumped_figure(here):
+    """Two instants of a figure; one of its cameras is turned by two degrees."""
+    figure = Figure()
+    pose = np.array(figure.cameras["cam1"]["extrinsics"])
+    turn = Rotation.from_rotvec([0, 0, 2], degrees=True).as_matrix()
+    pose[:3] = turn @ pose[:3]
+    figure.cameras["cam1"]["extrinsics"] = pose.tolist()
+    for instant in ("000", "001"):
+        cameras = figure.write(here / "images" / instant)
+    return cameras
 
 
 def test_a_sequence_goes_on_where_an_instant_lacks_photographs(here, checkpoint, capsys):

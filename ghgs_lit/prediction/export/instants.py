@@ -4,7 +4,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
@@ -36,10 +36,12 @@ class Instants:
 
     Args:
         count: how many instants there may be.
+        others: names and, once they are known, contents of further files.
     """
 
-    def __init__(self, count: int, options: OutputOptions):
+    def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
         self.count, self.options, self._seconds = count, options, 0.0
+        self.others: dict[str, bytes] = dict.fromkeys(others, b"")
         self.folders: list[Path] = []
         self._first: ExportedSubject | None = None
         self._packed: list[bytes] = []
@@ -51,7 +53,8 @@ class Instants:
         """The names below the directory of all instants that there may be."""
         numbered = [f"sequence/{number:04d}.ply" for number in range(self.count)]
         names = {"html": ["viewer.html"], "ply": numbered, "mp4": ["instants.mp4"]}
-        return [name for format in names if format in self.options.formats for name in names[format]]
+        made = [name for format in names if format in self.options.formats for name in names[format]]
+        return [*made, *self.others]
 
     def add(self, folder: Path, batch: Batch, prediction: Prediction, renderer: Renderer) -> None:
         """Keep of the next instant what the files need: a few bytes for each Gaussian. ``folder``: of its own
@@ -78,7 +81,7 @@ class Instants:
             InputError: a file of another origin is in the way.
         """
         contents: dict[str, Callable[[], bytes]] = {"viewer.html": self._page, "instants.mp4": self._video}
-        self.count = len(self.folders)
+        self.count, self.others = len(self.folders), {n: made for n, made in self.others.items() if made}
         names = self.files
         if not names:
             return []
@@ -89,7 +92,9 @@ class Instants:
             earlier.remove(name)
         seconds, sources = {"code": self._seconds}, iter(self.folders)
         for name in names:
-            if name in contents:
+            if name in self.others:
+                write_file(directory / name, partial(self.others.get, name))
+            elif name in contents:
                 seconds[f"write {name}"] = write_file(directory / name, contents[name])
             else:
                 source = next(sources) / "gaussians.ply"

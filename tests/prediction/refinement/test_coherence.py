@@ -274,3 +274,54 @@ def test_phases_weigh_rays_by_what_they_make_small():
     assert weights[0] == 1
     assert 0.2 < weights[1] < 0.3
     assert weights[2] < 1e-3
+
+
+def instants(count=3, views=4, size=98):
+    """The figure at several places of one world, as the elements of a batch in one frame."""
+    cameras, found = ring(1, views, size, size), []
+    for number in range(count):
+        moved = torch.eye(4)
+        moved[:3, 3] = torch.tensor([0.15 * number, 0.0, -0.1 * number])
+        place = dataclasses.replace(cameras, extrinsics=cameras.extrinsics @ moved)
+        parts = [ellipsoid(place.resized(4 * size, 4 * size), *part)[0] for part in _parts()]
+        found.append(torch.nn.functional.avg_pool2d(torch.stack(parts).any(0).float(), 4))
+    alpha = torch.cat(found)
+    lens, pose = (
+        matrix.expand(count, -1, -1, -1).clone() for matrix in (cameras.intrinsics, cameras.extrinsics)
+    )
+    masks, cameras = alpha > 0.5, dataclasses.replace(cameras, intrinsics=lens, extrinsics=pose)
+    batch = Batch(masks[:, :, None].expand(-1, -1, 3, -1, -1).float(), masks, cameras, alpha=alpha)
+    return Frame.of(batch).shared.enter(batch)
+
+
+def corners_off(cameras, truth):
+    """Pixels by which a box around all instants is seen elsewhere in the first's views, root mean square."""
+    corners = HEIGHT / 3 * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    seen = [
+        project(corners.expand(4, -1, -1), each.intrinsics[0][:, None], each.extrinsics[0][:, None])[0]
+        for each in (cameras, truth)
+    ]
+    return float((seen[0] - seen[1]).square().sum(-1).mean().sqrt())
+
+
+def test_instants_of_one_rig_move_its_cameras_alike_and_tell_more_than_one():
+    truth = instants()
+    wrong = dataclasses.replace(truth, cameras=off(truth, 6.0, (2,) * 3).cameras)
+    pose = wrong.cameras.extrinsics[:1].expand(3, -1, -1, -1)
+    wrong = dataclasses.replace(wrong, cameras=dataclasses.replace(truth.cameras, extrinsics=pose))
+    found, free, distance = coherent_cameras(wrong, shared=True)
+    assert (found.extrinsics == found.extrinsics[:1]).all()
+    assert (found.intrinsics == found.intrinsics[:1]).all()
+    assert free.all()
+    assert distance.unique().numel() == 1
+    alone, _, _ = coherent_cameras(wrong)
+    before, together, each = (corners_off(c, truth.cameras) for c in (wrong.cameras, found, alone))
+    assert together < 0.5 * before
+    assert together < 0.85 * each
+
+
+def test_instants_of_exact_cameras_leave_them():
+    truth = instants()
+    found, _, distance = coherent_cameras(truth, shared=True)
+    assert torch.equal(found.extrinsics, truth.cameras.extrinsics)
+    assert (distance < 5e-4).all()

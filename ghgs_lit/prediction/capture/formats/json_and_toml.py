@@ -83,6 +83,11 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
     """Write cameras and the (height, width) of their photographs as :func:`read_json` reads them."""
+    write_text_atomically(path, json_text(cameras))
+
+
+def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str:
+    """What :func:`write_json` writes."""
     from ghgs_lit.prediction.export.maps import camera_entry, cameras_json  # here: it imports PyTorch
 
     entries = {
@@ -90,4 +95,4 @@ def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, i
         | {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
         for name, (camera, size) in cameras.items()
     }
-    write_text_atomically(path, cameras_json(entries) + "\n")
+    return cameras_json(entries) + "\n"

@@ -1,0 +1,140 @@
+"""Cameras of a rig that stands still, corrected once over several instants.
+
+One instant shows one pose, often with a mask that is wrong somewhere; several together say more of the
+cameras, and cameras that are the same in all of them do not flicker.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from ghgs_lit.model import GHGS
+from ghgs_lit.prediction.capture.calibration import Calibration, calibrate
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.crops import Photograph
+from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
+from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.prediction.refinement import CameraRefinement, pixels_moved
+from ghgs_lit.rendering import Renderer
+from ghgs_lit.types import Batch, Cameras
+
+#: Instants, spread over a sequence, that its cameras are corrected with.
+INSTANTS = 8
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Corrected cameras, by name.
+
+    Attributes:
+        extrinsics: [4, 4] float64, world to camera.
+        zoom: by how much their focal lengths grow.
+        moved: pixels of a crop that the correction moved the subject by.
+        why: what the given cameras contradicted, where ``auto`` decided.
+    """
+
+    extrinsics: Mapping[str, np.ndarray]
+    zoom: Mapping[str, float]
+    moved: Mapping[str, float]
+    why: str = ""
+
+    def applied(self, capture: Capture) -> Capture:
+        """The capture with the corrected cameras."""
+        return dataclasses.replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
+
+    def _corrected(self, photograph: Photograph) -> Photograph:
+        intrinsics = photograph.intrinsics.copy()
+        intrinsics[[0, 1], [0, 1]] *= self.zoom[photograph.name]
+        return dataclasses.replace(
+            photograph, intrinsics=intrinsics, extrinsics=self.extrinsics[photograph.name]
+        )
+
+    def calibrations(
+        self, folder: CaptureFolder, capture: Capture
+    ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
+        """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
+
+        Args:
+            capture: one of the folder, with the cameras as they were given.
+        """
+        found = {}
+        for photograph in capture.photographs:
+            stored = folder.file.cameras[photograph.name]
+            size = stored.size or photograph.mask.shape
+            given = calibrate(stored, folder.convention, size)
+            intrinsics = given.intrinsics.copy()
+            intrinsics[[0, 1], [0, 1]] *= self.zoom[photograph.name]
+            # A photograph may be turned upright: what moved is the same before.
+            moved = np.linalg.inv(photograph.extrinsics) @ self.extrinsics[photograph.name]
+            extrinsics = given.extrinsics @ moved
+            found[photograph.name] = (
+                dataclasses.replace(given, intrinsics=intrinsics, extrinsics=extrinsics),
+                size,
+            )
+        return found
+
+
+def corrected_rig(
+    captures: Sequence[Capture],
+    model: GHGS,
+    size: tuple[int, int],
+    rounds: int | Literal["auto"],
+    refine_masks: int | Literal["auto"],
+    renderer: Renderer,
+) -> Rig | None:
+    """The cameras of several instants, corrected together; None: they stay as they are.
+
+    Args:
+        captures: of one rig; those that lack a camera take no part.
+        size: (height, width) of the crops in pixels.
+        rounds: of :class:`CameraRefinement`, at most; ``auto``: 4 where the silhouettes of half of the
+            instants contradict the cameras.
+        refine_masks: as of :func:`ghgs_lit.prediction.capture.predict.predict`.
+    """
+    names = Counter(_names(capture) for capture in captures).most_common(1)[0][0]
+    captures = [capture for capture in captures if _names(capture) == names]
+    batches, doubts = [], []
+    for capture in captures:
+        masks = refine_masks
+        if masks == "auto":
+            masks = ENOUGH if doubt_of_masks(capture, size) else 0
+        batches.append(capture.batch(size, masks))
+        doubts.append(doubt_of_cameras(capture, batches[-1]) if rounds == "auto" else "")
+    contradicted = [doubt for doubt in doubts if doubt]
+    if rounds == "auto":
+        if 2 * len(contradicted) < len(captures):
+            return None
+        rounds = ENOUGH
+    batch = _together(batches).to(next(model.parameters()).device)
+    corrected = CameraRefinement(rounds, model, renderer, shared=True)(batch)
+    before, after = batch.cameras, corrected.cameras
+    zoom = (after.intrinsics / before.intrinsics)[0, :, 0, 0].tolist()
+    if torch.equal(before.extrinsics, after.extrinsics) and torch.equal(before.intrinsics, after.intrinsics):
+        return None
+    extrinsics = dict(zip(names, after.extrinsics[0].double().cpu().numpy(), strict=True))
+    moved = np.mean(pixels_moved(batch, corrected), 0).tolist()
+    why = f"in {len(contradicted)} of {len(captures)} instants {contradicted[0]}" if contradicted else ""
+    return Rig(extrinsics, dict(zip(names, zoom, strict=True)), dict(zip(names, moved, strict=True)), why)
+
+
+def _names(capture: Capture) -> tuple[str, ...]:
+    return tuple(photograph.name for photograph in capture.photographs)
+
+
+def _together(batches: Sequence[Batch]) -> Batch:
+    """The instants as the elements of one batch."""
+    images, masks, alpha, lenses, poses = (
+        torch.cat(parts)
+        for parts in zip(
+            *((b.images, b.masks, b.alpha, b.cameras.intrinsics, b.cameras.extrinsics) for b in batches),
+            strict=True,
+        )
+    )
+    cameras = Cameras(lenses, poses, *masks.shape[2:])
+    subjects, views = zip(*((b.subjects[0], b.views[0]) for b in batches), strict=True)
+    return Batch(images, masks, cameras, alpha=alpha, subjects=subjects, views=views)
