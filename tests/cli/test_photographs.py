@@ -11,9 +11,9 @@ import pytest
 from imageio_ffmpeg import read_frames
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation
-from scipy.spatial.transform import Rotation
 
 from ghgs_lit.cli.predict import moved_line
+from ghgs_lit.prediction.capture.rig import Rig
 from ghgs_lit.weights.checkpoint import write_checkpoint
 from tests.helpers.figures import PARTS, Figure
 from tests.helpers.models import config, make_model
@@ -139,33 +139,41 @@ def test_a_folder_for_each_instant_becomes_a_folder_of_splats(here, checkpoint, 
     assert one == two
 
 
-def test_cameras_of_a_sequence_are_corrected_once_and_the_next_one_reads_them(here, checkpoint, capsys):
-    cameras = bumped_figure(here)
-    common = (f"checkpoint={checkpoint}", "formats=[ply,inputs]", "turntable.frames=0", "device=cpu")
+def test_cameras_of_a_sequence_are_corrected_once_and_the_next_one_reads_them(
+    here, checkpoint, capsys, monkeypatch
+):
+    """What the correction finds (here a shift of each camera) is in the crops of all instants."""
+    for instant in ("000", "001", "002"):
+        cameras = Figure().write(here / "images" / instant)
+    asked = []
+
+    def correct(captures, model, size, rounds, masks, renderer):
+        asked.append(([capture.name for capture in captures], rounds))
+        poses = {photograph.name: photograph.extrinsics.copy() for photograph in captures[0].photographs}
+        for pose in poses.values():
+            pose[0, 3] += 0.05
+        return Rig(poses, dict.fromkeys(poses, 1.02), dict.fromkeys(poses, 1.5))
+
+    monkeypatch.setattr("ghgs_lit.cli.predict.corrected_rig", correct)
+    common = (f"checkpoint={checkpoint}", "formats=[inputs]", "turntable.frames=0", "device=cpu")
     common = (*common, "images=images", "refine_masks=0", "check_cameras=false")
-    assert ghgs("predict", f"cameras={cameras}", "out=splats", "refine_cameras=1", *common) == 0
-    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("refine_cameras: moved")]
-    assert len(said) == 1
-    assert " in all instants; " in said[0]
-    report = json.loads((here / "splats" / "report.json").read_text())
-    assert "rig.json" in report["files"]
+    assert ghgs("predict", f"cameras={cameras}", "out=splats", "refine_cameras=3", *common) == 0
+    assert asked == [(["000", "001", "002"], 3)]
+    out = capsys.readouterr().out
+    assert "refine_cameras: moved by 1.50, 1.50, 1.50, 1.50 pixels in all instants; " in out
+    assert "rig.json" in json.loads((here / "splats" / "report.json").read_text())["files"]
     assert ghgs("predict", "cameras=splats/rig.json", "out=again", "refine_cameras=0", *common) == 0
-    one, two = (json.loads((here / out / "001" / "cameras.json").read_text()) for out in ("splats", "again"))
-    for name, camera in one["cameras"].items():
-        for key in ("intrinsics", "extrinsics"):
-            np.testing.assert_allclose(camera[key], two["cameras"][name][key], atol=1e-5)
-
-
-def bumped_figure(here):
-    """Two instants of a figure; one of its cameras is turned by two degrees."""
-    figure = Figure()
-    pose = np.array(figure.cameras["cam1"]["extrinsics"])
-    turn = Rotation.from_rotvec([0, 0, 2], degrees=True).as_matrix()
-    pose[:3] = turn @ pose[:3]
-    figure.cameras["cam1"]["extrinsics"] = pose.tolist()
-    for instant in ("000", "001"):
-        cameras = figure.write(here / "images" / instant)
-    return cameras
+    given = json.loads(cameras.read_text())["cameras"]
+    for instant in ("000", "002"):
+        one, two = (
+            json.loads((here / out / instant / "cameras.json").read_text()) for out in ("splats", "again")
+        )
+        for name, camera in one["cameras"].items():
+            for key in ("intrinsics", "extrinsics"):
+                np.testing.assert_allclose(camera[key], two["cameras"][name][key], atol=1e-5)
+            assert camera["extrinsics"][0][3] == pytest.approx(given[name]["extrinsics"][0][3] + 0.05)
+    assert ghgs("predict", f"cameras={cameras}", "out=none", "refine_cameras=0", *common) == 0
+    assert not (here / "none" / "rig.json").exists()
 
 
 def test_a_sequence_goes_on_where_an_instant_lacks_photographs(here, checkpoint, capsys):

@@ -157,8 +157,12 @@ def _as_drawn(
     prediction: Prediction, gaussians: Gaussians, batch: Batch, depth: Float[Tensor, "1 V H W"]
 ) -> Prediction:
     """A prediction with other Gaussians, and with the depths of their renders."""
-    valid = batch.masks & (depth > 0)
-    depth = torch.where(valid, depth, 1)
+    valid, drawn = batch.masks, depth > 0
+    # Pixels that no Gaussian covers have the mean depth of their view.
+    mean = (depth.sum((-2, -1), keepdim=True) / drawn.sum((-2, -1), keepdim=True).clamp(min=1)).clamp(
+        min=1e-6
+    )
+    depth = torch.where(valid, torch.where(drawn, depth, mean), 1)
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
     points = dataclasses.replace(prediction.points, pixels=pixels, valid=valid)
     maps = dataclasses.replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)

@@ -60,7 +60,8 @@ def test_the_file_of_a_rig_gives_the_corrected_cameras(tmp_path, orientation):
     same(read, rig.applied(given))
     assert np.abs(read.photographs[1].extrinsics - given.photographs[1].extrinsics).max() > 0.01
     for one, other in zip(given.photographs, read.photographs, strict=True):
-        np.testing.assert_array_equal(one.image, other.image)
+        # Another focal length bends a little otherwise.
+        assert np.abs(one.image.astype(int) - other.image).mean() < 2
 
 
 def captures(tmp_path, count=4):
