@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning.pytorch as L
 import torch
@@ -75,9 +75,7 @@ class CheckpointOptions(Options):
     filename: Text
     """Name of the file, without .ckpt."""
     monitor: Text | None = None
-    """Logged value that is compared at each validation; null: none."""
-    mode: Literal["max", "min"] = "min"
-    """The better direction of monitor."""
+    """Logged value that is compared at each validation, the higher the better; null: none."""
     save_top_k: int = Field(1, ge=-1)
     """Number of files that are kept; -1: all."""
     every_n_train_steps: Index | None = None
@@ -96,6 +94,7 @@ class Checkpoints(ModelCheckpoint):
         arguments = dict(options)
         minutes = arguments.pop("minutes")
         super().__init__(
+            mode="max",
             auto_insert_metric_name=False,
             enable_version_counter=False,
             save_on_train_epoch_end=False,

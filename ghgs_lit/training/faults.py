@@ -6,11 +6,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
-from unittest import mock
 
 import torch
 from torch import Tensor, nn
 
+from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.model import STAGES
 from ghgs_lit.types import Batch, map_tensors
 
@@ -58,8 +58,23 @@ class Fault:
         return f"{self.values} in the {self.where} {self.stage} ({self.place}{sample})"
 
 
-class _Faults(list[Fault]):
-    """Faults in the order in which they are seen."""
+class _Faults(list[Fault], Watcher):
+    """Faults in the order in which they are seen, in results of stages and in gradients of their inputs."""
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
+        """Views of the inputs, whose gradients are those from this stage alone."""
+
+        def view(value: Tensor) -> Tensor:
+            if not value.requires_grad:
+                return value
+            value = value.view_as(value)
+            value.register_hook(lambda slope: self.see("gradient from", "an input", slope, stage))
+            return value
+
+        return map_tensors(inputs, view)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self.see("result of", stage, result)
 
     def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
         """Look at all tensors in ``value``; ``stage`` is the beginning of ``place`` unless it is given."""
@@ -143,38 +158,8 @@ def _watch(module: Steps, faults: _Faults, stack: ExitStack) -> None:
     for name, parameter in model.named_parameters():
         if parameter.requires_grad:
             stack.callback(parameter.register_hook(partial(faults.see, "gradient from", name)).remove)
-    for name in _STAGES:
-        owner = model if name in STAGES else module
-        if (stage := getattr(owner, name, None)) is None:
-            continue
-        target, attribute = (stage, "forward") if isinstance(stage, nn.Module) else (owner, name)
-        watched = _around(getattr(target, attribute), name, faults)
-        stack.enter_context(mock.patch.object(target, attribute, watched))
-
-
-def _own_views(inputs: tuple, stage: str, faults: _Faults) -> tuple:
-    """Views of a stage's inputs, whose gradients are those from this stage alone."""
-
-    def view(value: Tensor) -> Tensor:
-        if not value.requires_grad:
-            return value
-        value = value.view_as(value)
-        value.register_hook(lambda slope: faults.see("gradient from", "an input", slope, stage))
-        return value
-
-    return map_tensors(inputs, view)
-
-
-def _around(stage: Callable[..., Any], name: str, faults: _Faults) -> Callable[..., Any]:
-    """A stage that looks at its result and at the gradients of its inputs."""
-
-    def call(*inputs: Any, **options: Any) -> Any:
-        inputs, options = _own_views((inputs, options), name, faults)
-        result = stage(*inputs, **options)
-        faults.see("result of", name, result)
-        return result
-
-    return call
+    paths = {name: f"model.{name}" if name in STAGES else name for name in _STAGES}
+    stack.enter_context(watched(module, paths, faults))
 
 
 def _one_subject(batch: Batch, element: int) -> Batch:

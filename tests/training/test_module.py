@@ -114,7 +114,7 @@ def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
 def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
     """Checkpoints load with weights_only=True, hold the configuration, and continue the same run."""
     last = CheckpointOptions(filename="last", every_n_train_steps=3).build()
-    best = CheckpointOptions(filename="best", monitor="val/psnr", mode="max").build()
+    best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     whole = module()
     trainer(tmp_path / "a", steps=12, callbacks=[last, best]).fit(whole, loader(), loader(1))
     files = sorted(p.name for p in (tmp_path / "a" / "checkpoints").iterdir())

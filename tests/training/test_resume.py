@@ -54,7 +54,7 @@ def module() -> GHGSModule:
 
 def fit(folder, cut: Cut, resume=None, every=3, more=(), **options):
     torch.manual_seed(11 if resume else 12)  # what the process drew before must not matter
-    best = CheckpointOptions(filename="best", monitor="val/psnr", mode="max").build()
+    best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     last = CheckpointOptions(filename="last", every_n_train_steps=every).build()
     trainer = L.Trainer(
         accelerator="cpu", max_steps=STEPS, max_epochs=-1, default_root_dir=folder,
@@ -374,9 +374,7 @@ def test_minutes_and_steps_both_count(tmp_path, minutes, steps, saved):
 def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):
     """Its score would keep every later one from being written."""
     path = tmp_path / "best.ckpt"
-    before, after = (
-        CheckpointOptions(filename="best", monitor="val/psnr", mode="max").build() for _ in range(2)
-    )
+    before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
     before.dirpath = after.dirpath = str(tmp_path)
     before.best_model_path, before.best_model_score = str(path), torch.tensor(30.0)
     before.best_k_models = {str(path): torch.tensor(30.0)}
