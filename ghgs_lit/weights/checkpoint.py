@@ -27,12 +27,11 @@ STATE_PREFIX = "model."
 _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 
 
-def read_checkpoint(path: str | Path, map_location: Any = "cpu", whole: bool = False) -> dict[str, Any]:
+def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     """Read a checkpoint of this package.
 
     Args:
         path: the file; its tensors are mapped from the disk, not read.
-        map_location: the device of the tensors, as for ``torch.load``.
         whole: read every byte once and refuse a file that was changed since it was written (2 s for 1 GB).
 
     Raises:
@@ -40,7 +39,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu", whole: bool = F
         InputError: the file is not a checkpoint of this package; names what was expected and found.
     """
     _check_sums(path, tensors=False)
-    checkpoint = open_file(path, map_location)
+    checkpoint = open_file(path)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
         if not isinstance(found, kind):
