@@ -90,7 +90,7 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
     """The Trainer with its loggers and callbacks, which all write below ``directory``.
 
     Raises:
-        InputError: the Trainer refuses its options, or the strategy divides parameters among processes.
+        InputError: the Trainer refuses its options.
     """
     logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
     callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
