@@ -11,7 +11,6 @@ import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from pydantic import Field
 
 from ghgs_lit.config.options import Index, Options, Positive, Text
 from ghgs_lit.errors import require
@@ -73,11 +72,9 @@ class CheckpointOptions(Options):
 
     group = "callbacks.checkpoints"
     filename: Text
-    """Name of the file, without .ckpt."""
+    """Name of the file, without .ckpt; with {step} in it all are kept, unless there is a monitor."""
     monitor: Text | None = None
     """Logged value that is compared at each validation, the higher the better; null: none."""
-    save_top_k: int = Field(1, ge=-1)
-    """Number of files that are kept; -1: all."""
     every_n_train_steps: Index | None = None
     """Steps between two checkpoints."""
     minutes: Positive | None = None
@@ -95,6 +92,7 @@ class Checkpoints(ModelCheckpoint):
         minutes = arguments.pop("minutes")
         super().__init__(
             mode="max",
+            save_top_k=-1 if options.monitor is None else 1,
             auto_insert_metric_name=False,
             enable_version_counter=False,
             save_on_train_epoch_end=False,
