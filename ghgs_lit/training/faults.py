@@ -1,18 +1,21 @@
 """The first value of a training step that is not finite: its stage, its place and its subject."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.model import STAGES
 from ghgs_lit.types import Batch, map_tensors
+
+if TYPE_CHECKING:  # it imports this module
+    from ghgs_lit.training.module import GHGSModule
 
 #: What faults are told apart by; other modules belong to the model.
 _STAGES = (*STAGES, "renderer", "losses")
@@ -30,17 +33,6 @@ class Step:
     budget: str | int | None = None
     autocast: torch.dtype | None = None
     scale: float = 1.0
-
-
-class Steps(Protocol):
-    """What runs steps: a :class:`ghgs_lit.training.GHGSModule`."""
-
-    model: nn.Module
-    renderer: Callable[..., Any]
-    losses: Callable[..., Any]
-
-    def forward_losses(self, step: Step) -> tuple[Any, Tensor, Any]:
-        """The prediction, the loss and its terms."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +96,7 @@ def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
             yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
 
 
-def first_fault(module: Steps, step: Step) -> Fault | None:
+def first_fault(module: "GHGSModule", step: Step) -> Fault | None:
     """Run ``step`` again and look at weights, batch, results of all modules and gradients, in this order.
 
     A batch that is at fault is run again subject by subject, to name the one that is at fault alone. Weights
@@ -121,7 +113,7 @@ def first_fault(module: Steps, step: Step) -> Fault | None:
     return fault
 
 
-def _search(module: Steps, step: Step) -> Fault | None:
+def _search(module: "GHGSModule", step: Step) -> Fault | None:
     faults, model, device = _Faults(), module.model, step.batch.images.device.type
     for name, value in (*model.named_parameters(), *model.named_buffers()):
         faults.see("weights of", name, value)
@@ -147,7 +139,7 @@ def _search(module: Steps, step: Step) -> Fault | None:
     return faults[0] if faults else None
 
 
-def _watch(module: Steps, faults: _Faults, stack: ExitStack) -> None:
+def _watch(module: "GHGSModule", faults: _Faults, stack: ExitStack) -> None:
     """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
     model = module.model
     for name, part in model.named_modules():

@@ -211,7 +211,6 @@ NUMBERS = [
     ("train callbacks.pictures.subjects=-1", 1, "callbacks.pictures.subjects: expected", "found -1"),
     ("train callbacks.last.minutes=0", 1, "callbacks.last.minutes: expected", "found 0"),
     ("train callbacks.pictures.token=[1]", 1, "callbacks.pictures.token: expected a list of 3 values"),
-    ("train callbacks.best.mode=best", 1, "callbacks.best.mode: expected one of max, min; found 'best'"),
     ("train metrics.box_margin=-1", 1, "metrics.box_margin: expected a number >= 0; found -1"),
     (
         "predict checkpoint=x turntable.frames=-1",
