@@ -27,7 +27,7 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
         raise InputError(f"test.unit: expected a regular expression; found {error}") from None
     require(unit.groups >= 1, "test.unit", "a regular expression with a group", unit.pattern)
     return t.TableOptions(
-        layout=t.layout_named(config["layout"]),
+        layout=t.LAYOUTS[config["layout"]],
         views=_listed(evaluation["views"]),
         targets=_listed(evaluation["targets"]),
         metrics=_listed(config["columns"]),

@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.errors import choice
 from ghgs_lit.evaluation.tables.records import Planned, Variant
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "depth_error_mm": 1, "gaussians": 0}
@@ -51,12 +50,6 @@ LAYOUTS = {
     "table3": Layout("table3", "methods", "views", (4,), "none", "table3"),
     "table4": Layout("table4", "ablation", "views", (4,), "data", "table4"),
 }
-
-
-def layout_named(name: str) -> Layout:
-    """One of ``LAYOUTS``; another name is an InputError."""
-    choice("layout", name, tuple(LAYOUTS))
-    return LAYOUTS[name]
 
 
 @dataclass(frozen=True)
