@@ -15,7 +15,6 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from ghgs_lit.config.options import Index, Options, Positive, Text
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
-from ghgs_lit.weights.checkpoint import content_digest
 
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
@@ -43,8 +42,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any | None = None
     ) -> None:
         """Replace the file at ``path`` as a whole; ``storage_options`` are not used."""
-        content = {**checkpoint, "digest": content_digest(checkpoint)}
-        write_atomically(path, lambda temporary: torch.save(content, temporary))
+        write_atomically(path, lambda temporary: torch.save(checkpoint, temporary))
 
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
