@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from torch.utils.flop_counter import FlopCounterMode
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from recorder import Recorder, Stage, memory_gb, merged, reset_peak
+from recorder import Recorder, Stage, forget_peak, memory_gb, merged
 
 from ghgs_lit import encoder
 from ghgs_lit.config import compose
@@ -55,7 +55,7 @@ def _patch_tokens_first(model: GHGS, record: Recorder) -> Callable:
         def timed(images, patches):
             with record("patch tokens (ViT)"):
                 found.append(kept(images, patches))
-            reset_peak()
+            forget_peak()
             return found[0]
 
         embed.forward = timed

@@ -1,7 +1,7 @@
 """What per-scene 3D Gaussian splatting reaches after how long: PSNR of the inputs and of both targets.
 
     python benchmarks/per_scene.py data=scans data.root=rendered
-    python benchmarks/per_scene.py data=scans data.root=rendered per_scene.start=hull --people 2 --seconds 1 5
+    python benchmarks/per_scene.py data=scans data.root=rendered --people 2 --seconds 1 5
 
 Further arguments are those of `ghgs evaluate`. Seconds are those that a processor spends on the optimiser,
 in one thread, without the start; means over the first people of the split.
@@ -60,7 +60,7 @@ def main() -> None:
     torch.set_num_threads(1)
     config = resolve(compose("evaluate", options.overrides))
     renderer = build_renderer(config, torch.device("cpu"))
-    method = PerScene(renderer, MANY, config["per_scene"]["start"])
+    method = PerScene(renderer, MANY)
     data, targets = build_data(config), target_protocols(config)
     split, views = config["evaluation"]["split"], config["evaluation"]["views"][0]
     data.prepare_data([split])

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from ghgs_lit.diagnostics.benchmark.memory import memory_bytes, reset_peak, return_free_memory
+from ghgs_lit.kernels.allocation import forget_peak, resident_bytes, return_free_memory
 
 
 @dataclass
@@ -27,7 +27,7 @@ def merged(name: str, stages: list[Stage]) -> Stage:
 
 def memory_gb(field: str) -> float:
     """``VmRSS`` (memory now) or ``VmHWM`` (peak since the last reset) of this process."""
-    return memory_bytes(field) / 1e9
+    return resident_bytes(field) / 1e9
 
 
 class Recorder:
@@ -42,7 +42,7 @@ class Recorder:
     def __call__(self, name: str) -> Iterator[None]:
         return_free_memory()
         before = memory_gb("VmRSS") - self.base
-        reset_peak()
+        forget_peak()
         start = time.perf_counter()
         yield
         seconds = time.perf_counter() - start

@@ -15,7 +15,7 @@ from torch import Tensor
 from ghgs_lit.encoder.rope import rotary_tables
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.geometry.vectors import unit
-from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import bounded_depth
 from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.heads.gaussian import FootprintAttributes
@@ -42,7 +42,7 @@ def inverse_depth() -> list[Row]:
     plain = [1 / (d + 1e-8) for d in (-0.1, 1e-6)]
     half = 1 / (torch.tensor([0.0, 1e-5], dtype=torch.float16) + 1e-8)
     with torch.autocast("cpu", torch.bfloat16):
-        confident = float(CONFIDENCES["expp1"](torch.tensor(100.0)))
+        confident = float(confidence_of(torch.tensor(100.0)))
     return [
         (
             "W1", "z = 1 / (d + 1e-8) at d = -0.1 and 1e-6, as a linear head gives them",

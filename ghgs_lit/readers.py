@@ -66,14 +66,16 @@ def read_json(path: Path, expected: str = "JSON") -> Any:
     return _parsed(path, expected, json.loads)
 
 
-def read_yaml(path: Path, expected: str = "YAML") -> Any:
+def read_yaml(path: Path) -> Any:
     """The plain data of a YAML file; as :func:`read_json`, and without aliases, which grow without limit."""
-    return _parsed(path, expected, _plain_yaml)
+    return _parsed(path, "YAML", _plain_yaml)
 
 
-def read_rows(path: Path, expected: str = "CSV with a header") -> list[dict[str, str]]:
-    """The lines of a CSV file by the names of its header; arguments and errors as for :func:`read_text`."""
-    return _parsed(path, expected, lambda text: list(csv.DictReader(io.StringIO(text, newline=""))))
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The lines of a CSV file by the names of its header; errors as for :func:`read_text`."""
+    return _parsed(
+        path, "CSV with a header", lambda text: list(csv.DictReader(io.StringIO(text, newline="")))
+    )
 
 
 def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:

@@ -171,7 +171,7 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         def build():
             return make_model("model=paper").to(device)
 
-        per_scene = {"steps": 1, "start": "photo_depth"}
+        per_scene = {"steps": 1}
         methods = {name: baseline(name, REFERENCE, build, per_scene) for name in BASELINES}
         methods["model"] = ModelMethod(build().eval(), REFERENCE)
         methods["refined"] = ModelMethod(build().eval(), REFERENCE, Refinement(1, REFERENCE))

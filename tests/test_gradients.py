@@ -20,7 +20,7 @@ from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
-from ghgs_lit.heads.activations import CONFIDENCES, VALUES
+from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth, inverse_linear
 from ghgs_lit.heads.gaussian import FootprintAttributes, release_attributes
 from ghgs_lit.heads.window import Span, Window
@@ -66,8 +66,7 @@ WHOLE, PART = Window.whole((4, 5)), Window(Span(1, 4, 4), Span(0, 4, 5))
 TARGET = Window(Span(3, 7, 9), Span(0, 5, 11))
 #: Function and inputs; raw values stay apart from the places where an activation has a corner.
 FUNCTIONS = {
-    **{f"value {name}": (function, (values(5, 3, low=0.1),)) for name, function in VALUES.items()},
-    **{f"confidence {name}": (function, (values(6),)) for name, function in CONFIDENCES.items()},
+    "confidence": (confidence_of, (values(6),)),
     **{
         f"depth {name}": (
             lambda x, near, far, name=name: bounded_depth(x, near, far, name),

@@ -32,7 +32,7 @@ from ghgs_lit.cli.messages import (
     takes_value,
 )
 from ghgs_lit.cli.usage import VERBS
-from ghgs_lit.config import check_groups, conf_dir, own_keys
+from ghgs_lit.config import conf_dir, own_keys
 from ghgs_lit.config.registry import check
 from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.runs.job import register_resolvers
@@ -73,7 +73,6 @@ class Verb:
             require_paths(self.name, config)
             # Before the verb's module is imported, which takes longer.
             check(config)
-            check_groups(self.name, cfg)
             module = importlib.import_module(module_of(self.name))
             collect_garbage_again()
             return module.run(cfg)

@@ -1,6 +1,5 @@
 """What the verbs that measure begin with: the data, the model of a checkpoint, and the device."""
 
-import copy
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -125,23 +124,24 @@ def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
         require(isinstance(found, Mapping), place, "a stage of the model", found)
     before = {node: trained[node] for node in MODEL_NODES if node in trained}
-    after = copy.deepcopy(before)
+    after = OmegaConf.create(before)
     for key in said():
         if key == "ablation":
             _require_ablation(before)
         if not is_below(key, MODEL_NODES):
             continue
-        value = _plain(cfg, key)
+        value = OmegaConf.select(cfg, key)
         if is_below(key, FREE):
-            _put(after, key, value)
+            OmegaConf.update(after, key, value, merge=False, force_add=True)
         else:
             _require_same(before, key, value)
-    return after
+    return OmegaConf.to_container(after, resolve=True)
 
 
 def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
     """Refuse another value than the one that the weights were trained with; names the first that differs."""
-    for name, wanted in flatten(value, key).items():
+    plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+    for name, wanted in flatten(plain, key).items():
         own = lookup(trained, name)
         same = own == wanted or is_below(name, FREE)
         require(same, name, f"{own!r}, which the checkpoint's weights were trained with", wanted)
@@ -154,18 +154,6 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
         f"{own}, as the checkpoint was trained (recalibration.neighborhood=... and .similarity=... act)"
     )
     require(wanted == own, "ablation", expected, wanted)
-
-
-def _plain(cfg: DictConfig, key: str) -> Any:
-    value = OmegaConf.select(cfg, key)
-    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-
-
-def _put(config: dict[str, Any], key: str, value: Any) -> None:
-    *parents, name = key.split(".")
-    for parent in parents:
-        config = config.setdefault(parent, {})
-    config[name] = value
 
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:

@@ -159,11 +159,11 @@ def flags_first(arguments: Sequence[str]) -> list[str]:
 
 
 def check_deletions(arguments: Sequence[str]) -> None:
-    """Refuse to delete single keys (``~data.size``), which the package reads; groups can be deleted.
+    """Refuse to delete keys and groups (``~data.size``), which the package reads.
 
     Raises:
         InputError: names the key.
     """
     for key in (text[1:].split("=", 1)[0] for text in arguments if text.startswith("~")):
-        if "." in key and not is_below(key, _LIGHTNING):
+        if key in _LIGHTNING or not is_below(key, _LIGHTNING):
             raise InputError(f"{key}: expected a value (or null where it may be empty); found ~{key}")

@@ -42,6 +42,8 @@ from ghgs_lit.training import GHGSModule, loggers, start
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.cost import TrainingCost
 from ghgs_lit.training.interruption import StopAtStep
+from ghgs_lit.weights import switches
+from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def quiet() -> None:
@@ -71,7 +73,7 @@ def prepare_start(config: dict[str, Any], model: GHGS, directory: Path) -> int |
         )
         if rank_zero_only.rank == 0:
             print(start.report(lines, config["init_from"], directory / "init_from.txt"), flush=True)
-            if differing := start.switched(config):
+            if differing := switches.differences(config, read_checkpoint(config["init_from"])["config"]):
                 print(f"the weights were trained in a different model: {', '.join(differing)}", flush=True)
     return resume_step(config, model)
 
@@ -90,7 +92,7 @@ def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -
     """The Trainer with its loggers and callbacks, which all write below ``directory``.
 
     Raises:
-        InputError: the Trainer refuses its options, or the strategy divides parameters among processes.
+        InputError: the Trainer refuses its options.
     """
     logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
     callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]

@@ -28,30 +28,6 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
         GlobalHydra.instance().hydra = running
 
 
-def check_groups(verb: str, cfg: DictConfig) -> None:
-    """Refuse a configuration that lacks a key or group of ``conf/<verb>.yaml``, as after ``~key``.
-
-    Raises:
-        InputError: names the key.
-    """
-    shipped = OmegaConf.to_container(OmegaConf.load(conf_dir() / f"{verb}.yaml"))
-    for entry in shipped.pop("defaults"):
-        if isinstance(entry, dict):
-            shipped |= {name: option for name, option in entry.items() if _has_node(name, option)}
-    for name in shipped:
-        # Hydra's own node is no part of what a verb gets.
-        if name not in cfg and name != "hydra" and not name.startswith("override "):
-            raise InputError(f"{name}: expected a key or group of ghgs {verb}; found none")
-
-
-def _has_node(group: str, option: str | None) -> bool:
-    """Whether an option fills the node of its group; those of the whole configuration may set others only."""
-    path = conf_dir() / group / f"{option}.yaml"
-    if option is None or not path.is_file():
-        return False
-    return not path.read_text().startswith("# @package _global_") or group in OmegaConf.load(path)
-
-
 def saved_text(config: dict[str, Any]) -> str:
     """A resolved configuration as runs save it, in YAML."""
     return f"{HEADER}\n{OmegaConf.to_yaml(OmegaConf.create(config))}"

@@ -66,15 +66,11 @@ class PerScene(Options):
 
     steps: Count = 200
     """Steps of optimisation."""
-    start: Literal["photo_depth", "hull"] = "photo_depth"
-    """Where it starts."""
 
 
 class Timing(Options):
     """How times are taken."""
 
-    warmup: Index = 1
-    """Rounds that do not count."""
     repeats: Count = 9
     """Rounds that count; each runs all presets, and each begins with another one."""
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from ghgs_lit.data.findings import Phase, Seen
 from ghgs_lit.data.reader import Reader
 from ghgs_lit.data.sampling import RING_VIEW
-from ghgs_lit.data.silhouettes import height, supports, twins
+from ghgs_lit.data.silhouettes import SEARCH, height, twins
 
 
 def agreeing(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
@@ -36,7 +36,7 @@ def _compared(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
             broken(one, line) if (one.position, one.view) == (pair[1], RING_VIEW) else one for one in seen
         ]
     silhouettes = [one.silhouette for one in seen]
-    shares = supports(silhouettes)
+    shares = SEARCH.shares(silhouettes)
     tall = height(silhouettes)
     seen = [
         replace(one, agreement=share, tall=tall if one.tall is None else one.tall)

@@ -17,7 +17,7 @@ class Seen:
 
     Attributes:
         iou, inside: how the body fits the mask (:class:`Overlap`), where there is a body.
-        agreement: where there is none, the share of the mask that the other masks allow (:func:`supports`).
+        agreement: where there is none, the share of the mask that the other masks allow.
         tall: its largest side in world units, by its body or by its masks, where that is known.
         silhouette: the coarse mask, where the body does not check the camera.
     """

@@ -17,7 +17,6 @@ from pydantic import Field, model_validator
 from ghgs_lit.config.options import Count, Index, Options, Text
 from ghgs_lit.errors import InputError, require
 
-VIEW_NUMBERS = (0, 1, 2, 3, 4)
 RING_VIEW, MIDDLE_VIEW = 0, 3
 # Streams of random numbers that must not repeat one another.
 _ORDER, _COUNT, _SAMPLE = 0, 1, 2

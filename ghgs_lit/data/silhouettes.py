@@ -10,8 +10,8 @@ from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
 # Side of a mask in cells, at most.
 _CELLS = 64
-# Of many photographs: a quarter of the other masks may be wrong.
-_SEARCH = HullSearch(rays=200, depths=64, reach=1.0, others=12, wrong=0.25)
+#: Of many photographs: a quarter of the other masks may be wrong.
+SEARCH = HullSearch(rays=200, depths=64, reach=1.0, others=12, wrong=0.25)
 # A person covers more of a photograph than this, and less of its border than that.
 _LEAST_SHARE, _MOST_BORDER = 1e-3, 0.5
 
@@ -38,11 +38,6 @@ def implausible(mask: np.ndarray) -> str | None:
             f"expected a subject of {_LEAST_SHARE:.1%} of the photograph or more; found {mask.sum()} pixels"
         )
     return None
-
-
-def supports(silhouettes: Sequence[Silhouette]) -> list[float]:
-    """For each silhouette the share of its cells whose rays meet the visual hull of the others."""
-    return _SEARCH.shares(silhouettes)
 
 
 def height(silhouettes: Sequence[Silhouette]) -> float:

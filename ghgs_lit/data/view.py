@@ -6,8 +6,6 @@ import numpy as np
 
 from ghgs_lit.data.resampling import area_image, area_mask, centered_depth, release_image, release_mask
 
-#: How photographs are resized: by exact areas, or as the authors' code does.
-RESAMPLINGS = ("area", "release")
 _DEPTH_SCALE = 1 << 15
 
 
@@ -81,7 +79,7 @@ def resize_view(view: View, height: int, width: int, resampling: str = "area") -
 
     Args:
         height, width: the new size in pixels.
-        resampling: one of :data:`RESAMPLINGS`. ``area`` keeps everything at its place; ``release`` resizes
+        resampling: ``area`` keeps everything at its place; ``release``, as the authors' code, resizes
             photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Mattes are resized
             as photographs, and the mask is where the subject fills half of a pixel or more. Depth is that at
             the centres of the subject's new pixels in both.

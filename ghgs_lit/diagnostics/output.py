@@ -6,8 +6,7 @@ from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
+from tabulate import tabulate
 
 from ghgs_lit.files import write_atomically
 
@@ -41,8 +40,7 @@ def pivoted(frame: pd.DataFrame, index: str, columns: str, values: str, form: st
 
 def to_markdown(table: pd.DataFrame) -> str:
     """One table, without its title."""
-    lines = [table.columns, ["---"] * len(table.columns), *table.itertuples(index=False)]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    return table.to_markdown(index=False, disable_numparse=True)
 
 
 def document(title: str, notes: Sequence[str], tables: Tables) -> str:
@@ -56,11 +54,7 @@ def document(title: str, notes: Sequence[str], tables: Tables) -> str:
 def print_tables(tables: Tables) -> None:
     """Print tables; a line that wraps is better than a number that is cut."""
     for name, table in tables.items():
-        printed = Table(*map(str, table.columns), title=name)
-        for line in table.itertuples(index=False):
-            printed.add_row(*map(str, line))
-        needed = Console(width=1000).measure(printed).maximum
-        Console(width=max(Console().width, needed)).print(printed)
+        print(name, tabulate(table, "keys", showindex=False, disable_numparse=True), sep="\n\n", end="\n\n")
 
 
 def save_figure(figure: Figure, path: Path) -> None:

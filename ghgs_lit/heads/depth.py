@@ -14,7 +14,7 @@ from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
-from ghgs_lit.heads.activations import CONFIDENCES, bounded_sigmoid
+from ghgs_lit.heads.activations import bounded_sigmoid, confidence_of
 from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import PHOTO_CHANNELS, photo_guide
@@ -147,7 +147,7 @@ class DepthHead(nn.Module):
         return DepthMaps(
             depth=torch.where(finite, depth, 1.0),
             valid=batch.masks & finite,
-            confidence=CONFIDENCES["expp1"](confidence),
+            confidence=confidence_of(confidence),
             bounds=bounds,
         )
 

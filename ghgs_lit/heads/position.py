@@ -13,21 +13,17 @@ SCALE = 0.1
 BASE = 100.0
 
 
-def axis_coordinates(count: int, half_extent: float, dtype: torch.dtype, device=None) -> Float[Tensor, " n"]:
-    """Centres of ``count`` cells between ``-half_extent`` and ``+half_extent``."""
-    bound = half_extent * (count - 1) / count
-    return torch.linspace(-bound, bound, count, dtype=dtype, device=device)
-
-
 @lru_cache(maxsize=64)
 def _axis_waves(
     channels: int, count: int, half_extent: float, dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "c n"]:
-    """Sines, then cosines along one axis times ``SCALE``; computed in float64, returned in float32."""
+    """Sines, then cosines along one axis times ``SCALE``, at the centres of ``count`` cells between
+    ``-half_extent`` and ``+half_extent``; computed in float64, returned in float32."""
     quarter = channels // 2
     exponents = torch.arange(quarter, dtype=torch.float64, device=device) / quarter
     omega = 1.0 / BASE**exponents
-    angles = omega[:, None] * axis_coordinates(count, half_extent, dtype, device).double()
+    bound = half_extent * (count - 1) / count
+    angles = omega[:, None] * torch.linspace(-bound, bound, count, dtype=dtype, device=device).double()
     return torch.cat((angles.sin(), angles.cos())).float() * SCALE
 
 

@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 from ghgs_lit.kernels.bfloat16 import PAIRS, holds_pairs
 from ghgs_lit.kernels.memory import pointer_to
-from ghgs_lit.kernels.simd import I32, I64, LANES, call, constant, floats, indices
+from ghgs_lit.kernels.simd import I32, I64, LANES, call, constant, everywhere, floats
 from ghgs_lit.kernels.tile import PANEL, ROWS
 
 _WORDS = ir.VectorType(I32, LANES)
@@ -29,7 +29,6 @@ def _multiply_add(builder, half: bool, x, y, total):
 def _steps(builder, half: bool, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:
     """Add the products of each row and the panel, over ``steps`` words, to ``totals``."""
     kind = _WORDS if half else floats.llvm
-    undefined = ir.Constant(kind, ir.Undefined)
     with cgutils.for_range(builder, steps, intp=I64) as loop:
         line = builder.gep(panel, [builder.mul(loop.index, ir.Constant(I64, PANEL))])
         parts = []
@@ -39,8 +38,7 @@ def _steps(builder, half: bool, rows, row_stride: int, step_stride: int, panel, 
         first = builder.gep(rows, [builder.mul(loop.index, ir.Constant(I64, step_stride))])
         for r in range(ROWS):
             word = builder.load(builder.gep(first, [ir.Constant(I64, row_stride * r)]))
-            one = builder.insert_element(undefined, word, ir.Constant(I32, 0))
-            x = builder.shuffle_vector(one, undefined, indices([0] * LANES))
+            x = everywhere(builder, word, LANES)
             for part, total in zip(parts, totals[r], strict=True):
                 builder.store(_multiply_add(builder, half, x, part, builder.load(total)), total)
 

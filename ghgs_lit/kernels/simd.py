@@ -58,13 +58,17 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.llvm)
 
 
+def everywhere(builder, number, count: int):
+    """A number in each of ``count`` lanes."""
+    undefined = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
+    one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
+    return builder.shuffle_vector(one, undefined, indices([0] * count))
+
+
 @lower_cast(types.Number, _Floats)
 def _fill(context, builder, source, kind, value):
     """The same number in every lane."""
-    undefined = ir.Constant(kind.llvm, ir.Undefined)
-    number = context.cast(builder, value, source, _SCALARS[kind])
-    one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
-    return builder.shuffle_vector(one, undefined, indices([0] * kind.count))
+    return everywhere(builder, context.cast(builder, value, source, _SCALARS[kind]), kind.count)
 
 
 def _common(*args):

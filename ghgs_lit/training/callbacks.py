@@ -1,18 +1,18 @@
 """What runs beside the training step: a progress bar, times and memory."""
 
-import resource
-import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import Callback, ProgressBar
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from torch import nn
 
 from ghgs_lit.config.options import Options
+from ghgs_lit.kernels.allocation import resident_bytes
+from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
 from ghgs_lit.training.clock import PARTS
 from ghgs_lit.types import Batch
@@ -105,15 +105,6 @@ class RunProgress(ProgressBar):
             self._bar = None
 
 
-def resident_mb() -> float:
-    """Memory of this process in MiB: now on Linux, the maximum so far on other systems."""
-    pages = Path("/proc/self/statm")
-    if pages.exists():
-        return int(pages.read_text().split()[1]) * resource.getpagesize() / 2**20
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-
-
 class CostsOptions(Options):
     """``time_ms/*``: milliseconds of each part of a step; ``memory_mb/*``: of the process and of the GPU."""
 
@@ -121,36 +112,37 @@ class CostsOptions(Options):
         return Costs()
 
 
-class Costs(Callback):
+class Costs(Callback, Watcher):
     """Logs milliseconds of a step and of its parts, and memory in MiB, each since the last log.
 
     Times are means, memory on CUDA is the peak of all tensors. ``time_ms/01_data`` is the wait for data,
-    ``time_ms/step`` the sum of all parts. Validation and the
-    writing of checkpoints and logs are not counted; parts that a model does not have are left out.
+    ``time_ms/step`` the sum of all parts. Validation and the writing of checkpoints and logs are not counted;
+    parts that a model does not have are left out.
     """
 
-    #: Stages of the model: name, the part that ends where the stage begins, the part that the stage is.
-    STAGES = (
-        ("encoder", "interval", "encode"),
-        ("depth_head", None, "depth"),
-        ("recalibration", "unproject", "recalibrate"),
-        ("gaussian_head", None, "gaussians"),
-        ("rounds", None, "rounds"),
-    )
+    #: Stages of the model: the part that ends where the stage begins, the part that the stage is.
+    STAGES: ClassVar = {
+        "encoder": ("interval", "encode"),
+        "depth_head": (None, "depth"),
+        "recalibration": ("unproject", "recalibrate"),
+        "gaussian_head": (None, "gaussians"),
+        "rounds": (None, "rounds"),
+    }
 
     def __init__(self):
-        self._hooks: list = []
+        self._stack = ExitStack()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        parts = pl_module.clock
-        for name, before, part in self.STAGES:
-            stage = getattr(pl_module.model, name, None)
-            if isinstance(stage, nn.Module):
-                if before is not None:
-                    hook = stage.register_forward_pre_hook(lambda *_, part=before: parts.mark(part))
-                    self._hooks.append(hook)
-                self._hooks.append(stage.register_forward_hook(lambda *_, part=part: parts.mark(part)))
-        parts.start(pl_module.device)
+        self._clock = pl_module.clock
+        self._stack.enter_context(watched(pl_module.model, {name: name for name in self.STAGES}, self))
+        self._clock.start(pl_module.device)
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        if (before := self.STAGES[stage][0]) is not None:
+            self._clock.mark(before)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self._clock.mark(self.STAGES[stage][1])
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         pl_module.clock.mark("data")
@@ -164,7 +156,7 @@ class Costs(Callback):
             names = {part: f"{number:02d}_{part}" for number, part in enumerate(PARTS, start=1)}
             means = pl_module.clock.means()
             pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
-            pl_module.log("memory_mb/process", resident_mb())
+            pl_module.log("memory_mb/process", resident_bytes() / 2**20)
             if pl_module.device.type == "cuda":
                 peak = torch.cuda.max_memory_allocated(pl_module.device)
                 pl_module.log("memory_mb/cuda_peak", peak / 2**20)
@@ -172,5 +164,4 @@ class Costs(Callback):
 
     def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         pl_module.clock.stop()
-        while self._hooks:
-            self._hooks.pop().remove()
+        self._stack.close()

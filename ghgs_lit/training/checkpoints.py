@@ -5,18 +5,16 @@ import shutil
 from collections.abc import Mapping
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from pydantic import Field
 
 from ghgs_lit.config.options import Index, Options, Positive, Text
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
-from ghgs_lit.weights.checkpoint import content_digest
 
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
@@ -44,8 +42,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any | None = None
     ) -> None:
         """Replace the file at ``path`` as a whole; ``storage_options`` are not used."""
-        content = {**checkpoint, "digest": content_digest(checkpoint)}
-        write_atomically(path, lambda temporary: torch.save(content, temporary))
+        write_atomically(path, lambda temporary: torch.save(checkpoint, temporary))
 
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
@@ -73,13 +70,9 @@ class CheckpointOptions(Options):
 
     group = "callbacks.checkpoints"
     filename: Text
-    """Name of the file, without .ckpt."""
+    """Name of the file, without .ckpt; with {step} in it all are kept, unless there is a monitor."""
     monitor: Text | None = None
-    """Logged value that is compared at each validation; null: none."""
-    mode: Literal["max", "min"] = "min"
-    """The better direction of monitor."""
-    save_top_k: int = Field(1, ge=-1)
-    """Number of files that are kept; -1: all."""
+    """Logged value that is compared at each validation, the higher the better; null: none."""
     every_n_train_steps: Index | None = None
     """Steps between two checkpoints."""
     minutes: Positive | None = None
@@ -96,6 +89,8 @@ class Checkpoints(ModelCheckpoint):
         arguments = dict(options)
         minutes = arguments.pop("minutes")
         super().__init__(
+            mode="max",
+            save_top_k=-1 if options.monitor is None else 1,
             auto_insert_metric_name=False,
             enable_version_counter=False,
             save_on_train_epoch_end=False,

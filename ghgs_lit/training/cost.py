@@ -1,14 +1,13 @@
 """What training costs: seconds and memory, over all sessions of a run."""
 
-import resource
-import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import Callback
+
+from ghgs_lit.kernels.allocation import forget_peak, resident_bytes
 
 
 class TrainingCost(Callback):
@@ -29,7 +28,7 @@ class TrainingCost(Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._started, self._device = time.perf_counter(), pl_module.device
         if self._device.type != "cuda":
-            _forget_peak()
+            forget_peak()  # the runs of a sweep share a process
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
         if self._device.type == "cuda":  # its peak may be reset at any step
@@ -49,7 +48,7 @@ class TrainingCost(Callback):
         if self._started is None:
             return self._peak
         on_gpu = self._device.type == "cuda"
-        now = torch.cuda.max_memory_allocated(self._device) if on_gpu else _peak_resident_bytes()
+        now = torch.cuda.max_memory_allocated(self._device) if on_gpu else resident_bytes("VmHWM")
         return max(self._peak, now)
 
     def state_dict(self) -> dict[str, Any]:
@@ -57,18 +56,3 @@ class TrainingCost(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._earlier, self._peak = state_dict["seconds"], state_dict["peak_bytes"]
-
-
-def _peak_resident_bytes() -> int:
-    """The highest memory of this process, on Linux since :func:`_forget_peak`."""
-    unit = 1 if sys.platform == "darwin" else 2**10
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
-def _forget_peak() -> None:
-    """Start the peak afresh: the runs of a sweep share a process. Only Linux can."""
-    switch = Path("/proc/self/clear_refs")
-    try:
-        switch.write_text("5")
-    except OSError:  # another system, or a container that forbids it: the peak is the process's
-        return

@@ -1,18 +1,21 @@
 """The first value of a training step that is not finite: its stage, its place and its subject."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
-from unittest import mock
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.model import STAGES
 from ghgs_lit.types import Batch, map_tensors
+
+if TYPE_CHECKING:  # it imports this module
+    from ghgs_lit.training.module import GHGSModule
 
 #: What faults are told apart by; other modules belong to the model.
 _STAGES = (*STAGES, "renderer", "losses")
@@ -32,17 +35,6 @@ class Step:
     scale: float = 1.0
 
 
-class Steps(Protocol):
-    """What runs steps: a :class:`ghgs_lit.training.GHGSModule`."""
-
-    model: nn.Module
-    renderer: Callable[..., Any]
-    losses: Callable[..., Any]
-
-    def forward_losses(self, step: Step) -> tuple[Any, Tensor, Any]:
-        """The prediction, the loss and its terms."""
-
-
 @dataclass(frozen=True)
 class Fault:
     """A value that is not finite; ``place`` is its tensor, ``sample`` the subject that is at fault alone."""
@@ -58,8 +50,23 @@ class Fault:
         return f"{self.values} in the {self.where} {self.stage} ({self.place}{sample})"
 
 
-class _Faults(list[Fault]):
-    """Faults in the order in which they are seen."""
+class _Faults(list[Fault], Watcher):
+    """Faults in the order in which they are seen, in results of stages and in gradients of their inputs."""
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
+        """Views of the inputs, whose gradients are those from this stage alone."""
+
+        def view(value: Tensor) -> Tensor:
+            if not value.requires_grad:
+                return value
+            value = value.view_as(value)
+            value.register_hook(lambda slope: self.see("gradient from", "an input", slope, stage))
+            return value
+
+        return map_tensors(inputs, view)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self.see("result of", stage, result)
 
     def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
         """Look at all tensors in ``value``; ``stage`` is the beginning of ``place`` unless it is given."""
@@ -89,7 +96,7 @@ def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
             yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
 
 
-def first_fault(module: Steps, step: Step) -> Fault | None:
+def first_fault(module: "GHGSModule", step: Step) -> Fault | None:
     """Run ``step`` again and look at weights, batch, results of all modules and gradients, in this order.
 
     A batch that is at fault is run again subject by subject, to name the one that is at fault alone. Weights
@@ -106,7 +113,7 @@ def first_fault(module: Steps, step: Step) -> Fault | None:
     return fault
 
 
-def _search(module: Steps, step: Step) -> Fault | None:
+def _search(module: "GHGSModule", step: Step) -> Fault | None:
     faults, model, device = _Faults(), module.model, step.batch.images.device.type
     for name, value in (*model.named_parameters(), *model.named_buffers()):
         faults.see("weights of", name, value)
@@ -132,7 +139,7 @@ def _search(module: Steps, step: Step) -> Fault | None:
     return faults[0] if faults else None
 
 
-def _watch(module: Steps, faults: _Faults, stack: ExitStack) -> None:
+def _watch(module: "GHGSModule", faults: _Faults, stack: ExitStack) -> None:
     """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
     model = module.model
     for name, part in model.named_modules():
@@ -143,38 +150,8 @@ def _watch(module: Steps, faults: _Faults, stack: ExitStack) -> None:
     for name, parameter in model.named_parameters():
         if parameter.requires_grad:
             stack.callback(parameter.register_hook(partial(faults.see, "gradient from", name)).remove)
-    for name in _STAGES:
-        owner = model if name in STAGES else module
-        if (stage := getattr(owner, name, None)) is None:
-            continue
-        target, attribute = (stage, "forward") if isinstance(stage, nn.Module) else (owner, name)
-        watched = _around(getattr(target, attribute), name, faults)
-        stack.enter_context(mock.patch.object(target, attribute, watched))
-
-
-def _own_views(inputs: tuple, stage: str, faults: _Faults) -> tuple:
-    """Views of a stage's inputs, whose gradients are those from this stage alone."""
-
-    def view(value: Tensor) -> Tensor:
-        if not value.requires_grad:
-            return value
-        value = value.view_as(value)
-        value.register_hook(lambda slope: faults.see("gradient from", "an input", slope, stage))
-        return value
-
-    return map_tensors(inputs, view)
-
-
-def _around(stage: Callable[..., Any], name: str, faults: _Faults) -> Callable[..., Any]:
-    """A stage that looks at its result and at the gradients of its inputs."""
-
-    def call(*inputs: Any, **options: Any) -> Any:
-        inputs, options = _own_views((inputs, options), name, faults)
-        result = stage(*inputs, **options)
-        faults.see("result of", name, result)
-        return result
-
-    return call
+    paths = {name: f"model.{name}" if name in STAGES else name for name in _STAGES}
+    stack.enter_context(watched(module, paths, faults))
 
 
 def _one_subject(batch: Batch, element: int) -> Batch:

@@ -1,6 +1,7 @@
 """Loggers that continue after a restart, and the values that a sweep compares its runs by."""
 
 import importlib.util
+import os
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from lightning.pytorch.utilities import rank_zero_only
 
 from ghgs_lit.config.keys import NOT_HYPERPARAMETERS, is_below, lookup
-from ghgs_lit.config.options import Options, Text
+from ghgs_lit.config.options import Options
 from ghgs_lit.errors import InputError
 from ghgs_lit.readers import read_rows
 
@@ -100,20 +101,14 @@ class WandbLog(_StepsTaken, WandbLogger):
 
 
 class WandbOptions(Options):
-    """Weights & Biases (extra ``wandb``)."""
-
-    group = "logger.wandb"
-    project: Text = "ghgs_lit"
-    """Project that the run belongs to."""
-    offline: bool = False
-    """Whether only files are written, for `wandb sync` later."""
+    """Weights & Biases (extra ``wandb``); ``WANDB_PROJECT`` and ``WANDB_MODE`` of the environment count."""
 
     def build(self, save_dir: str) -> WandbLog:
         if importlib.util.find_spec("wandb") is None:
             raise InputError(
                 "logger.wandb: expected the package wandb (pip install 'ghgs-lit[wandb]'); found none"
             )
-        return WandbLog(project=self.project, offline=self.offline, save_dir=save_dir)
+        return WandbLog(project=os.environ.get("WANDB_PROJECT", "ghgs_lit"), save_dir=save_dir)
 
 
 @rank_zero_only

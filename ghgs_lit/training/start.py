@@ -12,7 +12,6 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import resolved
 from ghgs_lit.training.checkpoints import check_training_state
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint, require_finite, shape_of
-from ghgs_lit.weights.switches import differences as differing_switches
 
 
 def check_start(config: Mapping[str, Any], directory: Path) -> None:
@@ -136,11 +135,6 @@ def with_origin(config: Mapping[str, Any], model: nn.Module) -> Mapping[str, Any
         if name.startswith("encoder.semantic." if has_branch else "encoder.")
     )
     return {**config, "encoder": {**config["encoder"], "weights": origin}} if origin and fits else config
-
-
-def switched(config: Mapping[str, Any]) -> list[str]:
-    """Switches (:mod:`ghgs_lit.weights.switches`) in which this model differs from that of ``init_from``."""
-    return differing_switches(config, read_checkpoint(config["init_from"])["config"])
 
 
 def report(lines: list[str], path: str | Path, written: Path) -> str:

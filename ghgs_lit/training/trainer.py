@@ -3,13 +3,12 @@
 from typing import Annotated, Any, Literal
 
 import lightning.pytorch as L
-from lightning.pytorch.strategies import DeepSpeedStrategy, FSDPStrategy, ModelParallelStrategy
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
 from ghgs_lit.config.options import Amount, Count, Index, Options, Share, Text
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 
 Duration = Annotated[
     Annotated[str, Field(pattern=r"^\d+(:\d+){3}$")] | dict[str, Amount],
@@ -24,9 +23,7 @@ class TrainerOptions(Options):
     accelerator: Text = "gpu"
     """gpu, cpu or auto."""
     devices: Count | tuple[Index, ...] | Literal[-1, "auto"] = 1
-    """Number of processes, or a list of GPUs."""
-    strategy: Text = "auto"
-    """auto, or for several processes ddp_find_unused_parameters_true."""
+    """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters."""
     precision: Text | Literal[16, 32, 64] = "32-true"
     """32-true (the paper's), bf16-mixed or 16-mixed."""
     max_steps: int = Field(200000, ge=-1)
@@ -45,14 +42,13 @@ class TrainerOptions(Options):
     """true: only deterministic operations, where PyTorch has them."""
 
     def build(self, **arguments: Any) -> L.Trainer:
-        """The Trainer, with further ``arguments`` of it.
-
-        Raises:
-            InputError: the Trainer refuses its options, or the strategy divides parameters among processes.
-        """
+        """The Trainer, with further ``arguments`` of it; InputError: it refuses its options."""
+        alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
         try:
-            trainer = L.Trainer(
+            return L.Trainer(
                 **dict(self),
+                # Not every parameter has a gradient in every step (ablations, skipped work).
+                strategy="auto" if alone else "ddp_find_unused_parameters_true",
                 max_epochs=-1,
                 check_val_every_n_epoch=None,  # validations are counted in steps
                 num_sanity_val_steps=0,
@@ -62,16 +58,3 @@ class TrainerOptions(Options):
             )
         except (MisconfigurationException, RuntimeError, TypeError, ValueError) as error:
             raise InputError(f"trainer: {error}") from None
-        require_whole_parameters(trainer)
-        return trainer
-
-
-def require_whole_parameters(trainer: L.Trainer) -> None:
-    """Refuse strategies that divide parameters among processes: each would clip by the norm of its shard.
-
-    Raises:
-        InputError: such a strategy is configured.
-    """
-    sharded = isinstance(trainer.strategy, (FSDPStrategy, ModelParallelStrategy, DeepSpeedStrategy))
-    expected = "auto or a kind of ddp, whose processes have all parameters to clip the gradient by"
-    require(not sharded, "trainer.strategy", expected, type(trainer.strategy).__name__)

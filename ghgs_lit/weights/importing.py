@@ -9,19 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import describe, require_shape, shape_of, write_checkpoint
 from ghgs_lit.weights.hub import fetch, is_repository, sha256
 from ghgs_lit.weights.reading import cast, open_file
 
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
-
 #: The files' names in messages.
 KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}
-
-#: What the depth head starts from without a checkpoint of the release.
-DEPTH_STARTS = ("fresh", "vggt")
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,6 @@ class Source:
 def sources(vggt: str | None, release: str | None, depth_head: str = "fresh") -> Iterator[Source]:
     """The files to read; a repository of the hub is downloaded first."""
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
-    choice("depth_head_start", depth_head, DEPTH_STARTS)
     use_depth = depth_head == "vggt" and release is None
     table = names.VGGT | (names.VGGT_DEPTH if use_depth else {})
     ignored = names.VGGT_DEPTH_IGNORED + names.VGGT_IGNORED
@@ -127,14 +121,13 @@ def import_weights(
         out: the checkpoint to write.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
         release: the authors' checkpoint; None without it.
-        dtype: precision of the encoder in the checkpoint (``DTYPES``); the heads are always float32.
-        depth_head: what the depth head starts from without ``release`` (``DEPTH_STARTS``).
+        dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
+        depth_head: what the depth head starts from without ``release``, ``fresh`` or ``vggt``.
 
     Raises:
         FileNotFoundError: a file is missing.
         InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
-    choice("dtype", dtype, tuple(DTYPES))
     files = list(sources(vggt, release, depth_head))
     for source in files:
         same = Path(out).exists() and Path(out).samefile(source.path)
@@ -144,7 +137,7 @@ def import_weights(
 
     def precision(name: str, stored: torch.dtype) -> torch.dtype:
         # Depths and offsets of millimetres depend on the digits of the heads.
-        return DTYPES[dtype] if name.startswith("encoder.") else torch.float32
+        return getattr(torch, dtype) if name.startswith("encoder.") else torch.float32
 
     for source in files:
         found = cast(source.used_tensors, precision)

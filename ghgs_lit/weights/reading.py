@@ -40,14 +40,10 @@ def file_of(path: str | Path) -> Path:
     return SHIPPED_FILE if str(path) == SHIPPED else Path(path).expanduser()
 
 
-def open_file(path: str | Path, map_location: Any = "cpu") -> Any:
+def open_file(path: str | Path) -> Any:
     """The content of a safetensors or PyTorch file; its format is read from its first bytes.
 
-    Nothing in the file is ever executed (``weights_only=True``).
-
-    Args:
-        path: the file, or :data:`SHIPPED`.
-        map_location: the device of the tensors, as for ``torch.load``.
+    Nothing in the file is ever executed (``weights_only=True``). ``path``: the file, or :data:`SHIPPED`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -58,11 +54,11 @@ def open_file(path: str | Path, map_location: Any = "cpu") -> Any:
     if start.startswith(ZIP):
         if not zipfile.is_zipfile(path):
             raise _unfit(path, "the beginning of a PyTorch file whose end is missing (truncated)")
-        return _open_torch(path, map_location, mmap=True)
+        return _open_torch(path, mmap=True)
     if start.startswith(PICKLE):  # files of PyTorch before 1.6 cannot be mapped
-        return _open_torch(path, map_location, mmap=False)
+        return _open_torch(path, mmap=False)
     if start[8:9] == b"{":
-        return _open_safetensors(path, map_location)
+        return _open_safetensors(path)
     raise _unfit(path, f"neither; its first bytes are {start[:16]!r}")
 
 
@@ -88,13 +84,13 @@ def require_weights(path: str | Path) -> bytes:
     return start
 
 
-def _open_torch(path: Path, map_location: Any, mmap: bool) -> Any:
+def _open_torch(path: Path, mmap: bool) -> Any:
     import torch
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about foreign pickles, which are refused below
-            return torch.load(path, map_location=map_location, weights_only=True, mmap=mmap)
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
         text = str(error)
         code = re.search(r"GLOBAL ([\w.]+)", text)
@@ -107,11 +103,11 @@ def _open_torch(path: Path, map_location: Any, mmap: bool) -> Any:
         raise _unfit(path, found) from error
 
 
-def _open_safetensors(path: Path, map_location: Any) -> "dict[str, Tensor]":
+def _open_safetensors(path: Path) -> "dict[str, Tensor]":
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, "pt", device=str(map_location)) as file:
+        with safe_open(path, "pt") as file:
             return {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         text = str(error)

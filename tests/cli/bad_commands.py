@@ -64,12 +64,12 @@ MISSPELT = [
     ("import compat=relase out=x", 1, "compat: expected one of none, release", "did you mean release?"),
     ("train +optimizer.lrr=1", 1, "optimizer", "lrr"),
     ("train +seed=3", 1, "+seed=3: expected", "already at 'seed'"),
-    ("train ~sed", 1, "~sed: expected", "does not exist"),
+    ("train ~sed", 1, "sed: expected a value", "~sed"),
 ]
 
 MISSING = [
-    ("train ~optimizer", 1, "optimizer: expected a key or group of ghgs train; found none"),
-    ("train ~seed", 1, "seed: expected a key or group of ghgs train; found none"),
+    ("train ~optimizer", 1, "optimizer: expected a value", "~optimizer"),
+    ("train ~seed", 1, "seed: expected a value", "~seed"),
     ("train optimizer=null", 1, "optimizer=null: expected"),
     ("train 'seed=${{foo}}'", 1, "seed: expected a value that can be resolved", "'foo'"),
     ("train seed=", 1, "seed: expected an integer", "found ''"),
@@ -211,7 +211,6 @@ NUMBERS = [
     ("train callbacks.pictures.subjects=-1", 1, "callbacks.pictures.subjects: expected", "found -1"),
     ("train callbacks.last.minutes=0", 1, "callbacks.last.minutes: expected", "found 0"),
     ("train callbacks.pictures.token=[1]", 1, "callbacks.pictures.token: expected a list of 3 values"),
-    ("train callbacks.best.mode=best", 1, "callbacks.best.mode: expected one of max, min; found 'best'"),
     ("train metrics.box_margin=-1", 1, "metrics.box_margin: expected a number >= 0; found -1"),
     (
         "predict checkpoint=x turntable.frames=-1",

@@ -16,10 +16,10 @@ from ghgs_lit.encoder.block import REGISTERS
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
-from ghgs_lit.heads.activations import split_activated
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
+from tests.helpers.activations import split_activated
 from tests.helpers.encoders import make_encoder
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"

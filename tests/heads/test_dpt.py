@@ -8,7 +8,6 @@ from torch import nn
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.vectors import unit
-from ghgs_lit.heads.activations import split_activated
 from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
 from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.types import Tokens
@@ -206,23 +205,8 @@ def test_unit_of_zero_is_zero_with_a_finite_gradient():
     assert x.grad.isfinite().all()
 
 
-def test_activations_are_wide():
-    """exp of a half-precision value must not overflow."""
-    raw = torch.full((1, 2, 1, 1), 30.0, dtype=torch.float16)
-    value, confidence = split_activated(raw, "exp")
-    assert value.dtype == torch.float32
-    assert value.isfinite().all()
-    assert confidence.isfinite().all()
-
-
 def test_wrong_number_of_layers_is_refused():
     """An encoder that reads out other layers must be refused by name."""
     tokens = _tokens()
     with pytest.raises(InputError, match=r"tokens.latent: expected four layers; found 3"):
         _head()(dataclasses.replace(tokens, latent=tokens.latent[:3]))
-
-
-def test_unknown_activation_is_refused():
-    """A misspelt activation must be refused by name."""
-    with pytest.raises(InputError, match="value activation"):
-        split_activated(torch.zeros(1, 2, 1, 1), "tan")

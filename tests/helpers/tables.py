@@ -75,7 +75,7 @@ def start_run(folder: Path, ablation, seed=1, **changes) -> None:
 def tables_of(folder: Path, layout="ablation", by=(), others=(), illustration=False, **options):
     """The tables of the runs below a folder."""
     test = t.PairedTest(**options.pop("test", {}))
-    chosen = t.TableOptions(t.layout_named(layout), test=test, illustration=illustration, **options)
+    chosen = t.TableOptions(t.LAYOUTS[layout], test=test, illustration=illustration, **options)
     return t.build_tables(t.read_sweep([folder], by), others, chosen)
 
 

@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.plugins.precision import MixedPrecision
-from lightning.pytorch.strategies import FSDPStrategy, SingleDeviceStrategy
+from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
 from ghgs_lit.config import compose, resolve
@@ -22,7 +22,7 @@ from ghgs_lit.runs.progress import Lines, track
 from ghgs_lit.training import DivergedError, GHGSModule, Optimization
 from ghgs_lit.training.callbacks import Costs, RunProgress
 from ghgs_lit.training.checkpoints import CheckpointOptions, Checkpoints
-from ghgs_lit.training.trainer import require_whole_parameters
+from ghgs_lit.training.trainer import TrainerOptions
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from ghgs_lit.types import Targets
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, write_checkpoint
@@ -114,7 +114,7 @@ def test_training_lowers_the_loss_and_ends_with_no_rate(tmp_path):
 def test_checkpoints_are_plain_and_resume_to_the_same_weights(tmp_path):
     """Checkpoints load with weights_only=True, hold the configuration, and continue the same run."""
     last = CheckpointOptions(filename="last", every_n_train_steps=3).build()
-    best = CheckpointOptions(filename="best", monitor="val/psnr", mode="max").build()
+    best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     whole = module()
     trainer(tmp_path / "a", steps=12, callbacks=[last, best]).fit(whole, loader(), loader(1))
     files = sorted(p.name for p in (tmp_path / "a" / "checkpoints").iterdir())
@@ -196,11 +196,12 @@ def test_a_step_whose_scaled_gradient_overflows_is_skipped(tmp_path):
         scaled(tmp_path / "b", scale=1.0, renderer=infinitely_steep, render_l1=1.0)
 
 
-def test_strategies_that_divide_parameters_are_refused():
-    """Each process would clip by the norm of its shard."""
-    with pytest.raises(InputError, match=r"trainer\.strategy: .*clip.*FSDPStrategy"):
-        require_whole_parameters(SimpleNamespace(strategy=object.__new__(FSDPStrategy)))
-    require_whole_parameters(SimpleNamespace(strategy=SingleDeviceStrategy()))
+@pytest.mark.parametrize(("devices", "processes"), [(1, 1), (2, 2)])
+def test_several_processes_have_all_parameters(devices, processes):
+    """Each clips by the norm of the whole gradient; not every parameter has one in every step."""
+    trainer = TrainerOptions(accelerator="cpu", devices=devices, max_steps=1).build(logger=False)
+    assert trainer.num_devices == processes
+    assert isinstance(trainer.strategy, DDPStrategy) == (processes > 1)
 
 
 def test_without_a_terminal_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):

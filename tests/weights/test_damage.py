@@ -41,26 +41,18 @@ READERS = {
 
 
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("has_digest", [True, False])
-@pytest.mark.parametrize("where", ["weights", "configuration", "saved again"])
-def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, has_digest, where):
-    """A flipped bit would be a slightly other model in silence: checksums, and a digest where it has one."""
+@pytest.mark.parametrize("save", [AtomicCheckpointIO().save_checkpoint, torch.save])
+@pytest.mark.parametrize("where", ["weights", "configuration"])
+def test_one_changed_bit_is_refused_by_every_reader(tmp_path, reader, save, where):
+    """A flipped bit would be a slightly other model in silence."""
     path, made = tmp_path / "last.ckpt", content()
     name = "model.gaussian_head.dpt.projections.0.weight"
     name = name if name in made["state_dict"] else next(n for n in made["state_dict"] if "head" in n)
-    save = AtomicCheckpointIO().save_checkpoint if has_digest else torch.save
     save(made, path)
     read_checkpoint(path, whole=True)
-    if where == "saved again":
-        if not has_digest:
-            return
-        again = torch.load(path, weights_only=True)
-        again["state_dict"][name].view(-1)[0] += 1
-        torch.save(again, path)
-    else:
-        near = made["state_dict"][name].numpy().tobytes()[:64]
-        flip(path, near if where == "weights" else b"neighborhood")
-    with pytest.raises(InputError, match=r"last\.ckpt: (digest: )?expected .*written; found"):
+    near = made["state_dict"][name].numpy().tobytes()[:64]
+    flip(path, near if where == "weights" else b"neighborhood")
+    with pytest.raises(InputError, match=r"last\.ckpt: expected .*written; found"):
         READERS[reader](path)
 
 

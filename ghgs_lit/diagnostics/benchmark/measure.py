@@ -22,6 +22,9 @@ from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Prediction, Rendering
 
+#: Rounds that do not count: the first compiles and fills caches.
+WARMUP = 1
+
 
 @dataclass(frozen=True)
 class Times:
@@ -135,7 +138,6 @@ def record_cases(
     batches: Sequence[Batch],
     metrics: ImageMetrics,
     device: torch.device,
-    warmup: int,
     repeats: int,
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times.
@@ -156,7 +158,7 @@ def record_cases(
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
             record.metrics += _metrics(record.case, batch, *result, metrics, device)
-    times = time_cases(cases, batches, warmup, repeats, device)
+    times = time_cases(cases, batches, WARMUP, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work, record.times = Work.of(mine), seconds
     return records

@@ -1,33 +1,11 @@
 """Peak memory of stages: of the process on a CPU (Linux's own counters), of all tensors on CUDA."""
 
-import ctypes
-import os
-from pathlib import Path
 from typing import Any
 
 import torch
 
+from ghgs_lit.kernels.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
 from ghgs_lit.kernels.watching import Inputs, Watcher
-
-_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-
-
-def memory_bytes(field: str) -> int:
-    """``VmRSS`` (memory now) or ``VmHWM`` (peak since the last reset) of this process."""
-    line = next(line for line in _STATUS.read_text().splitlines() if line.startswith(field + ":"))
-    return int(line.split()[1]) * 1024
-
-
-def reset_peak() -> None:
-    """Reset ``VmHWM`` to the memory that is held now."""
-    _CLEAR.write_text("5")
-
-
-def return_free_memory() -> None:
-    """Give free memory that the C library keeps back to the system, where it can: it must not count."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 class PeakProbe(Watcher):
@@ -66,19 +44,19 @@ class PeakProbe(Watcher):
     @property
     def is_available(self) -> bool:
         """Whether the system has counters whose peak can be reset."""
-        return self.device.type == "cuda" or os.access(_CLEAR, os.W_OK)
+        return self.device.type == "cuda" or can_forget_peak()
 
     def held(self) -> int:
         """Bytes now."""
         if self.device.type == "cuda":
             return torch.cuda.memory_allocated(self.device)
         return_free_memory()
-        return memory_bytes("VmRSS")
+        return resident_bytes()
 
     def peak(self) -> int:
         """Most bytes since the last :meth:`reset`."""
         is_cuda = self.device.type == "cuda"
-        return torch.cuda.max_memory_allocated(self.device) if is_cuda else memory_bytes("VmHWM")
+        return torch.cuda.max_memory_allocated(self.device) if is_cuda else resident_bytes("VmHWM")
 
     def reset(self) -> None:
         """Forget the peak."""
@@ -86,4 +64,4 @@ class PeakProbe(Watcher):
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
             return_free_memory()  # what an earlier stage freed is not this one's
-            reset_peak()
+            forget_peak()

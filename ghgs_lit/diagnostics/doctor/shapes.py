@@ -52,7 +52,7 @@ class Shapes(TorchDispatchMode):
         values = tree_leaves((args, kwargs))
         self._count(values, made_here=False)
         is_fake = any(isinstance(value, FakeTensor) for value in values)
-        result = (self._of_shapes if is_fake else _computed)(function, args, kwargs)
+        result = self._of_shapes(function, args, kwargs) if is_fake else function(*args, **kwargs)
         self._count(tree_leaves(result), made_here=True)
         return result
 
@@ -78,10 +78,6 @@ class Shapes(TorchDispatchMode):
     def _freed(self, key: int, size: int, _: Any) -> None:
         self.live -= size
         self._known.pop(key, None)
-
-
-def _computed(function, args, kwargs):
-    return function(*args, **kwargs)
 
 
 def _whole_indices(indices: list[Tensor | None]) -> list[Tensor | None]:

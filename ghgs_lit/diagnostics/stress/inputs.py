@@ -73,13 +73,17 @@ def _towards_middle(angle: float) -> Tensor:
     return torch.stack((right, torch.linalg.cross(forward, right), forward))
 
 
-def matrices(lenses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-    """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4]."""
+def intrinsics(lenses: Tensor) -> Tensor:
+    """Intrinsics [..., 3, 3]."""
     fx, fy, cx, cy = lenses.unbind(-1)
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    intrinsics = torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+    return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
+
+
+def matrices(lenses: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Intrinsics [..., 3, 3] and extrinsics [..., 4, 4]."""
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=poses.dtype).expand(*poses.shape[:-2], 1, 4)
-    return intrinsics, torch.cat((poses, last), -2)
+    return intrinsics(lenses), torch.cat((poses, last), -2)
 
 
 def points(family: str, g: Generator, count: int, middle: Tensor, poses: Tensor | None = None) -> Tensor:

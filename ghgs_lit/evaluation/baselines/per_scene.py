@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from ghgs_lit.errors import choice
-from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
 from ghgs_lit.evaluation.baselines.splats import splats_at
 from ghgs_lit.evaluation.measure import Estimate, Renderer
@@ -21,26 +19,18 @@ CHANGES = {
 }
 #: Standard deviation in pixels and opacity of Gaussians that are not fitted yet.
 SIGMA, OPACITY = 0.5, 0.5
-STARTS = {"hull": hull_depth, "photo_depth": photo_depth}
 
 
 @dataclass(frozen=True)
 class PerScene:
     """``method(batch)``: 3D Gaussian splatting (Kerbl et al. 2023) on the inputs, a Gaussian for each pixel.
 
-    None is added or pruned: a Gaussian for each pixel of each photograph is more than they can tell apart.
-
-    Args:
-        steps: of the optimiser, 1 or more.
-        start: where the Gaussians begin, ``hull`` or ``photo_depth``.
+    They begin where photographs agree. None is added or pruned: a Gaussian for each pixel of each photograph
+    is more than they can tell apart. ``steps``: of the optimiser, 1 or more.
     """
 
     renderer: Renderer
     steps: int
-    start: str
-
-    def __post_init__(self) -> None:
-        choice("per_scene.start", self.start, tuple(STARTS))
 
     @property
     def fitting(self) -> Refinement:
@@ -49,7 +39,7 @@ class PerScene:
 
     def begin(self, batch: Batch) -> Gaussians:
         """The Gaussians that are fitted."""
-        depth = STARTS[self.start](batch)
+        depth = photo_depth(batch)
         return splats_at(batch, depth, depth > 0, SIGMA, OPACITY)
 
     def __call__(self, batch: Batch) -> Estimate:

@@ -1,9 +1,9 @@
 """The paper's tables from directories of runs."""
 
 from ghgs_lit.config.nodes import PairedTest
-from ghgs_lit.evaluation.tables.assemble import TableOptions, build_tables
+from ghgs_lit.evaluation.tables.assemble import build_tables
 from ghgs_lit.evaluation.tables.latex import PREAMBLE, to_latex
-from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Table, layout_named
+from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Table, TableOptions
 from ghgs_lit.evaluation.tables.others import read_others
 from ghgs_lit.evaluation.tables.records import read_sweep
 from ghgs_lit.evaluation.tables.writers import to_csv, to_markdown, to_terminal
@@ -15,7 +15,6 @@ __all__ = [
     "Table",
     "TableOptions",
     "build_tables",
-    "layout_named",
     "read_others",
     "read_sweep",
     "to_csv",

@@ -1,16 +1,14 @@
 """From measurements to tables: which run fills which cell, what is best."""
 
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import pandas as pd
 
 from ghgs_lit.config.ablation import ABLATIONS
-from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.evaluation.tables.cells import fill
-from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table
+from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table, TableOptions
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
 from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep, Variant
 from ghgs_lit.evaluation.tables.reported import data_title, reported_data, reported_table
@@ -27,26 +25,6 @@ BASELINES = {
     "true_depth": "Discs at the true depth",
     "untrained": "Untrained model",
 }
-
-
-@dataclass(frozen=True)
-class TableOptions:
-    """What is shown.
-
-    Args:
-        views, targets, metrics: a selection; None: those of the layout and of the runs.
-        unit: a regular expression whose first group is the person, where subjects are frames of people.
-        illustration: whether a note says that the numbers are no result, of which none is bold.
-    """
-
-    layout: Layout
-    views: tuple[int, ...] | None = None
-    targets: tuple[str, ...] | None = None
-    metrics: tuple[str, ...] | None = None
-    reported: bool = True
-    test: PairedTest = field(default_factory=PairedTest)
-    unit: re.Pattern[str] | None = None
-    illustration: bool = False
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
@@ -105,10 +83,9 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
         lines = [*names, *lines]
     stub = ("3D Unproj.", "Semantic Cons.") if layout.rows == "ablation" else ("Methods",)
     on = reported_table(reported)[0] if reported else None
-    table = Table(layout, rows, planned, stub, groups, metrics, lines, reported_on=on)
-    fill(table, figures, options.test, options.unit, sweep.configs, options.illustration)
-    table.caption = write_caption(table, options.illustration)
-    table.notes = write_notes(table, options.test, sweep.configs, options.illustration)
+    table = Table(options, rows, planned, sweep.configs, stub, groups, metrics, lines, reported_on=on)
+    fill(table, figures)
+    table.caption, table.notes = write_caption(table), write_notes(table)
     return table
 
 

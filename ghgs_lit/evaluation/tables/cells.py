@@ -16,29 +16,12 @@ from ghgs_lit.evaluation.tables.records import TRAINING, person_of
 from ghgs_lit.evaluation.tables.reported import data_title
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm
 
-Configs = Mapping[str, Mapping[str, Any]]
 
-
-def fill(
-    table: Table,
-    figures: Sequence[Mapping[str, Any]],
-    test: PairedTest,
-    unit: re.Pattern[str] | None,
-    configs: Configs,
-    illustration: bool = False,
-) -> None:
-    """Fill ``table.cells``.
-
-    Args:
-        figures: the reported figures, as entries of ``table.cells``.
-        unit: tells persons of subjects, as for :func:`person_of`.
-        illustration: nothing is best: the numbers are no result.
-
-    Raises:
-        InputError: two runs claim one cell with different numbers.
-    """
-    values = _values(table)
-    _refuse_rivals(table, values, configs)
+def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
+    """Fill ``table.cells``. ``figures``: the reported ones, as entries of it. InputError: two runs claim one
+    cell with different numbers."""
+    values, options = _values(table), table.options
+    _refuse_rivals(table, values)
     # The same numbers, measured or copied twice, are one run.
     cell_and_seed = [*CELL, "seed"]
     values = values[values["source"] == values.groupby(cell_and_seed)["source"].transform("first")]
@@ -57,11 +40,11 @@ def fill(
     table.cells["mean"] = table.cells["mean"].fillna(reported["mean"])
     table.cells["lacking"] = [_lacking(table, cell) for cell in table.cells.itertuples()]
     table.cells["best"] = False
-    for column in [] if illustration else product(*_columns(table)):
+    for column in [] if options.illustration else product(*_columns(table)):
         _mark_best(table, column)
     table.cells["test"], table.cells["marked"] = None, False
-    if test.against != "none":
-        _test(table, _by_person(values, unit), test)
+    if options.test.against != "none":
+        _test(table, _by_person(values, options.unit), options.test)
 
 
 def _columns(table: Table) -> tuple[range, list[str]]:
@@ -87,7 +70,7 @@ def _values(table: Table) -> pd.DataFrame:
     return rows.melt([*facts, "count"], var_name="metric").dropna(subset="value")
 
 
-def _refuse_rivals(table: Table, values: pd.DataFrame, configs: Configs) -> None:
+def _refuse_rivals(table: Table, values: pd.DataFrame) -> None:
     """Refuse several runs for one cell; names them all, and the keys that tell them apart."""
     means = values.groupby([*CELL, "seed", "source"], sort=False)["value"].mean().reset_index("source")
     rivals: dict[tuple[str, ...], str] = {}
@@ -100,7 +83,7 @@ def _refuse_rivals(table: Table, values: pd.DataFrame, configs: Configs) -> None
         return
     clashes, apart = [], {}
     for sources, what in list(rivals.items())[:3]:
-        of_models = [configs[source] for source in sources if source in configs]
+        of_models = [table.configs[source] for source in sources if source in table.configs]
         keys = differing(of_models)
         apart |= dict.fromkeys(telling_apart(of_models, keys))
         said = f" (they differ in {differing_text(keys)})" if keys else ""

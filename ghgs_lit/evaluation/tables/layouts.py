@@ -1,10 +1,13 @@
 """Layouts of tables (the paper's four, and the ablation at every number of views) and their parts."""
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import pandas as pd
 
-from ghgs_lit.errors import choice
+from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.records import Planned, Variant
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "flicker": 4, "depth_error_mm": 1, "gaussians": 0}
@@ -49,10 +52,24 @@ LAYOUTS = {
 }
 
 
-def layout_named(name: str) -> Layout:
-    """One of ``LAYOUTS``; another name is an InputError."""
-    choice("layout", name, tuple(LAYOUTS))
-    return LAYOUTS[name]
+@dataclass(frozen=True)
+class TableOptions:
+    """What is shown.
+
+    Args:
+        views, targets, metrics: a selection; None: those of the layout and of the runs.
+        unit: a regular expression whose first group is the person, where subjects are frames of people.
+        illustration: whether a note says that the numbers are no result, of which none is bold.
+    """
+
+    layout: Layout
+    views: tuple[int, ...] | None = None
+    targets: tuple[str, ...] | None = None
+    metrics: tuple[str, ...] | None = None
+    reported: bool = True
+    test: PairedTest = field(default_factory=PairedTest)
+    unit: re.Pattern[str] | None = None
+    illustration: bool = False
 
 
 def _stem(metric: str) -> str:
@@ -119,8 +136,10 @@ class Table:
     """One table: everything that a writer of a format needs.
 
     Args:
+        options: what is shown.
         rows: what was measured, as in :class:`Sweep`.
         planned: the training runs of the sweep, finished or not, that belong to it.
+        configs: the configuration of our model by ``source``.
         stub: headings of the first columns.
         groups, metrics: the columns.
         cells: by ``CELL``, every line and column in order: ``mean`` over subjects and seeds (nan: no number),
@@ -132,9 +151,10 @@ class Table:
         comparisons: number of tests that were made.
     """
 
-    layout: Layout
+    options: TableOptions
     rows: pd.DataFrame
     planned: list[Planned]
+    configs: Mapping[str, Mapping[str, Any]]
     stub: tuple[str, ...]
     groups: list[Group]
     metrics: list[str]
@@ -144,6 +164,10 @@ class Table:
     notes: list[str] = field(default_factory=list)
     reported_on: str | None = None
     comparisons: int = 0
+
+    @property
+    def layout(self) -> Layout:
+        return self.options.layout
 
     @property
     def ours(self) -> list[Line]:

@@ -1,11 +1,7 @@
 """The caption of a table and the notes below it."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import pandas as pd
 
-from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.differences import differing, differing_text
 from ghgs_lit.evaluation.tables.layouts import Table
 from ghgs_lit.evaluation.tables.records import Planned
@@ -25,7 +21,7 @@ ILLUSTRATION = (
 MARK = "*"
 
 
-def write_caption(table: Table, illustration: bool = False) -> str:
+def write_caption(table: Table) -> str:
     """Data, protocol, model and number of runs, in one line."""
     first, names = table.rows.iloc[0], dict.fromkeys(table.rows["data"])
     measured = table.measured
@@ -45,15 +41,13 @@ def write_caption(table: Table, illustration: bool = False) -> str:
         said.append(f"{views.pop()} input views")
     spread = f" ± deviation over {seeds} seeds" if seeds > 1 else ""
     clear = " where it leads by more than the deviation" if seeds > 1 else ""
-    best = "" if illustration else f", best of the measured methods in bold{clear}"
+    best = "" if table.options.illustration else f", best of the measured methods in bold{clear}"
     return f"{', '.join(said)}; mean over subjects{spread}{best}."
 
 
-def write_notes(
-    table: Table, test: PairedTest, configs: Mapping[str, Mapping[str, Any]], illustration: bool = False
-) -> list[str]:
-    """The notes below the table; ``illustration`` adds that the numbers are no result."""
-    said = [f"**{ILLUSTRATION}**"] if illustration else []
+def write_notes(table: Table) -> list[str]:
+    """The notes below the table."""
+    said = [f"**{ILLUSTRATION}**"] if table.options.illustration else []
     if table.layout.rows == "ablation":
         said.append(FOOTNOTE)
         if not table.ours[0].variant.has_semantics:
@@ -67,10 +61,10 @@ def write_notes(
             " with figures on other data or protocols."
         )
     said += _about_others(table)
-    said += _about_test(table, test)
+    said += _about_test(table)
     said += _about_steps(table)
     said += _about_seeds(table)
-    return said + _about_runs(table, configs)
+    return said + _about_runs(table)
 
 
 def _of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
@@ -95,7 +89,7 @@ def _range(counts: list[int]) -> str:
     return " to ".join(map(str, dict.fromkeys((min(counts), max(counts)))))
 
 
-def _about_test(table: Table, test: PairedTest) -> list[str]:
+def _about_test(table: Table) -> list[str]:
     """Which test was made of how many seeds and subjects, or why nothing is marked."""
     tests = [comparison for comparison in table.cells["test"] if comparison is not None]
     if not tests:
@@ -107,7 +101,7 @@ def _about_test(table: Table, test: PairedTest) -> list[str]:
         else:
             why = "rows have fewer than two subjects in common"
         return [f"No differences are marked: {why}."]
-    against = "its column's best row"
+    against, test = "its column's best row", table.options.test
     if test.against == "full":
         full = [line for line in table.ours if line.variant.ablation == "full"]
         against = "the row of the whole method" if len(full) == 1 else against
@@ -153,7 +147,7 @@ def _run_name(planned: Planned) -> str:
     return f"{data_title(planned.data)} {variant.model} {variant.ablation} seed {planned.seed}"
 
 
-def _about_runs(table: Table, configs: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _about_runs(table: Table) -> list[str]:
     """Runs that are unfinished, that differ in settings, or that are of different states of the code."""
     said = []
     if table.measured["lacking"].map(bool).any():
@@ -167,7 +161,7 @@ def _about_runs(table: Table, configs: Mapping[str, Mapping[str, Any]]) -> list[
         _of(table.rows, "model")[["source", "variant", "data"]].drop_duplicates().values
     ):
         row = (variant.model, variant.encoder, variant.switches, data)
-        groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(configs[source])
+        groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(table.configs[source])
     keys = {key: values for group in groups.values() for key, values in differing(group).items()}
     keys.pop("checkpoint", None)
     if keys:

@@ -5,7 +5,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ghgs_lit.kernels.memory import pointer_to
-from ghgs_lit.kernels.simd import I32, LANES, floats, indices
+from ghgs_lit.kernels.simd import I32, LANES, everywhere, floats, indices
 
 #: Of a pixel.
 CHANNELS = 4
@@ -15,16 +15,9 @@ def _vector(count: int) -> ir.VectorType:
     return ir.VectorType(ir.FloatType(), count)
 
 
-def _everywhere(builder, number, count: int):
-    """A number in each of ``count`` lanes."""
-    undefined = ir.Constant(ir.VectorType(number.type, count), ir.Undefined)
-    one = builder.insert_element(undefined, number, ir.Constant(I32, 0))
-    return builder.shuffle_vector(one, undefined, indices([0] * count))
-
-
 def _between(builder, low, high, share):
     """``low + share (high - low)`` of two vectors of any length."""
-    kind, share = low.type, _everywhere(builder, share, low.type.count)
+    kind, share = low.type, everywhere(builder, share, low.type.count)
     function = ir.FunctionType(kind, [kind] * 3)
     callee = cgutils.get_or_insert_function(builder.module, function, f"llvm.fmuladd.v{kind.count}f32")
     return builder.call(callee, [share, builder.fsub(high, low), low])
@@ -80,7 +73,7 @@ def store_places(typing_context, places, at, row, column, line):
     def emit(context, builder, sig, args):
         integers = ir.VectorType(I32, LANES)
         row, column = (builder.fptosi(values, integers) for values in args[2:4])
-        line = _everywhere(builder, builder.trunc(args[4], I32), LANES)
+        line = everywhere(builder, builder.trunc(args[4], I32), LANES)
         column = builder.mul(column, ir.Constant(integers, [CHANNELS] * LANES))
         target = pointer_to(context, builder, places, *args[:2], at, integers)
         builder.store(builder.add(builder.mul(row, line), column), target, align=4)

@@ -5,7 +5,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ghgs_lit.kernels.memory import pointer_to
-from ghgs_lit.kernels.simd import DOUBLES, I32, I64, LANES, constant, doubles, floats, indices
+from ghgs_lit.kernels.simd import DOUBLES, I32, I64, LANES, constant, doubles, everywhere, floats, indices
 from ghgs_lit.rendering.cpu import layout
 
 _FLOAT8, _INT8 = ir.VectorType(ir.FloatType(), DOUBLES), ir.VectorType(I32, DOUBLES)
@@ -94,8 +94,7 @@ def _flat_rows(context, builder, array_type, args, index_type, count, kind):
 def _masked(builder, name: str, kind, rows, count: int, *args):
     """Load or store a vector of eight rows of ``count`` floats, but only the first ``rows`` of them."""
     wide, lanes = ir.VectorType(I64, kind.count), range(kind.count)
-    one = builder.insert_element(ir.Constant(wide, ir.Undefined), rows, ir.Constant(I32, 0))
-    limit = builder.shuffle_vector(one, one, indices([0 for _ in lanes]))
+    limit = everywhere(builder, rows, kind.count)
     mask = builder.icmp_signed("<", ir.Constant(wide, [lane // count for lane in lanes]), limit)
     values, align = [v for v in args if v.type == kind], ir.Constant(I32, 4)
     (address,) = (v for v in args if v.type != kind)

@@ -12,7 +12,7 @@ from tests.helpers.verbs import ghgs
 KEYS = {
     "preset", "stage", "seconds", "peak_bytes", "flops", "max_rel_diff", "psnr", "psnr_loss_db", "budget_db",
 }  # fmt: skip
-QUICK = ["timing.warmup=0", "timing.repeats=1", "threads=1", "metrics.lpips=off", "views=v3"]
+QUICK = ["timing.repeats=1", "threads=1", "metrics.lpips=off", "views=v3"]
 
 
 @pytest.fixture(scope="module")

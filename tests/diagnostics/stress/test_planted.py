@@ -14,7 +14,6 @@ from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
 from ghgs_lit.geometry import projection, rotations, sampling, vectors
 from ghgs_lit.geometry.padding import Padding
-from ghgs_lit.heads.activations import CONFIDENCES
 from ghgs_lit.metrics import functional
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.rendering import reference
@@ -126,7 +125,7 @@ def test_a_changed_line_is_reported(defect, monkeypatch):
 
 def test_a_confidence_without_its_limit_is_reported(monkeypatch):
     """exp(100) is infinite in float32, and is not in float64."""
-    monkeypatch.setitem(CONFIDENCES, "expp1", lambda c: 1 + c.exp())
+    monkeypatch.setattr(heads, "confidence_of", lambda c: 1 + c.exp())
     assert failures("depth activation", "saturated", "float32") > 0
 
 

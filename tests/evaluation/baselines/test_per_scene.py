@@ -1,11 +1,9 @@
 """Per-scene 3D Gaussian splatting as a baseline."""
 
-import pytest
 import torch
 
-from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.baselines.hull import hull_depth
 from ghgs_lit.evaluation.baselines.per_scene import CHANGES, PerScene
+from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import psnr
 from ghgs_lit.rendering import Renderer
@@ -23,11 +21,10 @@ def scene(views=4, size=42):
     return Batch(images[:, ::2], masks[:, ::2], around[:, ::2], own)
 
 
-@pytest.mark.parametrize("start", ["hull", "photo_depth"])
-def test_the_photographs_are_fitted(start):
+def test_the_photographs_are_fitted():
     """The render of an input comes nearer to its photograph with steps, far beyond what refinement may do."""
     batch = scene()
-    method = PerScene(RENDERER, steps=40, start=start)
+    method = PerScene(RENDERER, steps=40)
     begin = RENDERER(method.begin(batch), batch.targets.cameras).image
     fitted = method(batch)
     before, after = (psnr(i[0].clamp(0, 1), batch.targets.images[0]).item() for i in (begin, fitted.image))
@@ -35,20 +32,14 @@ def test_the_photographs_are_fitted(start):
     assert fitted.gaussians == (int(batch.masks.sum()),)
 
 
-def test_every_gaussian_begins_on_its_pixel_in_the_hull_and_may_become_another():
-    """The start is the hull's surface; position, rotation, scale, opacity and colour all change."""
+def test_every_gaussian_begins_on_its_pixel_and_may_become_another():
+    """The start is where photographs agree; position, rotation, scale, opacity and colour all change."""
     batch = scene()
-    method = PerScene(RENDERER, steps=3, start="hull")
+    method = PerScene(RENDERER, steps=3)
     begin = method.begin(batch)
     seen = int(batch.masks[0, 0].sum())
     _, depth = project(begin.means[:seen], batch.cameras.intrinsics[0, 0], batch.cameras.extrinsics[0, 0])
-    assert torch.allclose(depth, hull_depth(batch)[0, 0][batch.masks[0, 0]], atol=1e-5)
+    assert torch.allclose(depth, photo_depth(batch)[0, 0][batch.masks[0, 0]], atol=1e-5)
     fitted = method.fitting(begin, batch)
     for name in CHANGES:
         assert (getattr(fitted, name) != getattr(begin, name)).float().mean() > 0.5, name
-
-
-def test_an_unknown_start_is_refused():
-    """In one line that lists the choices."""
-    with pytest.raises(InputError, match=r"per_scene.start: expected .*hull"):
-        PerScene(RENDERER, steps=1, start="random")

@@ -16,7 +16,7 @@ BRANCH = "encoder.semantic={width: 16, depth: 1, heads: 2, channels: 8}"
 TINY = ["encoder.width=32", "encoder.heads=2", "encoder.vit.channels=8", "recalibration.num_heads=2"]
 TINY += ["evaluation.views=[3]", "evaluation.pictures=0", "logger=none", "callbacks=none"]
 TINY += ["evaluation.targets=[release]", "trainer.limit_val_batches=0"]
-EACH = "kind: checkpoints, filename: 'at_{step}', every_n_train_steps: 2, save_top_k: -1"
+EACH = "kind: checkpoints, filename: 'at_{step}', every_n_train_steps: 2"
 
 
 @pytest.fixture(scope="module")

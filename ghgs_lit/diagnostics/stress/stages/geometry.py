@@ -56,7 +56,7 @@ def _unproject(v: Values) -> Values:
 def _unproject_slowly(v: Values) -> Values:
     """By the inverses of the matrices of the whole camera."""
     homogeneous = torch.cat((v["pixels"], torch.ones_like(v["pixels"][..., :1])), -1)
-    intrinsics, _ = inputs.matrices(v["lenses"], v["poses"])
+    intrinsics = inputs.intrinsics(v["lenses"])
     camera = torch.einsum("nvij,npj->npi", torch.linalg.inv(intrinsics), homogeneous)
     centered = camera * v["depth"][..., None] - v["poses"][..., 3]
     return {"points": torch.einsum("nvji,npj->npi", v["poses"][..., :3], centered)}
@@ -128,10 +128,7 @@ def _bounds(v: Values) -> Values:
     metres; and how far the true surface lies outside them."""
     batch, masks = batch_of(v), v["masks"]
     frame = Frame.of(batch)
-    found, metre = (
-        VisualHull(dilation=0.02)(frame.enter(batch)),
-        frame.metre.to(v["truth"])[:, None, None, None],
-    )
+    found, metre = _HULL(frame.enter(batch)), frame.metre.to(v["truth"])[:, None, None, None]
     found = DepthBounds(found.near * metre, found.far * metre)
     outside = torch.relu(found.near - v["truth"]) + torch.relu(v["truth"] - found.far)
     seen = masks & (v["truth"] > 0)
@@ -237,14 +234,8 @@ def _lens_inputs(family: str, g: Generator) -> Values:
     return {"lens": _rig(family, g, size=16)["lenses"][0], "distortion": distortion}
 
 
-def _intrinsics(v: Values) -> Tensor:
-    fx, fy, cx, cy = v["lens"].unbind(-1)
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one), -1).unflatten(-1, (3, 3))
-
-
 def _lens(v: Values) -> Values:
-    pairs = zip(_intrinsics(v).numpy(), v["distortion"].numpy(), strict=True)
+    pairs = zip(inputs.intrinsics(v["lens"]).numpy(), v["distortion"].numpy(), strict=True)
     return {"grid": torch.cat([undistorting_grid(k, d, 16, 16) for k, d in pairs])}
 
 
@@ -253,7 +244,7 @@ def _lens_slowly(v: Values) -> Values:
     knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
     rows, columns = torch.meshgrid(knots, knots, indexing="ij")
     pixels = torch.stack((columns, rows), -1).flatten(0, 1).expand(len(v["lens"]), 9, 2)
-    grid = 2 * distort_points(pixels, _intrinsics(v), v["distortion"]) / 16 - 1
+    grid = 2 * distort_points(pixels, inputs.intrinsics(v["lens"]), v["distortion"]) / 16 - 1
     grid = grid.mT.unflatten(-1, (3, 3))
     dense = torch.nn.functional.interpolate(grid, (16, 16), mode="bilinear", align_corners=True)
     return {"grid": dense.permute(0, 2, 3, 1)}

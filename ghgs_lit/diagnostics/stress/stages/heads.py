@@ -9,7 +9,7 @@ from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.vectors import unit
-from ghgs_lit.heads.activations import CONFIDENCES
+from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.gaussian import FootprintAttributes
@@ -26,7 +26,7 @@ def _depth_inputs(family: str, g: Generator) -> Values:
 
 def _depth(v: Values) -> Values:
     found = {name: bounded_depth(v["raw"], v["near"], v["far"], name) for name in BOUNDED}
-    return {**found, "confidence": CONFIDENCES["expp1"](v["confidence"])}
+    return {**found, "confidence": confidence_of(v["confidence"])}
 
 
 def _attribute_inputs(family: str, g: Generator) -> Values:
