@@ -17,6 +17,7 @@ from ghgs_lit.evaluation.tables.others import read_others
 from ghgs_lit.evaluation.tables.records import read_sweep
 from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
 from ghgs_lit.runs.journal import Journal
+from ghgs_lit.runs.listing import list_runs
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.synthesis.progress import Progress
@@ -145,8 +146,9 @@ def test_runs_of_foreign_content_are_listed_or_named(tmp_path, content):
         (tmp_path / name).write_bytes(content)
     run.sessions()
     assert not run.done
-    with contextlib.suppress(InputError):
-        read_sweep([tmp_path])
+    for read in (list_runs, read_sweep):
+        with contextlib.suppress(InputError):
+            read([tmp_path])
 
 
 def test_lines_that_a_killed_process_left_are_skipped(tmp_path):

@@ -1,4 +1,4 @@
-"""``ghgs table``: the runs below a directory as one of the paper's tables."""
+"""``ghgs table``: the runs below a directory as one of the paper's tables, or as a list."""
 
 import re
 from pathlib import Path
@@ -7,11 +7,13 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.text import Text
+from tabulate import tabulate
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.listing import list_runs
 
 
 def _listed(value: Any) -> tuple | None:
@@ -39,11 +41,17 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the tables, and the path of the Markdown file last."""
+    """The verb; prints the tables, and the path of the Markdown file last; with ``list`` the runs."""
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
     folders = [Path(p).expanduser() for p in _listed(config["runs"]) or ()]
+    if config["list"]:
+        runs = list_runs(folders)
+        write_text_atomically(directory / "runs.csv", runs.to_csv(index=False))
+        print(tabulate(runs, "keys", showindex=False, disable_numparse=True))
+        announce(directory / "runs.csv")
+        return
     others = [t.read_others(Path(p).expanduser()) for p in _listed(config["others"]) or ()]
     sweep = t.read_sweep(folders, _listed(config["by"]) or ())
     tables = t.build_tables(sweep, others, options)
