@@ -6,7 +6,7 @@ fine ones. What a single point leaves open its neighbours say: the equations of 
 nodes of a grid and spread to the nodes around, far where photographs are coarse.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from ghgs_lit.types import Cameras
 #: Metres between the nodes of the grid.
 _CELL = 0.08
 #: One point in so many has equations; all of them move.
-_EVERY = 3
+_EVERY = 4
 #: Deviation of a colour at which an equation counts half.
 _OUTLIER = 0.06
 #: Longest step in metres, and the weight of steps of 0: absolute, and as a share of the equations' own.
@@ -41,9 +41,9 @@ _LEVELS = (_Level(4, 4, 2), _Level(2, 2, 2), _Level(1, 1, 1))
 
 
 class Instant(NamedTuple):
-    """Photographs on black and their cameras, in metres."""
+    """Photographs on black, smoothed and made smaller (:func:`pyramid`), and their cameras, in metres."""
 
-    images: Float[Tensor, "V 3 H W"]
+    levels: Sequence[Float[Tensor, "V 3 _h _w"]]
     cameras: Cameras
 
 
@@ -76,30 +76,39 @@ class _Grid:
 
 
 def _spread(nodes: Float[Tensor, "c z y x"], times: int) -> Float[Tensor, "c z y x"]:
-    kernel = nodes.new_tensor([0.25, 0.5, 0.25])
-    nodes = nodes[:, None]
+    """Each node's values to the nodes around: a quarter to each side along each axis, so many times."""
     for _ in range(times):
-        for axis in range(3):
-            shape = [1, 1, 1, 1, 1]
-            shape[2 + axis] = 3
-            pads = [0, 0, 0]
-            pads[axis] = 1
-            nodes = F.conv3d(nodes, kernel.view(shape), padding=pads)
-    return nodes[:, 0]
+        for axis in (1, 2, 3):
+            size = nodes.shape[axis]
+            spread = 0.5 * nodes
+            spread.narrow(axis, 1, size - 1).add_(nodes.narrow(axis, 0, size - 1), alpha=0.25)
+            spread.narrow(axis, 0, size - 1).add_(nodes.narrow(axis, 1, size - 1), alpha=0.25)
+            nodes = spread
+    return nodes
 
 
-def _pyramid(images: Float[Tensor, "V 3 H W"]) -> Iterator[tuple[_Level, Float[Tensor, "V 3 h w"]]]:
-    for level in _LEVELS:
-        smaller = F.avg_pool2d(images, level.smaller, ceil_mode=True) if level.smaller > 1 else images
-        yield level, F.avg_pool2d(F.pad(smaller, (1, 1, 1, 1)), 3, 1)
+def pyramid(images: Float[Tensor, "V 3 H W"]) -> list[Float[Tensor, "V 3 _h _w"]]:
+    """Photographs on black as :class:`Instant` has them, the smallest first."""
+    views, _, height, width = images.shape
+    found = []
+    for smaller, _, _ in _LEVELS:
+        # Means of windows that overlap by half, or of nine pixels.
+        side = 2 * smaller if smaller > 1 else 3
+        mean = images.new_full((1, 1, side, side), 1 / side**2)
+        rim = (side - smaller + 1) // 2
+        low = F.conv2d(images.reshape(-1, 1, height, width), mean, stride=smaller, padding=rim)
+        found.append(low.view(views, 3, *low.shape[2:]))
+    return found
 
 
 def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
-    """Values, and their slopes to the right and down."""
-    rim = F.pad(images, (1, 1, 1, 1), mode="replicate")
-    right = (rim[..., 1:-1, 2:] - rim[..., 1:-1, :-2]) / 2
-    down = (rim[..., 2:, 1:-1] - rim[..., :-2, 1:-1]) / 2
-    return torch.cat((images, right, down), 1)
+    """Values, and their slopes to the right and down, 0 at the rim."""
+    maps = images.new_zeros(len(images), 9, *images.shape[2:])
+    maps[:, :3] = images
+    torch.sub(images[..., 2:], images[..., :-2], out=maps[:, 3:6, :, 1:-1])
+    torch.sub(images[..., 2:, :], images[..., :-2, :], out=maps[:, 6:, 1:-1])
+    maps[:, 3:] *= 0.5
+    return maps
 
 
 @torch.no_grad()
@@ -119,7 +128,7 @@ def scene_flow(
     grid, (index, view) = _Grid.around(points), seen.nonzero().unbind(-1)
     moved = points.new_zeros(3, *grid.shape)
     from_, _ = _seen(some[index], view, before.cameras)
-    for (level, was), (_, now) in zip(_pyramid(before.images), _pyramid(after.images), strict=True):
+    for level, was, now in zip(_LEVELS, before.levels, after.levels, strict=True):
         colors = sample(was, view, from_ / level.smaller)
         maps = _with_slopes(now)
         for _ in range(level.steps):
@@ -136,6 +145,11 @@ def _seen(
     return project(points, cameras.intrinsics[view], cameras.extrinsics[view])
 
 
+#: Entries of a symmetric matrix [3, 3] that are kept, and where each is in it.
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_PLACES = (0, 1, 2, 1, 3, 4, 2, 4, 5)
+
+
 def _equations(
     points: Float[Tensor, "n 3"],
     view: Int[Tensor, " n"],
@@ -143,30 +157,35 @@ def _equations(
     maps: Float[Tensor, "V 9 h w"],
     cameras: Cameras,
     smaller: int,
-) -> Float[Tensor, "n 12"]:
-    """The normal equations of a step of each point in one view: a matrix and the right side."""
+) -> Float[Tensor, "n 9"]:
+    """The normal equations of a step of each point in one view: a symmetric matrix and the right side."""
     pixels, depth = _seen(points, view, cameras)
     value, right, down = sample(maps, view, pixels / smaller).split(3, -1)
     lens, pose = cameras.intrinsics[view], cameras.extrinsics[view]
     inside = world_to_camera(points, pose)
-    across = torch.stack((right, down), -1) * (lens[:, [0, 1], [0, 1]] / depth[:, None])[:, None] / smaller
-    ahead = -(across * (inside[:, :2] / depth[:, None])[:, None]).sum(-1, keepdim=True)
-    slopes = torch.cat((across, ahead), -1) @ pose[:, :3, :3]
+    right = right * (lens[:, 0, :1] / (smaller * depth[:, None]))
+    down = down * (lens[:, 1, 1:2] / (smaller * depth[:, None]))
+    ahead = -(right * (inside[:, :1] / depth[:, None]) + down * (inside[:, 1:2] / depth[:, None]))
+    # By the axes of the world, each [n, 3] for the colours; products of many small matrices are slow.
+    slopes = [
+        right * pose[:, 0, i, None] + down * pose[:, 1, i, None] + ahead * pose[:, 2, i, None]
+        for i in range(3)
+    ]
     missing = colors - value
     weights = 1 / (1 + (missing / _OUTLIER).square().sum(-1))
-    weighted = weights[:, None, None] * slopes
-    return torch.cat(((weighted.mT @ slopes).flatten(1), (weighted.mT @ missing[..., None])[..., 0]), 1)
+    entries = [(slopes[i] * slopes[j]).sum(-1) for i, j in _PAIRS]
+    entries += [(slope * missing).sum(-1) for slope in slopes]
+    return weights[:, None] * torch.stack(entries, -1)
 
 
-def _steps(sums: Float[Tensor, "12 z y x"]) -> Float[Tensor, "3 z y x"]:
-    shape = sums.shape[1:]
-    matrices, right = sums.flatten(1).mT.split((9, 3), 1)
-    matrices = matrices.reshape(-1, 3, 3)
+def _steps(sums: Float[Tensor, "9 z y x"]) -> Float[Tensor, "3 z y x"]:
+    entries, right = sums.flatten(1).mT.split((6, 3), 1)
+    matrices = entries[:, _PLACES].reshape(-1, 3, 3)
     still = _STILL + _STIFF * matrices.diagonal(dim1=1, dim2=2).mean(1)
     matrices = matrices + still[:, None, None] * torch.eye(3, dtype=sums.dtype, device=sums.device)
     steps = torch.linalg.solve_ex(matrices, right).result
     length = steps.norm(dim=1, keepdim=True)
-    return (steps * (_LONGEST / length.clamp(min=_LONGEST))).mT.reshape(3, *shape)
+    return (steps * (_LONGEST / length.clamp(min=_LONGEST))).mT.reshape(3, *sums.shape[1:])
 
 
 def _turns(moved: Float[Tensor, "3 z y x"]) -> Float[Tensor, "3 z y x"]:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.geometry.scene_flow import Instant, scene_flow
+from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow
 from tests.helpers.motion import INPUTS, instant, motion
 from tests.helpers.scenes import CENTER
 
@@ -17,7 +17,7 @@ def flow(moved, shown=None):
         own = before.masks.flatten(0, 1).nonzero()[:, 0]
         shown = torch.nn.functional.one_hot(own, before.masks.shape[1]).bool()
     true = points @ moved[:3, :3].mT + moved[:3, 3] - points
-    found = scene_flow(points, shown, *(Instant(b.images[0], b.cameras[0]) for b in (before, after)))
+    found = scene_flow(points, shown, *(Instant(pyramid(b.images[0]), b.cameras[0]) for b in (before, after)))
     return true, *found
 
 
@@ -47,7 +47,9 @@ def test_other_crops_of_cameras_that_stand_still_move_nothing():
     cropped = instant(motion(), type(INPUTS)(lens, INPUTS.extrinsics, INPUTS.height, INPUTS.width))
     points = unproject_maps(before.depths, INPUTS)[before.masks]
     shown = torch.ones(len(points), 4, dtype=torch.bool)
-    found, _ = scene_flow(points, shown, *(Instant(b.images[0], b.cameras[0]) for b in (before, cropped)))
+    found, _ = scene_flow(
+        points, shown, *(Instant(pyramid(b.images[0]), b.cameras[0]) for b in (before, cropped))
+    )
     assert found.abs().max() < 2e-3
 
 
@@ -66,7 +68,7 @@ def test_points_that_no_view_shows_follow_their_neighbours_and_none_stay_where_n
 
 def test_no_points_are_no_error():
     batch = instant(motion())
-    one = Instant(batch.images[0], batch.cameras[0])
+    one = Instant(pyramid(batch.images[0]), batch.cameras[0])
     moved, turned = scene_flow(torch.zeros(0, 3), torch.zeros(0, 4, dtype=torch.bool), one, one)
     assert moved.shape == turned.shape == (0, 3)
 

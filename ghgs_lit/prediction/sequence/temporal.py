@@ -20,7 +20,7 @@ from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project, unproject_maps
 from ghgs_lit.geometry.rotations import multiply_quaternions
 from ghgs_lit.geometry.sampling import sample
-from ghgs_lit.geometry.scene_flow import Instant, scene_flow
+from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.prediction.refinement.refinement import Change, Descent, Renderer, seen_by
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
@@ -44,10 +44,12 @@ _WORSE = 1.5
 
 @dataclass(frozen=True)
 class _Last:
-    """The last instant: its batch, its prediction, and the depth [1, V, 1, H, W] of its inputs' renders."""
+    """The last instant: its batch, prediction, photographs for the flow, and depth [1, V, 1, H, W] of the
+    inputs' renders."""
 
     batch: Batch
     prediction: Prediction
+    levels: list[Tensor]
     depth: Tensor
 
 
@@ -83,19 +85,22 @@ class Temporal:
             return self.predict(batch)
         if last is not None and _are_equal(last.batch, batch):
             return last.prediction
+        levels = pyramid(at_least_float32(on_black(batch))[0])
         if last is not None and last.batch.views == batch.views and self._age + 1 < self.every:
-            self._descent.start = _moved(self._descent.start, last, batch)
-            found, error = self._improved(last.prediction, batch)
+            self._descent.start = _moved(self._descent.start, last, batch, levels)
+            found, error = self._improved(last.prediction, batch, levels)
             if error <= _WORSE * self._error:
                 self._age += 1
                 return found
         prediction = self.predict(batch)
         self.anew, self._age = self.anew + 1, 0
         self._descent = Descent(prediction.gaussians, batch, _CHANGES)
-        found, self._error = self._improved(prediction, batch)
+        found, self._error = self._improved(prediction, batch, levels)
         return found
 
-    def _improved(self, prediction: Prediction, batch: Batch) -> tuple[Prediction, float]:
+    def _improved(
+        self, prediction: Prediction, batch: Batch, levels: list[Tensor]
+    ) -> tuple[Prediction, float]:
         """The prediction after some steps, and the error of its inputs before the last one."""
         photographs, silhouettes, cameras = seen_by(batch, range(batch.images.shape[1]))
         for _ in range(_STEPS):
@@ -103,7 +108,7 @@ class Temporal:
         masks, depth = batch.masks[:, :, None], drawn.depth.detach()
         error = ((drawn.image - photographs).abs() * masks).sum() / (3 * masks.sum()).clamp(min=1)
         found = _as_drawn(prediction, self._descent.gaussians, batch, depth[:, :, 0])
-        self._last = _Last(batch, found, depth)
+        self._last = _Last(batch, found, levels, depth)
         return found, float(error)
 
 
@@ -115,16 +120,16 @@ def _are_equal(first: Batch, second: Batch) -> bool:
     return all(torch.equal(one, other) for one, other in pairs)
 
 
-def _moved(gaussians: Gaussians, last: _Last, batch: Batch) -> Gaussians:
+def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]) -> Gaussians:
     """Gaussians that go where those of the last instant went."""
     seen = last.prediction.gaussians
     metre = 1.0 if seen.metre is None else float(seen.metre[0])
     # Near the origin and in metres: the world may be anywhere, and have any unit.
     origin = seen.means.double().mean(0)
-    points = ((seen.means.double() - origin) / metre).to(at_least_float32(batch.images))
+    points = ((seen.means.double() - origin) / metre).to(levels[0])
     before, after = (
-        Instant(at_least_float32(on_black(each))[0], _around(each.cameras, origin, metre).to(points.dtype))
-        for each in (last.batch, batch)
+        Instant(maps, _around(each.cameras, origin, metre).to(points.dtype))
+        for maps, each in ((last.levels, last.batch), (levels, batch))
     )
     shown = _shown(points, before.cameras, (last.depth[0] / metre).to(points))
     moved, turned = scene_flow(points, shown, before, after)
