@@ -85,15 +85,16 @@ class Temporal:
             return self.predict(batch)
         if last is not None and _are_equal(last.batch, batch):
             return last.prediction
-        levels = pyramid(at_least_float32(on_black(batch))[0])
+        levels, age = pyramid(at_least_float32(on_black(batch))[0]), 0
         if last is not None and last.batch.views == batch.views and self._age + 1 < self.every:
             self._descent.start = _moved(self._descent.start, last, batch, levels)
             found, error = self._improved(last.prediction, batch, levels)
             if error <= _WORSE * self._error:
                 self._age += 1
                 return found
+            age = self.every - 1  # what moves too fast is not followed in vain at every instant
         prediction = self.predict(batch)
-        self.anew, self._age = self.anew + 1, 0
+        self.anew, self._age = self.anew + 1, age
         self._descent = Descent(prediction.gaussians, batch, _CHANGES)
         found, self._error = self._improved(prediction, batch, levels)
         return found

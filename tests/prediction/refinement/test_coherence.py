@@ -168,13 +168,15 @@ def test_gradients_are_those_of_finite_differences():
     points = 0.3 * torch.randn(40, 3, generator=torch.Generator().manual_seed(2))
     other = torch.arange(40) % 4
     gradients = coherence._gradients(outlines, lens, pose, points, other)
-    rows = coherence._rows(points, gradients, pose[other], torch.zeros(3))
+    middle = torch.tensor([0.2, -0.1, 0.3])  # a turn is about the frame's origin, not about the subject
+    rows = coherence._rows(points, gradients, pose[other], middle)
 
     def distances(step):
         rotation, shift = rigid(step[:6], HEIGHT / 2)
         zoomed = lens.clone()
         zoomed[:, [0, 1], [0, 1]] *= step[6].exp()
-        return outlines.at(other, project(points @ rotation.mT + shift, zoomed[other], pose[other])[0])
+        moved = (points + middle) @ rotation.mT + shift - middle
+        return outlines.at(other, project(moved, zoomed[other], pose[other])[0])
 
     for axis in range(7):
         step = 0.01 * torch.eye(7)[axis]

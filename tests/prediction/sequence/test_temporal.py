@@ -9,7 +9,7 @@ from ghgs_lit.metrics.functional import psnr
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Cameras
-from tests.helpers.motion import BETWEEN, at_true_depth, instant, motion, photographed
+from tests.helpers.motion import BETWEEN, INPUTS, at_true_depth, instant, motion, photographed
 
 RENDERER = Renderer(backend="cpu")
 
@@ -81,14 +81,15 @@ def test_every_instant_by_itself_is_the_prediction_as_it_is():
 
 
 def test_a_jump_is_predicted_anew():
+    """And what comes next, too, before it is followed again: more jumps cost no attempt each."""
     predict, asked = counted()
     temporal = Temporal(predict, 99, RENDERER)
-    for shift in (0.0, 0.005, 0.5, 0.505):
+    for shift in (0.0, 0.005, 0.5, 0.505, 0.51):
         last = temporal(instant(motion((shift, 0.0, 0.0))))
     assert [float(b.depths.max()) for b in asked] == [
-        float(instant(motion((shift, 0.0, 0.0))).depths.max()) for shift in (0.0, 0.5)
+        float(instant(motion((shift, 0.0, 0.0))).depths.max()) for shift in (0.0, 0.5, 0.505)
     ]
-    there = motion((0.505, 0.0, 0.0))
+    there = motion((0.51, 0.0, 0.0))
     assert quality(last, there) > quality(at_true_depth(instant(there)), there) - 1
 
 
@@ -99,6 +100,17 @@ def test_a_camera_that_is_missing_for_an_instant_is_predicted_without_it_and_wit
     for batch in (whole[0], whole[1].of_views([0, 1, 3]), whole[2].of_views([0, 1, 3]), whole[3]):
         temporal(batch)
     assert [b.masks.shape[1] for b in asked] == [4, 3, 4]
+
+
+def test_crops_that_move_are_no_motion():
+    """The crop of each instant is another part of what its camera sees."""
+    moved = INPUTS.intrinsics.clone()
+    moved[..., 0, 2] += 6
+    crops = dataclasses.replace(INPUTS, intrinsics=moved)
+    temporal = Temporal(at_true_depth, 99, RENDERER)
+    first, second = temporal(instant(motion())), temporal(instant(motion(), crops))
+    assert temporal.anew == 1
+    assert (second.gaussians.means - first.gaussians.means).norm(dim=1).mean() < 0.02
 
 
 def test_what_was_forgotten_is_predicted_anew():
