@@ -1,8 +1,10 @@
 """``ghgs view``: a page in the browser with a prediction, its photographs and its cameras."""
 
 import ipaddress
+import math
 import time
 from functools import partial
+from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
@@ -28,19 +30,22 @@ from ghgs_lit.weights.reading import SHIPPED
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; shows ``path``, or predicts first where there is none, or ``live``. Ctrl-C ends it."""
+    """The verb; shows ``path``, or predicts first where there is none, or again and again where ``live``.
+    Ctrl-C ends it."""
+    has_source = cfg.live or any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
+    require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
+    if cfg.path is None and cfg.checkpoint is None:
+        cfg.checkpoint = SHIPPED
     if cfg.live:
         _run_live(cfg)
         return
-    has_source = any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
-    require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
     if cfg.path is None:
         predict.run(cfg)
     else:
         save_config(cfg, output_dir())
     # What was predicted is in the frame of ``up`` already: its cameras say which axis that is.
     viewer = _opened(cfg, read_content(cfg.path or output_dir(), cfg.up if cfg.path else None))
-    end = time.monotonic() + _seconds(cfg)
+    end = time.monotonic() + (cfg.seconds or math.inf)
     try:
         while time.monotonic() < end:
             time.sleep(0.2)
@@ -53,7 +58,6 @@ def _run_live(cfg: DictConfig) -> None:
     require(cfg.path is None, "path", "null with live=true", cfg.path)
     config, pause = resolve(cfg), Pause()
     frames = live_frames(**sources_of(config), sleep=pause)
-    config["checkpoint"] = config["checkpoint"] or SHIPPED
     config |= model_of(config["checkpoint"], cfg)
     options, device = output_options(config), pick_device(config["device"])
     renderer, model = build_renderer(config, device), load_model(config, device)
@@ -70,14 +74,10 @@ def _run_live(cfg: DictConfig) -> None:
         return exported_subject(result.batch, result.prediction, renderer, options)
 
     crop = partial(Capture.batch, size=size, refine_masks=masks)
-    recording = None if config["out"] is None else Recording(output_dir())
+    recording = None if config["out"] is None else Recording(Path(config["out"]).expanduser().resolve())
     print(f"waiting for an instant in {config['images']}", flush=True)
     page = partial(_opened, cfg, layers=False)
-    show_live(frames, pause, crop, predicted, page, recording, _seconds(cfg))
-
-
-def _seconds(cfg: DictConfig) -> float:
-    return float("inf") if cfg.seconds is None else cfg.seconds
+    show_live(frames, pause, crop, predicted, page, recording, cfg.seconds or math.inf)
 
 
 def _opened(cfg: DictConfig, content: Content, layers: bool = True) -> Viewer:

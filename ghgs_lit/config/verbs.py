@@ -142,7 +142,7 @@ class View(Predict):
     path: Path | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
     checkpoint: Path | None = None
-    """Without path: a checkpoint, as for ``ghgs predict``."""
+    """Without path: a checkpoint, as for ``ghgs predict``; null: the one that comes with the package."""
     formats: Texts = ("ply", "inputs")
     """What is written, as for ``ghgs predict``."""
     host: Text = "127.0.0.1"

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -62,7 +63,7 @@ def show_live(
     predict: Callable[[Batch], ExportedSubject],
     open_page: Callable[[Content], Viewer],
     recording: Recording | None = None,
-    seconds: float = float("inf"),
+    seconds: float = math.inf,
 ) -> None:
     """Show the newest capture again and again until no more come or ``seconds`` are over. However it ends,
     the page is closed and a summary printed.

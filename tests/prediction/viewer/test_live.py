@@ -168,7 +168,7 @@ def test_what_was_shown_is_kept_in_place_of_an_earlier_recording(tmp_path):
 def test_videos_are_shown_as_they_are_predicted(tmp_path, capsys, monkeypatch):
     """From files to files, to the bit; sizes of masks stay as given."""
     monkeypatch.chdir(tmp_path)
-    figure, folder = Figure(), Path("videos")
+    figure, folder = Figure(3), Path("videos")
     for camera, name in enumerate(figure.names):
         write_video(folder / f"{name}.mp4", numbered_frames(figure, camera, 2))
         write_video(Path("masks") / f"{name}.mp4", mask_frames(figure, camera, 2))
@@ -199,3 +199,12 @@ def test_videos_are_shown_as_they_are_predicted(tmp_path, capsys, monkeypatch):
 def test_what_cannot_be_shown_live_is_one_line(tmp_path, capsys, arguments, message):
     assert ghgs("view", "live=true", *arguments, f"hydra.run.dir={tmp_path}") == 1
     assert f"ghgs view: {message}" in capsys.readouterr().err
+
+
+def test_photographs_need_no_checkpoint(tmp_path, capsys, monkeypatch):
+    def refuse(cfg):
+        raise InputError(f"predicts with {cfg.checkpoint}")
+
+    monkeypatch.setattr("ghgs_lit.cli.predict.run", refuse)
+    assert ghgs("view", "images=.", "cameras=c.json", f"hydra.run.dir={tmp_path}") == 1
+    assert "predicts with shipped" in capsys.readouterr().err
