@@ -17,15 +17,20 @@ _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration
 _CHECKED = 5
 
 
+def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """``images``, ``cameras`` and the keys beside them. InputError: one of both is missing."""
+    for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
+        require(config[name] is not None, name, example, None)
+    return {name: config[name] for name in _SOURCES if name in config}
+
+
 def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
     """The folder that ``images``, ``cameras`` and the keys beside them describe.
 
     Raises:
         InputError: one of both is missing, or a file is missing or wrong.
     """
-    for name, example in (("images", "images=<folder of photographs>"), ("cameras", "cameras=<calibration>")):
-        require(config[name] is not None, name, example, None)
-    folder = CaptureFolder(**{name: config[name] for name in _SOURCES if name in config})
+    folder = CaptureFolder(**sources_of(config))
     return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 

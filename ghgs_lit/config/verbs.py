@@ -142,7 +142,7 @@ class View(Predict):
     path: Path | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
     checkpoint: Path | None = None
-    """Without path: a checkpoint, as for ``ghgs predict``."""
+    """Without path: a checkpoint, as for ``ghgs predict``; null: the one that comes with the package."""
     formats: Texts = ("ply", "inputs")
     """What is written, as for ``ghgs predict``."""
     host: Text = "127.0.0.1"
@@ -151,6 +151,9 @@ class View(Predict):
     """The next free one is taken where it is in use."""
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
+    live: bool = False
+    """Show the newest instant of images again and again: of a folder that is being written, or of videos at
+    their rate. Cameras are not checked, auto refines nothing, and out gets sequence/0000.ply and so on."""
 
 
 class Doctor(Photographs):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ghgs_lit.config.nodes import Sequence
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
@@ -46,6 +47,9 @@ def live_frames(
     require(folder.is_dir(), str(images), "a folder", "no such folder")
     if images_in(folder, SUFFIXES):
         return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
+    part = options.get("sequence", {})
+    expected = "all instants of a folder that is being written"
+    require(Sequence.read(part, "sequence") == Sequence(), "sequence", expected, part)
     said = options.get("calibration", {})
     names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}
     wanted = set(read_cameras(cameras, said.get("format") or "auto").cameras)

@@ -52,12 +52,13 @@ class Viewer:
     Args:
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
+        layers: cameras, photographs, point cloud and hull are there, too, of the first content alone.
 
     Raises:
         InputError: viser is not installed, or this machine has no such address.
     """
 
-    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080):
+    def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
         try:
             import viser
         except ImportError as error:
@@ -74,8 +75,11 @@ class Viewer:
         self._prepare()
         with self.server.gui.add_folder("Gaussians"):
             self._add_splat_controls()
-        self._add_points()
+        if layers:
+            self._add_points()
         if content.batch is not None:
+            self._place_visitors()
+        if content.batch is not None and layers:
             self._add_cameras()
             with self.server.gui.add_folder("Photographs"):
                 self._add_comparison()
@@ -87,6 +91,13 @@ class Viewer:
 
     def stop(self) -> None:
         self.server.stop()
+
+    def show(self, content: Content) -> None:
+        """Show other Gaussians; visitors stay where they are."""
+        with self._lock:
+            self.content = content
+            self._prepare()
+        self.show_splats()
 
     def _prepare(self) -> None:
         """Covariances of all Gaussians, in the order in which a count takes them."""
@@ -111,7 +122,8 @@ class Viewer:
     def show_splats(self) -> None:
         """Show as many Gaussians, and as opaque ones, as the controls say."""
         with self._lock:
-            n = min(self.count.value, len(self._opacities))
+            # At its end it means all, also where there were fewer at first.
+            n = None if self.count.value == self.count.max else self.count.value
             self.splats = self.server.scene.add_gaussian_splats(
                 "/gaussians",
                 self.content.points[0][:n],
@@ -175,11 +187,16 @@ class Viewer:
         self.cameras = self.server.gui.add_checkbox("cameras", True)
         self.cameras.on_update(lambda _: self._show_frustums())
         self._at: int | None = None  # the camera that visitors were put at
-        # Behind the first camera and beside it: its photograph would hide the subject.
-        away, up = self._poses[0][0]["position"] - target, self.content.up.numpy().astype(np.float64)
+
+    def _place_visitors(self) -> None:
+        """They begin behind the first camera and beside it: its photograph would hide the subject."""
+        cameras, target = self.content.cameras, self.content.center.numpy()
+        up = self.content.up.numpy().astype(np.float64)
+        away = cameras.centers[0].numpy() - target
         start = self.server.initial_camera
         start.position = target + 1.5 * away + 0.6 * np.cross(up, away)
-        start.look_at, start.up, start.fov = target, up, self._poses[0][1]
+        start.look_at, start.up = target, up
+        start.fov = 2 * math.atan(cameras.height / 2 / float(cameras.intrinsics[0, 1, 1]))
 
     def go_to(self, view: int) -> None:
         """Put every visitor at the camera of a photograph."""

@@ -1,0 +1,133 @@
+"""A page that shows the newest of what goes on, and how fast that is."""
+
+import contextlib
+import dataclasses
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
+from pathlib import Path
+
+from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.export.ply import write_ply
+from ghgs_lit.prediction.export.reports import begin_files, end_files
+from ghgs_lit.prediction.export.subject import ExportedSubject
+from ghgs_lit.prediction.viewer.content import Content
+from ghgs_lit.prediction.viewer.server import Viewer
+from ghgs_lit.types import Batch
+
+#: Instants over which times are means, the newest with the largest weight.
+_RECENT = 30
+
+
+class Recording:
+    """Numbered PLYs of what is shown, ``sequence/0000.ply`` and so on, in place of those of earlier runs.
+    InputError: a file of another origin is in the way."""
+
+    def __init__(self, directory: Path):
+        self.directory, self.instants = directory, {}
+        before = [f"sequence/{path.name}" for path in (directory / "sequence").glob("*")]
+        self._earlier = begin_files(directory, before)
+        for name in before:
+            (directory / name).unlink()
+
+    def add(self, subject: ExportedSubject) -> None:
+        name = f"sequence/{len(self.instants):04d}.ply"
+        write_ply(subject.stored, self.directory / name)
+        self.instants[name] = subject.name
+
+    def end(self) -> None:
+        """Write the report, by which a later run knows the files."""
+        end_files(self.directory, [*self.instants], {"instants": [*self.instants.values()]}, self._earlier)
+
+
+class Pause:
+    """``pause(seconds)`` lets them pass, and raises CancelledError once the event ``stopped`` is set; the
+    attribute ``seconds`` says how long all pauses took."""
+
+    def __init__(self):
+        self.stopped, self.seconds = threading.Event(), 0.0
+
+    def __call__(self, seconds: float) -> None:
+        begin = time.perf_counter()
+        if self.stopped.wait(seconds):
+            raise CancelledError
+        self.seconds += time.perf_counter() - begin
+
+
+def show_live(
+    frames: Iterator[tuple[Capture, int]],
+    pause: Pause,
+    crop: Callable[[Capture], Batch],
+    predict: Callable[[Batch], ExportedSubject],
+    open_page: Callable[[Content], Viewer],
+    recording: Recording | None = None,
+    seconds: float = math.inf,
+) -> None:
+    """Show the newest capture again and again until no more come or ``seconds`` are over. However it ends,
+    the page is closed and a summary printed.
+
+    Args:
+        frames: captures, and how many were dropped before each; it waits by ``pause``, which ends here.
+        crop: gives what the model sees; of the next capture in a thread while one is predicted.
+        predict: gives what is shown.
+        open_page: called with the first content.
+    """
+    page, shown, dropped, line, times = None, 0, 0, "0 shown", {}
+    try:
+        with contextlib.closing(_read_ahead(frames, pause, crop, seconds)) as batches:
+            for batch, missed, reading in batches:
+                begin = time.perf_counter()
+                subject = predict(batch)
+                seen = dataclasses.replace(batch, cameras=subject.cameras[None].to("cpu"))
+                content = Content(subject.stored.to("cpu"), subject.up.cpu(), seen)
+                predicted = time.perf_counter()
+                if page is None:
+                    page = open_page(content)
+                    text, last = page.server.gui.add_markdown(""), begin
+                opened = time.perf_counter()
+                page.show(content)
+                if recording is not None:
+                    recording.add(subject)
+                now = time.perf_counter()
+                shown, dropped = shown + 1, dropped + missed
+                stages = {"read and crop": reading, "predict": predicted - begin, "show": now - opened}
+                for name, value in {"all": now - last, **stages}.items():
+                    before = times.get(name, 0.0)
+                    times[name] = before + (value - before) / min(shown, _RECENT)
+                last = now
+                means = ", ".join(f"{name} {1000 * times[name]:.0f} ms" for name in stages)
+                line = f"{shown} shown, {dropped} dropped, {1 / times['all']:.3g} a second ({means})"
+                text.content = f"instant {subject.name}: {line}"
+    finally:
+        if page is not None:
+            page.stop()
+        if recording is not None:
+            recording.end()
+        print(line, flush=True)
+
+
+def _read_ahead(
+    frames: Iterator[tuple[Capture, int]], pause: Pause, crop: Callable[[Capture], Batch], seconds: float
+) -> Iterator[tuple[Batch, int, float]]:
+    """Batches, how many captures were dropped before each, and the seconds of reading it without pauses."""
+
+    def following() -> tuple[Batch, int, float] | None:
+        begin = time.perf_counter() - pause.seconds
+        for capture, dropped in frames:
+            return crop(capture), dropped, time.perf_counter() - pause.seconds - begin
+        return None
+
+    end = time.monotonic() + seconds
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            coming = pool.submit(following)
+            while wait([coming], min(end - time.monotonic(), threading.TIMEOUT_MAX)).done:
+                found = coming.result()
+                if found is None or time.monotonic() > end:
+                    break
+                coming = pool.submit(following)
+                yield found
+        finally:
+            pause.stopped.set()
