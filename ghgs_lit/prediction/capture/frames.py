@@ -145,7 +145,7 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
 def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
     """The frame of each camera that is nearest to one of the first, within half of the time between its."""
     times: dict[str, list[tuple[float, int]]] = {}
-    for row in read_rows(path, "CSV with the columns camera,frame,seconds"):
+    for row in read_rows(path):
         try:
             name = composed(row["camera"])
             entry = float(row["seconds"]), int(row["frame"])
