@@ -3,16 +3,16 @@
 import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ghgs_lit.config.nodes import Sequence
+from ghgs_lit.config import nodes
 from ghgs_lit.data.silhouettes import implausible
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.calibration import (
     Calibration,
@@ -37,10 +37,8 @@ from ghgs_lit.prediction.capture.photographs import (
 if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     import torch
 
-EXIF = ("auto", "stored", "shown")
 #: Photographs that an instant needs where others of its are missing.
 ENOUGH = 3
-_CONVENTION = tuple(f.name for f in fields(Convention))
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,8 @@ class CaptureFolder:
             masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
         backgrounds: folder of photographs without the subject, named after the cameras.
         segment: a segmenter of :data:`ghgs_lit.prediction.capture.masks.SEGMENTERS`.
-        calibration: what the file does not say, or says wrongly: ``format``; the fields of
-            :class:`Convention`; ``exif`` (:func:`fits_stored`); ``names``, the camera of a photograph whose
-            name differs, as ``{photograph: camera}``. None and missing keys are as the format has it.
+        calibration: what the file does not say, or says wrongly: the fields of
+            :class:`ghgs_lit.config.nodes.Calibration`.
         sequence: which instants count, and how videos fit together: the fields of
             :class:`ghgs_lit.config.nodes.Sequence`.
 
@@ -74,19 +71,19 @@ class CaptureFolder:
     sequence: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = ("format", "exif", "names", *_CONVENTION)
-        unknown = sorted(set(self.calibration) - set(known))
-        require(not unknown, "calibration", f"keys among {', '.join(known)}", unknown)
-        choice("calibration.exif", self._said("exif", "auto"), EXIF)
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
             is_folder = path is None or Path(path).expanduser().is_dir()
             require(is_folder, name, "a folder", str(path))
         _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
 
-    def _said(self, key: str, default: Any) -> Any:
-        value = self.calibration.get(key)
-        return default if value is None else value
+    @functools.cached_property
+    def _said(self) -> nodes.Calibration:
+        return nodes.Calibration.read(self.calibration, "calibration")
+
+    @functools.cached_property
+    def _part(self) -> nodes.Sequence:
+        return nodes.Sequence.read(self.sequence, "sequence")
 
     @functools.cached_property
     def _begun(self) -> dict[str, dict[str, Future]]:
@@ -96,24 +93,19 @@ class CaptureFolder:
     @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
-        return read_cameras(self.cameras, self._said("format", "auto"))
+        return read_cameras(self.cameras, self._said.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
         """Meaning of the stored numbers: the format's, unless the user says otherwise."""
-        said = {name: self._said(name, getattr(self.file.convention, name)) for name in _CONVENTION}
-        return Convention(**said)
-
-    @property
-    def _part(self) -> Sequence:
-        return Sequence.read(self.sequence, "sequence")
+        return self.file.convention.told(vars(self._said))
 
     @functools.cached_property
     def _found(self) -> tuple[dict[str, dict[str, Path | VideoFrame]], str]:
         """The photographs of all instants, and a line about what is left over."""
         folder, cameras, part = Path(self.images).expanduser(), self.file.cameras, self._part
         # Numbers, too, are names of cameras.
-        names = {composed(str(key)): composed(str(name)) for key, name in self._said("names", {}).items()}
+        names = {composed(str(key)): composed(str(name)) for key, name in (self._said.names or {}).items()}
         if has_videos(folder, cameras, names):
             masks = None if self.masks is None else Path(self.masks).expanduser()
             return find_frames(folder, masks, cameras, names, self.convention, part.sync, part.step)
@@ -219,7 +211,7 @@ class CaptureFolder:
     ) -> Photograph:
         """One view without distortion and upright, as a convention has it."""
         image, turns = pixels.image, 0
-        if fits_stored(pixels, camera, self._said("exif", "auto")):
+        if fits_stored(pixels, camera, self._said.exif):
             turns = pixels.turns
             image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
         size = image.shape[:2]
@@ -234,13 +226,15 @@ class CaptureFolder:
 
     def _matte(self, name: str, camera: StoredCamera, path: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
-        images, is_frame = Path(self.images).expanduser(), isinstance(path, VideoFrame)
-        if is_frame and path.masks is not None:
-            return path.matte(pixels)
+        images = Path(self.images).expanduser()
+
+        def drawn(masks: Path) -> Path | VideoFrame | None:
+            return path.mask if isinstance(path, VideoFrame) else mask_path(path, images, masks)
+
         if self.masks is not None:
-            mask = mask_path(path, images, Path(self.masks).expanduser())
-            require(mask is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
-            return matte_of_file(mask, pixels)
+            mask = drawn(Path(self.masks).expanduser())
+            require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
+            return _matte_of(mask, pixels)
         if self.backgrounds is not None:
             background = image_named(Path(self.backgrounds).expanduser(), name)
             expected = f"a photograph {name} without the subject"
@@ -248,16 +242,19 @@ class CaptureFolder:
             return matte_of_background(pixels, background)
         if self.segment is not None:
             return _segmenter(self.segment)(pixels)
-        beside = None if is_frame else mask_path(path, images, images)
-        named = beside if beside is not None else camera.mask
-        if named is not None:
-            return matte_of_file(named, pixels)
+        mask = drawn(images) or camera.mask
+        if mask is not None:
+            return _matte_of(mask, pixels)
         if pixels.alpha is not None:
             return pixels.alpha
         raise InputError(
             f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
             f" segment=rembg, <name>_mask beside the photograph, or an alpha channel; found none"
         )
+
+
+def _matte_of(mask: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
+    return mask.matte(pixels) if isinstance(mask, VideoFrame) else matte_of_file(mask, pixels)
 
 
 _segmenter = functools.cache(segmenter)

@@ -1,6 +1,7 @@
 """Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
 
 import functools
+import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -134,7 +135,7 @@ def find_instants(
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     below = {
         composed(path.name): images_in(path)
-        for path in sorted(folder.iterdir())
+        for path in sorted(folder.iterdir(), key=lambda path: _counted(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }
     folders = {name: paths for name, paths in below.items() if paths}
@@ -145,6 +146,11 @@ def find_instants(
     return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
 
 
+def _counted(name: str) -> list[str | int]:
+    """What names are sorted by so that their numbers follow one another: 2 before 10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
 def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
     """``{camera: {instant: path}}`` the other way around."""
     first, *others = by_camera
@@ -152,7 +158,7 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
         shared = by_camera[first].keys() & by_camera[other].keys()
         expected, found = f"photographs named as those of {first}", ", ".join(list(by_camera[other])[:3])
         require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
-    instants = sorted({instant for paths in by_camera.values() for instant in paths})
+    instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=_counted)
     return {
         instant: {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
         for instant in instants
