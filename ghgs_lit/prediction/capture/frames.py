@@ -44,13 +44,11 @@ class VideoFrame:
 
     def matte(self, pixels: Pixels) -> np.ndarray:
         """The mask [h, w] uint8 of a photograph. InputError: it cannot be decoded or has another size."""
-        grey, place = self.video.frame(self.number), str(self.video.video.path)
-        require(
-            grey.shape == pixels.size,
-            place,
+        grey, expected = (
+            self.video.frame(self.number),
             f"the size of its video, {pixels.size} (height, width)",
-            grey.shape,
         )
+        require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
         return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
 
 
@@ -134,12 +132,11 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
     """The frame of each camera that is nearest to one of the first, within half of the time between its."""
     import pandas as pd  # here: it takes time to import
 
-    rows = read_rows(path)
+    columns, rows = {"camera": str, "frame": int, "seconds": float}, read_rows(path)
     try:
-        table = pd.DataFrame(rows, columns=["camera", "frame", "seconds"]).astype(
-            {"frame": int, "seconds": float}
-        )
-        require(np.isfinite(table.seconds).all(), str(path), "times", "none")
+        table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
+        if not np.isfinite(table.seconds).all():
+            raise ValueError("no time")
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
     cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
@@ -176,11 +173,8 @@ def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict
         drawn = read_video(path)
         reader, numbers = Reader(drawn, "gray", step), drawn.numbers.tolist()
         # Masks that were drawn of frame after frame know of none that the camera dropped.
-        alike = len(numbers) == len(video.numbers)
-        return {
-            known: VideoFrame(reader, n)
-            for known, n in zip(video.numbers.tolist() if alike else numbers, numbers, strict=True)
-        }
+        known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
+        return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}
     if masks is None:
         return {}
     below = next((place / spelled for spelled in names if (place / spelled).is_dir()), None)

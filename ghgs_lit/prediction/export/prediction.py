@@ -147,7 +147,7 @@ def write_prediction(
     """
     subject = exported_subject(batch, prediction, renderer, options)
     names, seconds = output_files(options, subject.views), {}
-    earlier = begin_files(directory, names)
+    begin_files(directory, names)
     files = iter([directory / name for name in names])
     with ThreadPoolExecutor(allowed_cores()) as pool:
         pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
@@ -170,7 +170,7 @@ def write_prediction(
         for name, begun in tasks.items():
             seconds[f"write {name}"] += sum(task.result() for task in begun)
     report["seconds"] = {**facts.get("seconds", {}), **seconds}
-    return end_files(directory, names, report, earlier)
+    return end_files(directory, names, report)
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:
