@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.readers import require_file
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
@@ -97,14 +97,9 @@ def _read_video(path: Path, changed: int) -> Video:
 
 
 def _source(path: Path, seek: float = 0.0, log: str = "quiet") -> list[str]:
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError:
-        raise InputError(
-            f"{path}: expected the extra video for videos (pip install 'ghgs-lit[video]'); found none"
-        ) from None
+    ffmpeg = installed("imageio_ffmpeg", "video", str(path)).get_ffmpeg_exe()
     start = ["-ss", f"{seek:.6f}"] if seek > 0 else []
-    return [get_ffmpeg_exe(), "-v", log, "-nostdin", "-copyts", *start, "-i", str(path), "-map", "0:v:0"]
+    return [ffmpeg, "-v", log, "-nostdin", "-copyts", *start, "-i", str(path), "-map", "0:v:0"]
 
 
 def _command(path: Path, pixels: str, *output: str, select: str = "1", **source: Any) -> list[str]:

@@ -5,14 +5,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.metrics import psnr
@@ -103,10 +102,8 @@ def output_options(config: Mapping[str, Any]) -> OutputOptions:
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
     for name in formats:
         choice("formats", name, ("all", *FORMATS))
-        needed = FORMATS[name].package
-        if needed is not None and find_spec(needed) is None:
-            hint = f"pip install 'ghgs-lit[{FORMATS[name].extra}]'"
-            raise InputError(f"formats: expected the package {needed} for {name} ({hint}); found none")
+        if FORMATS[name].package is not None:
+            installed(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
     frames = config["turntable"]["frames"]
     require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
     return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])

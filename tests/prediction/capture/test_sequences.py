@@ -452,5 +452,7 @@ def test_two_people_are_said(place, capsys):
 
 def test_videos_without_ffmpeg(place, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(InputError, match=r"expected the extra video .*ghgs-lit\[video\].*found none"):
+    with pytest.raises(
+        InputError, match=r"expected the package imageio_ffmpeg .*ghgs-lit\[video\].*found none"
+    ):
         opened(place)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import imageio.v3 as iio
 import numpy as np
@@ -193,10 +194,9 @@ def test_options_are_read():
 
 
 def test_a_missing_package_is_named_before_any_work(monkeypatch):
-    monkeypatch.setattr("ghgs_lit.prediction.export.prediction.find_spec", lambda name: None)
-    with pytest.raises(
-        InputError, match=r"gaussforge for spz \(pip install 'ghgs-lit\[formats\]'\); found none"
-    ):
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    line = r"formats=spz: expected the package gaussforge \(pip install 'ghgs-lit\[formats\]'\); found none"
+    with pytest.raises(InputError, match=line):
         output_options(CONFIG | {"formats": ["ply", "spz"]})
 
 
