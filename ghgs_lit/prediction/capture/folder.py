@@ -71,10 +71,12 @@ class CaptureFolder:
     sequence: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for name in ("images", "cameras", "masks", "backgrounds"):
+            if (path := getattr(self, name)) is not None:
+                object.__setattr__(self, name, Path(path).expanduser())
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
-            is_folder = path is None or Path(path).expanduser().is_dir()
-            require(is_folder, name, "a folder", str(path))
+            require(path is None or path.is_dir(), name, "a folder", str(path))
         _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
 
     @functools.cached_property
@@ -103,12 +105,11 @@ class CaptureFolder:
     @functools.cached_property
     def _found(self) -> tuple[dict[str, dict[str, Path | VideoFrame]], str]:
         """The photographs of all instants, and a line about what is left over."""
-        folder, cameras, part = Path(self.images).expanduser(), self.file.cameras, self._part
+        folder, cameras, part = self.images, self.file.cameras, self._part
         # Numbers, too, are names of cameras.
         names = {composed(str(key)): composed(str(name)) for key, name in (self._said.names or {}).items()}
         if has_videos(folder, cameras, names):
-            masks = None if self.masks is None else Path(self.masks).expanduser()
-            return find_frames(folder, masks, cameras, names, self.convention, part.sync, part.step)
+            return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
         return find_instants(folder, cameras, names), ""
 
@@ -143,10 +144,9 @@ class CaptureFolder:
     @property
     def input_files(self) -> list[Path]:
         """The files that may be read, such as photographs with what lies beside them, and the calibration."""
-        sources, videos = (path for paths in self.paths.values() for path in paths.values()), self.images
-        folders = {path.parent if isinstance(path, Path) else Path(videos).expanduser() for path in sources}
-        given = (self.cameras, self.masks, self.backgrounds)
-        given = [Path(path).expanduser() for path in given if path is not None]
+        sources = (path for paths in self.paths.values() for path in paths.values())
+        folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
+        given = [path for path in (self.cameras, self.masks, self.backgrounds) if path is not None]
         files = [path for folder in folders for path in folder.iterdir()]
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
@@ -226,35 +226,28 @@ class CaptureFolder:
 
     def _matte(self, name: str, camera: StoredCamera, path: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
-        images = Path(self.images).expanduser()
-
-        def drawn(masks: Path) -> Path | VideoFrame | None:
-            return path.mask if isinstance(path, VideoFrame) else mask_path(path, images, masks)
-
+        masks = self.images if self.masks is None else self.masks
+        mask = path.mask if isinstance(path, VideoFrame) else mask_path(path, self.images, masks)
         if self.masks is not None:
-            mask = drawn(Path(self.masks).expanduser())
             require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
-            return _matte_of(mask, pixels)
-        if self.backgrounds is not None:
-            background = image_named(Path(self.backgrounds).expanduser(), name)
+        elif self.backgrounds is not None:
+            background = image_named(self.backgrounds, name)
             expected = f"a photograph {name} without the subject"
             require(background is not None, f"{self.backgrounds}", expected, "none")
             return matte_of_background(pixels, background)
-        if self.segment is not None:
+        elif self.segment is not None:
             return _segmenter(self.segment)(pixels)
-        mask = drawn(images) or camera.mask
+        mask = mask or camera.mask
+        if isinstance(mask, VideoFrame):
+            return mask.matte(pixels)
         if mask is not None:
-            return _matte_of(mask, pixels)
+            return matte_of_file(mask, pixels)
         if pixels.alpha is not None:
             return pixels.alpha
         raise InputError(
             f"{path}: expected a mask of the subject: masks=<folder>, backgrounds=<folder without it>,"
             f" segment=rembg, <name>_mask beside the photograph, or an alpha channel; found none"
         )
-
-
-def _matte_of(mask: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
-    return mask.matte(pixels) if isinstance(mask, VideoFrame) else matte_of_file(mask, pixels)
 
 
 _segmenter = functools.cache(segmenter)

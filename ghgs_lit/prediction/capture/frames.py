@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ _CODED = 16
 _DIGITS = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class VideoFrame:
     """A photograph, or a mask, that is a frame of a video; ``mask``: that of the photograph, where known."""
 
@@ -44,10 +44,8 @@ class VideoFrame:
 
     def matte(self, pixels: Pixels) -> np.ndarray:
         """The mask [h, w] uint8 of a photograph. InputError: it cannot be decoded or has another size."""
-        grey, expected = (
-            self.video.frame(self.number),
-            f"the size of its video, {pixels.size} (height, width)",
-        )
+        grey = self.video.frame(self.number)
+        expected = f"the size of its video, {pixels.size} (height, width)"
         require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
         return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
 
@@ -90,23 +88,20 @@ def find_frames(
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():
-        try:
-            calibrate(cameras[name], convention, video.size)
-        except InputError as error:
-            raise InputError(f"{video.path}: {error}") from None
+        camera = cameras[name]
+        calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
     if isinstance(sync, str):
         numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
     else:
         numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
-    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
-    differ = len({video.count for video in videos.values()}) > 1
-    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
     frames = {name: _frames_of(video, folder, masks, step) for name, video in videos.items()}
     instants = {
         f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
         for instant, shown in numbers.items()
     }
-    return instants, note if differ else ""
+    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
+    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
+    return instants, note if len({video.count for video in videos.values()}) > 1 else ""
 
 
 def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,9 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
+
+#: The picture to look at.
+SHEET = "sheet.png"
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
     """The names below the directory of the files that :func:`write_prediction` writes of these views beside
     the report."""
     names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
-    return [*names, "sheet.png"]
+    return [*names, SHEET]
 
 
 @torch.no_grad()
@@ -145,23 +147,19 @@ def write_prediction(
     subject = exported_subject(batch, prediction, renderer, options)
     names, seconds = output_files(options, subject.views), {}
     begin_files(directory, names)
-    files = iter([directory / name for name in names])
     with ThreadPoolExecutor(allowed_cores()) as pool:
         pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
         tasks = {}
         for name in options.formats:
             begin = time.perf_counter()
-            contents = FORMATS[name].contents(subject)
-            count = len(FORMATS[name].names(subject.views, options.frames))
-            places = islice(files, count)
-            tasks[name] = [
-                pool.submit(write_file, path, made) for made, path in zip(contents, places, strict=True)
-            ]
+            files = FORMATS[name].names(subject.views, options.frames)
+            contents = zip(files, FORMATS[name].contents(subject), strict=True)
+            tasks[name] = [pool.submit(write_file, directory / file, made) for file, made in contents]
             seconds[f"write {name}"] = time.perf_counter() - begin
         seen = batch.cameras if batch.targets is None else batch.targets.cameras
         image = renderer(prediction.gaussians, seen).image
         overview = sheet(batch, image, 0, prediction.depth, prediction.depth_valid)
-        write_file(next(files), partial(png, overview))
+        write_file(directory / SHEET, partial(png, overview))
         facts = dict(facts or {})
         report = {**_report(subject), **facts}
         for name, begun in tasks.items():
