@@ -124,13 +124,14 @@ class Instants:
         seen.extrinsics[:, :3, 3] -= (seen.extrinsics[:, :3, :3] @ shifts[..., None])[..., 0]
         larger = max(_VIDEO_SIDE / max(seen.height, seen.width), 1.0)
         seen = seen.resized(round(larger * seen.height), round(larger * seen.width))
-        pictures = []
-        for frame, packed in enumerate(self._packed):
-            gaussians = unpack(packed, first.pixel, first.center, COARSE, first.gaussians)
+
+        def picture(frame: int) -> np.ndarray:
+            gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
             # Large pictures would show gaps.
             gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
-            pictures.append(to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0]))
-        return mp4_bytes(pictures, self.options.fps)
+            return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
+
+        return mp4_bytes(map(picture, range(len(path))), self.options.fps)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -72,16 +72,15 @@ def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubje
     return lambda subject: [partial(content, subject)]
 
 
-def _html(s: ExportedSubject) -> bytes:
-    return page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()
-
-
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
     **{name: _converted(name) for name in CONVERTED},
     "splat": Format(("gaussians.splat",), _one(lambda s: to_records(s.for_other_renderers).tobytes())),
     "glb": Format(("gaussians.glb",), _one(lambda s: glb_bytes(s.for_other_renderers, s.up)), "pygltflib"),
-    "html": Format(("viewer.html",), _one(_html)),
+    "html": Format(
+        ("viewer.html",),
+        _one(lambda s: page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()),
+    ),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
     "mp4": Format(
         ("turntable.mp4",),
