@@ -54,10 +54,8 @@ def read_pixels(path: Path) -> Pixels:
     image = read_image(path)
     require(image.mode in _EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
     orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    if orientation not in _TURNS:
-        raise InputError(
-            f"{path}: expected a photograph that is not mirrored; found EXIF orientation {orientation}"
-        )
+    found = f"EXIF orientation {orientation}"
+    require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
     turns, alpha = _TURNS[orientation], None
     if image.has_transparency_data:
         image = image.convert("RGBA")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.readers import read_json
 from ghgs_lit.runs.results import plain
@@ -22,13 +22,10 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
     written = _written_before(directory)
     for name in (*names, REPORT):
         path = directory / name
-        if path.resolve() in read:
-            raise InputError(
-                f"{path}: expected another folder (out=...) than that of an input; found the input"
-            )
-        if path.exists() and name not in written:
-            expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
-            raise InputError(f"{path}: expected {expected}; found another file")
+        expected = "another folder (out=...) than that of an input"
+        require(path.resolve() not in read, str(path), expected, "the input")
+        expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
+        require(name in written or not path.exists(), str(path), expected, "another file")
 
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:

@@ -286,5 +286,5 @@ def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
         write("ply", "depth")
     assert (tmp_path / "depth.npz").read_text() == "somebody's"
     (tmp_path / "report.json").write_text("{}")
-    with pytest.raises(InputError, match=r"found another file"):
+    with pytest.raises(InputError, match=r"found 'another file'"):
         write("ply")
