@@ -1,5 +1,8 @@
 """Errors that a user can correct; the command line prints them as one line and exits with 1."""
 
+import importlib
+from types import ModuleType
+
 
 class InputError(ValueError):
     """Bad input; the message names the path or key, what was expected and what was found."""
@@ -15,3 +18,12 @@ def require(condition: bool, key: str, expected: str, found: object) -> None:
     """Refuse the value ``found`` of ``key`` unless ``condition`` is true; ``expected`` describes it."""
     if not condition:
         raise InputError(f"{key}: expected {expected}; found {found!r}")
+
+
+def installed(package: str, extra: str, key: str) -> ModuleType:
+    """The module of a package that an ``extra`` installs. InputError: it is missing; ``key`` asks for it."""
+    try:
+        return importlib.import_module(package)
+    except ImportError:
+        hint = f"pip install 'ghgs-lit[{extra}]'"
+        raise InputError(f"{key}: expected the package {package} ({hint}); found none") from None

@@ -16,9 +16,10 @@ from ghgs_lit.config import resolve
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
-from ghgs_lit.prediction.capture.calibration import Convention, calibrate
+from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import read_cameras
+from ghgs_lit.prediction.export.maps import camera_entry
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.weights.inference import write_inference
@@ -56,7 +57,7 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
     else:
         folder = capture_folder(config)
         photographs = folder.photographs(folder.instants[0])
-        entries = {p.name: _entry(p.intrinsics, p.extrinsics, p.mask.shape) for p in photographs}
+        entries = {p.name: camera_entry(p.intrinsics, p.extrinsics, p.mask.shape) for p in photographs}
         fill = _fill_of(photographs)
     count = len(entries)
     require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
@@ -73,20 +74,13 @@ def with_rig(config: dict[str, Any]) -> dict[str, Any]:
 def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """All cameras of the calibration, which must say the size of its photographs."""
     require(config["cameras"] is not None, "cameras", "cameras=<calibration>", None)
-    said = {key: value for key, value in config["calibration"].items() if value is not None}
-    file = read_cameras(config["cameras"], said.pop("format", "auto"))
-    meant = {name: said.get(name, value) for name, value in vars(file.convention).items()}
-    entries = {}
+    file = read_cameras(config["cameras"], config["calibration"]["format"])
+    convention, entries = file.convention.told(config["calibration"]), {}
     for name, camera in file.cameras.items():
         require(camera.size is not None, camera.origin, "the photographs' size, or images=<folder>", None)
-        calibration = calibrate(camera, Convention(**meant), camera.size)
-        entries[name] = _entry(calibration.intrinsics, calibration.extrinsics, camera.size)
+        calibration = calibrate(camera, convention, camera.size)
+        entries[name] = camera_entry(calibration.intrinsics, calibration.extrinsics, camera.size)
     return entries
-
-
-def _entry(intrinsics: np.ndarray, extrinsics: np.ndarray, size: tuple[int, int]) -> dict[str, Any]:
-    matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
-    return matrices | {"height": size[0], "width": size[1]}
 
 
 def _fill_of(photographs: Sequence[Photograph]) -> list[float]:

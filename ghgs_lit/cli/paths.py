@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from ghgs_lit.cli.photographs import begin_to_read
-from ghgs_lit.config.registry import check
 from ghgs_lit.readers import require_data_folder
 from ghgs_lit.weights.reading import require_weights
 
@@ -36,7 +35,6 @@ def require_paths(verb: str, config: Mapping[str, Any]) -> None:
             require_weights(config[key])
     has_photographs = config.get("images") is not None and config.get("cameras") is not None
     if has_photographs and (verb == "predict" or config.get("task") == "cameras"):
-        check({"calibration": config["calibration"]})
         begin_to_read(config)
     data = config.get("data")
     is_read = verb in _READERS and isinstance(data, Mapping) and not data.get("source")

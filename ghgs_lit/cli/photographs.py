@@ -1,13 +1,10 @@
 """What ``predict images=...`` and ``doctor task=cameras`` share: the folder of a configuration."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.folder import CaptureFolder
-
-if TYPE_CHECKING:  # photographs are read while PyTorch is imported
-    from ghgs_lit.prediction.capture.camera_report import Diagnosis
 
 #: The folder that is being read, if any.
 _BEGUN: list[CaptureFolder] = []
@@ -45,19 +42,6 @@ def begin_to_read(config: Mapping[str, Any]) -> None:
         _BEGUN[0].begin(_BEGUN[0].instants[0])
 
 
-def require_consistent(diagnosis: "Diagnosis") -> None:
-    """Refuse cameras that the masks contradict, with what would fit.
-
-    Raises:
-        InputError: the diagnosis found something wrong.
-    """
-    if not diagnosis.consistent:
-        raise InputError(
-            "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"
-            f" check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
-        )
-
-
 def check_cameras(folder: CaptureFolder) -> None:
     """Print how cameras and masks agree, in a few instants of a sequence, and which contradict.
 
@@ -82,5 +66,9 @@ def check_cameras(folder: CaptureFolder) -> None:
             print(f"instant {name}: cameras and masks do not fit: {'; '.join(diagnosis.lines)}", flush=True)
     sound = [diagnosis for diagnosis in found.values() if diagnosis.consistent]
     for diagnosis in (sound or list(found.values()))[:1]:
-        require_consistent(diagnosis)
+        if not diagnosis.consistent:
+            raise InputError(
+                "cameras: expected cameras that fit photographs and masks (ghgs doctor draws them,"
+                f" check_cameras=false goes on anyway); found {'; '.join(diagnosis.lines)}"
+            )
         print("\n".join(diagnosis.lines), flush=True)

@@ -17,7 +17,9 @@ class Calibration(Options):
     """What the file of the cameras does not say, or says wrongly; null: as its format has it."""
 
     group = "calibration"
-    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml"] = "auto"
+    format: Literal["auto", "ghgs", "colmap", "nerfstudio", "opencv", "easymocap", "toml", "qualisys"] = (
+        "auto"
+    )
     """Format of the file."""
     extrinsics: Literal["world_to_camera", "camera_to_world"] | None = None
     """What the matrices map."""

@@ -29,7 +29,7 @@ def _compared(seen: list[Seen], reader: Reader, least: float) -> list[Seen]:
     def broken(one: Seen, line: str) -> Seen:
         return replace(one, problem=f"{reader.place(one.name, one.position, one.view)}: {line}")
 
-    ring = {one.position: one.silhouette for one in seen if one.view == RING_VIEW}
+    ring = {one.position: one.silhouette.extrinsics for one in seen if one.view == RING_VIEW}
     if (pair := twins(ring)) is not None:
         line = f"expected a camera of its own; found that of position {pair[0]}"
         return [

@@ -1,6 +1,8 @@
 """Checks of a person's masks that need no body: each by itself, and each beside the others."""
 
+import itertools
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -8,6 +10,7 @@ from ghgs_lit.data.resampling import area_mask
 from ghgs_lit.data.view import View
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
+_T = TypeVar("_T")
 # Side of a mask in cells, at most.
 _CELLS = 64
 #: Of many photographs: a quarter of the other masks may be wrong.
@@ -46,11 +49,7 @@ def height(silhouettes: Sequence[Silhouette]) -> float:
     return float(np.median([s.extent(focus)[0] for s in silhouettes]))
 
 
-def twins(silhouettes: Mapping[int, Silhouette]) -> tuple[int, int] | None:
-    """The first two positions whose cameras are the same; None if all differ."""
-    listed = list(silhouettes.items())
-    for i, (first, one) in enumerate(listed):
-        for second, other in listed[i + 1 :]:
-            if np.allclose(one.extrinsics, other.extrinsics, atol=1e-6):
-                return first, second
-    return None
+def twins(poses: Mapping[_T, np.ndarray]) -> tuple[_T, _T] | None:
+    """The names of the first two poses [4, 4] that are the same; None if all differ."""
+    pairs = itertools.combinations(poses, 2)
+    return next((p for p in pairs if np.allclose(poses[p[0]], poses[p[1]], rtol=1e-6, atol=1e-6)), None)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, installed
 
 NETWORK = "vgg"
 
@@ -16,10 +16,7 @@ class LPIPS:
     calibrated; the authors' evaluation does not. InputError: torchvision or the weights are not available."""
 
     def __init__(self, signed: bool = True):
-        try:
-            import torchvision  # noqa: F401
-        except ImportError as error:
-            raise InputError("LPIPS needs torchvision: pip install 'ghgs-lit[lpips]'") from error
+        installed("torchvision", "lpips", "LPIPS")
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
         try:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_npy, load_pickle
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, installed
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.scans import ScanSource
 
@@ -178,12 +178,7 @@ def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
 
 @lru_cache(maxsize=2)
 def _smplx_model(folder: Path) -> Any:
-    try:
-        import smplx
-    except ImportError as error:
-        raise InputError(
-            "data.body_model: expected the package smplx (pip install smplx); found none"
-        ) from error
+    smplx = installed("smplx", "smpl", "data.body_model")
     if not folder.exists():
         raise InputError(f"{folder}: expected the SMPL-X model (data.body_model); found no such folder")
     try:

@@ -1,6 +1,5 @@
 """Loggers that continue after a restart, and the values that a sweep compares its runs by."""
 
-import importlib.util
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from ghgs_lit.config.keys import NOT_HYPERPARAMETERS, is_below, lookup
 from ghgs_lit.config.options import Options
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import installed
 from ghgs_lit.readers import read_rows
 
 #: The final numbers that runs are compared by: TensorBoard's HParams tab shows the first five of them
@@ -104,10 +103,7 @@ class WandbOptions(Options):
     """Weights & Biases (extra ``wandb``); ``WANDB_PROJECT`` and ``WANDB_MODE`` of the environment count."""
 
     def build(self, save_dir: str) -> WandbLog:
-        if importlib.util.find_spec("wandb") is None:
-            raise InputError(
-                "logger.wandb: expected the package wandb (pip install 'ghgs-lit[wandb]'); found none"
-            )
+        installed("wandb", "wandb", "logger.wandb")
         return WandbLog(project=os.environ.get("WANDB_PROJECT", "ghgs_lit"), save_dir=save_dir)
 
 

@@ -7,12 +7,13 @@ Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.data.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from PIL import Image
 
 from ghgs_lit.data.layout import position_name
-from ghgs_lit.data.sampling import VIEW_NUMBERS, subject_rng
+from ghgs_lit.data.sampling import ViewNumber, subject_rng
 from ghgs_lit.synthesis.miniature import names, scan_of
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
@@ -26,7 +27,7 @@ def make(
     people: Mapping[str, int],
     size: int,
     seed: int,
-    vids: Sequence[int] = VIEW_NUMBERS,
+    vids: Sequence[int] = get_args(ViewNumber),
     positions: int = 16,
 ) -> Path:
     """Write renders below ``root`` in the layout that the published scripts make.

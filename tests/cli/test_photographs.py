@@ -256,7 +256,7 @@ def test_inputs_are_never_replaced(here, checkpoint, capsys):
     assert ghgs("predict", *run) == 0
     again = ("images=first/inputs", "cameras=first/cameras.json", "out=first", *common, "formats=[inputs]")
     assert ghgs("predict", *again) == 1
-    assert "found the input" in capsys.readouterr().err
+    assert "found 'the input'" in capsys.readouterr().err
     assert ghgs("doctor", "task=cameras", "images=cap", f"cameras={cameras}", "hydra.run.dir=cap") == 1
     assert "cameras.json: expected a folder (hydra.run.dir) without inputs" in capsys.readouterr().err
     (here / "other").mkdir()

@@ -273,4 +273,6 @@ def test_without_smplx_the_message_says_what_to_install(whole, monkeypatch):
     monkeypatch.setitem(sys.modules, "smplx", None)
     place = whole.parent.with_name("recon_body_models")
     data = build_data("humman", whole.parent, f"data.smpl_model={place}").dataset
-    refused(r"data.body: expected the package smplx .*pip install smplx", lambda: data.reader("val"))
+    refused(
+        r"data.body: expected the package smplx .*pip install 'ghgs-lit\[smpl\]'", lambda: data.reader("val")
+    )

@@ -7,6 +7,7 @@ by harmless classes that keep the arrays.
 
 import contextlib
 import functools
+import importlib
 import io
 import pickle
 from pathlib import Path
@@ -18,7 +19,7 @@ from scipy import sparse
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_pickle
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, installed
 
 VERTICES = 6890
 #: What a sequence's ``smpl_params/<frame>.npz`` holds.
@@ -128,12 +129,7 @@ class Body:
 
 @functools.lru_cache(maxsize=1)
 def _model(path: Path) -> torch.nn.Module:
-    try:
-        import smplx
-        from smplx.utils import Struct
-    except ImportError as error:
-        raise InputError(
-            "data.body: expected the package smplx for body=smpl (pip install smplx); found none"
-        ) from error
+    smplx = installed("smplx", "smpl", "data.body")
+    struct = importlib.import_module("smplx.utils").Struct(**read_model(path))
     with contextlib.redirect_stdout(io.StringIO()):  # it prints how many shapes the model has
-        return smplx.SMPL("", data_struct=Struct(**read_model(path)), gender="neutral").eval()
+        return smplx.SMPL("", data_struct=struct, gender="neutral").eval()

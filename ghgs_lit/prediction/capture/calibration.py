@@ -5,8 +5,10 @@ the user. A :class:`Convention` is such a meaning; :mod:`ghgs_lit.prediction.cap
 others.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +59,11 @@ class Convention:
             value = getattr(self, name)
             expected = "a number above 0, from 1e-9 to 1e9"
             require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
+
+    def told(self, said: Mapping[str, Any]) -> "Convention":
+        """The convention with what the user says; None and keys of other things say nothing."""
+        named = {f.name: said.get(f.name) for f in fields(self)}
+        return replace(self, **{name: value for name, value in named.items() if value is not None})
 
 
 @dataclass(frozen=True)

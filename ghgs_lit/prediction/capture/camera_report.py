@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ghgs_lit.data.resampling import area_image, area_mask
+from ghgs_lit.data.silhouettes import twins
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 from ghgs_lit.prediction.capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera
@@ -115,10 +116,10 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
     read."""
     views = small_views(folder, folder.instants[0] if instant is None else instant)
     given = Hypothesis("the calibration is right as it is", "", views).ranked(folder)
-    twins = _twins(views)
-    if twins:
-        line = f"{' and '.join(twins)} have the same pose: one of them is a copy"
-        return Diagnosis(False, (line,), "", (given,), given.size(folder), twins)
+    same = twins({view.name: view.camera.pose for view in views})
+    if same is not None:
+        line = f"{' and '.join(same)} have the same pose: one of them is a copy"
+        return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
     if given.score >= AGREES:
         size = given.size(folder)
         line = (
@@ -134,7 +135,10 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         best = max(tried, key=lambda hypothesis: hypothesis.score)
     tried.sort(key=lambda hypothesis: -hypothesis.score)
     if best.score >= max(AGREES, given.score + BETTER):
-        return _explained(folder, given, best, tried)
+        size = best.size(folder)
+        lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}"]
+        lines += [f"try {best.option}"] if best.option else []
+        return Diagnosis(False, (*lines, _size_line(size)), best.option, tuple(tried), size, best.blames)
     return _unexplained(folder, given, tried)
 
 
@@ -265,13 +269,6 @@ def _contrast(view: StoredView, mask: np.ndarray) -> float:
     return float(gradient[outline].mean()) if outline.any() else 0.0
 
 
-def _twins(views: Sequence[StoredView]) -> tuple[str, ...]:
-    for one, other in itertools.combinations(views, 2):
-        if np.allclose(one.camera.pose, other.camera.pose, rtol=1e-6, atol=1e-9):
-            return one.name, other.name
-    return ()
-
-
 def _size_line(size: float) -> str:
     """A line about the subject's size, with the unit in which it is a person's."""
     if PERSON[0] <= size <= PERSON[1]:
@@ -281,16 +278,6 @@ def _size_line(size: float) -> str:
         return f"the subject is {size:.3g} units tall; it is scaled to a person's size inside, and back"
     option = f"calibration.unit={_UNITS[unit]:g}"
     return f"the subject is {size:.4g} units tall, a person in {unit}: {option} makes it metres"
-
-
-def _explained(
-    folder: CaptureFolder, given: Hypothesis, best: Hypothesis, tried: list[Hypothesis]
-) -> Diagnosis:
-    size = best.size(folder)
-    lines = [f"{best.says}: masks agree by {best.score:.0%} instead of {given.score:.0%}", _size_line(size)]
-    if best.option:
-        lines.insert(1, f"try {best.option}")
-    return Diagnosis(False, tuple(lines), best.option, tuple(tried), size, best.blames)
 
 
 def _unexplained(folder: CaptureFolder, given: Hypothesis, tried: list[Hypothesis]) -> Diagnosis:

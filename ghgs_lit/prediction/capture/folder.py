@@ -3,16 +3,16 @@
 import functools
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ghgs_lit.config.nodes import Sequence
+from ghgs_lit.config import nodes
 from ghgs_lit.data.silhouettes import implausible
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.calibration import (
     Calibration,
@@ -37,10 +37,8 @@ from ghgs_lit.prediction.capture.photographs import (
 if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     import torch
 
-EXIF = ("auto", "stored", "shown")
 #: Photographs that an instant needs where others of its are missing.
 ENOUGH = 3
-_CONVENTION = tuple(f.name for f in fields(Convention))
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,8 @@ class CaptureFolder:
             masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
         backgrounds: folder of photographs without the subject, named after the cameras.
         segment: a segmenter of :data:`ghgs_lit.prediction.capture.masks.SEGMENTERS`.
-        calibration: what the file does not say, or says wrongly: ``format``; the fields of
-            :class:`Convention`; ``exif`` (:func:`fits_stored`); ``names``, the camera of a photograph whose
-            name differs, as ``{photograph: camera}``. None and missing keys are as the format has it.
+        calibration: what the file does not say, or says wrongly: the fields of
+            :class:`ghgs_lit.config.nodes.Calibration`.
         sequence: which instants count, and how videos fit together: the fields of
             :class:`ghgs_lit.config.nodes.Sequence`.
 
@@ -74,19 +71,21 @@ class CaptureFolder:
     sequence: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = ("format", "exif", "names", *_CONVENTION)
-        unknown = sorted(set(self.calibration) - set(known))
-        require(not unknown, "calibration", f"keys among {', '.join(known)}", unknown)
-        choice("calibration.exif", self._said("exif", "auto"), EXIF)
+        for name in ("images", "cameras", "masks", "backgrounds"):
+            if (path := getattr(self, name)) is not None:
+                object.__setattr__(self, name, Path(path).expanduser())
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
-            is_folder = path is None or Path(path).expanduser().is_dir()
-            require(is_folder, name, "a folder", str(path))
+            require(path is None or path.is_dir(), name, "a folder", str(path))
         _ = self.paths  # reads the calibration and lists the photographs: missing files are refused here
 
-    def _said(self, key: str, default: Any) -> Any:
-        value = self.calibration.get(key)
-        return default if value is None else value
+    @functools.cached_property
+    def _said(self) -> nodes.Calibration:
+        return nodes.Calibration.read(self.calibration, "calibration")
+
+    @functools.cached_property
+    def _part(self) -> nodes.Sequence:
+        return nodes.Sequence.read(self.sequence, "sequence")
 
     @functools.cached_property
     def _begun(self) -> dict[str, dict[str, Future]]:
@@ -96,27 +95,21 @@ class CaptureFolder:
     @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
-        return read_cameras(self.cameras, self._said("format", "auto"))
+        return read_cameras(self.cameras, self._said.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
         """Meaning of the stored numbers: the format's, unless the user says otherwise."""
-        said = {name: self._said(name, getattr(self.file.convention, name)) for name in _CONVENTION}
-        return Convention(**said)
-
-    @property
-    def _part(self) -> Sequence:
-        return Sequence.read(self.sequence, "sequence")
+        return self.file.convention.told(vars(self._said))
 
     @functools.cached_property
     def _found(self) -> tuple[dict[str, dict[str, Path | VideoFrame]], str]:
         """The photographs of all instants, and a line about what is left over."""
-        folder, cameras, part = Path(self.images).expanduser(), self.file.cameras, self._part
+        folder, cameras, part = self.images, self.file.cameras, self._part
         # Numbers, too, are names of cameras.
-        names = {composed(str(key)): composed(str(name)) for key, name in self._said("names", {}).items()}
+        names = {composed(str(key)): composed(str(name)) for key, name in (self._said.names or {}).items()}
         if has_videos(folder, cameras, names):
-            masks = None if self.masks is None else Path(self.masks).expanduser()
-            return find_frames(folder, masks, cameras, names, self.convention, part.sync, part.step)
+            return find_frames(folder, self.masks, cameras, names, self.convention, part.sync, part.step)
         require(part.sync is None, "sequence.sync", "null for photographs", part.sync)
         return find_instants(folder, cameras, names), ""
 
@@ -151,10 +144,9 @@ class CaptureFolder:
     @property
     def input_files(self) -> list[Path]:
         """The files that may be read, such as photographs with what lies beside them, and the calibration."""
-        sources, videos = (path for paths in self.paths.values() for path in paths.values()), self.images
-        folders = {path.parent if isinstance(path, Path) else Path(videos).expanduser() for path in sources}
-        given = (self.cameras, self.masks, self.backgrounds)
-        given = [Path(path).expanduser() for path in given if path is not None]
+        sources = (path for paths in self.paths.values() for path in paths.values())
+        folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
+        given = [path for path in (self.cameras, self.masks, self.backgrounds) if path is not None]
         files = [path for folder in folders for path in folder.iterdir()]
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 
@@ -219,7 +211,7 @@ class CaptureFolder:
     ) -> Photograph:
         """One view without distortion and upright, as a convention has it."""
         image, turns = pixels.image, 0
-        if fits_stored(pixels, camera, self._said("exif", "auto")):
+        if fits_stored(pixels, camera, self._said.exif):
             turns = pixels.turns
             image, matte = np.rot90(image, -turns), np.rot90(matte, -turns)
         size = image.shape[:2]
@@ -234,24 +226,22 @@ class CaptureFolder:
 
     def _matte(self, name: str, camera: StoredCamera, path: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
-        images, is_frame = Path(self.images).expanduser(), isinstance(path, VideoFrame)
-        if is_frame and path.masks is not None:
-            return path.matte(pixels)
+        masks = self.images if self.masks is None else self.masks
+        mask = path.mask if isinstance(path, VideoFrame) else mask_path(path, self.images, masks)
         if self.masks is not None:
-            mask = mask_path(path, images, Path(self.masks).expanduser())
-            require(mask is not None, f"{self.masks}", f"a mask {path.stem}.png of {path}", "none")
-            return matte_of_file(mask, pixels)
-        if self.backgrounds is not None:
-            background = image_named(Path(self.backgrounds).expanduser(), name)
+            require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
+        elif self.backgrounds is not None:
+            background = image_named(self.backgrounds, name)
             expected = f"a photograph {name} without the subject"
             require(background is not None, f"{self.backgrounds}", expected, "none")
             return matte_of_background(pixels, background)
-        if self.segment is not None:
+        elif self.segment is not None:
             return _segmenter(self.segment)(pixels)
-        beside = None if is_frame else mask_path(path, images, images)
-        named = beside if beside is not None else camera.mask
-        if named is not None:
-            return matte_of_file(named, pixels)
+        mask = mask or camera.mask
+        if isinstance(mask, VideoFrame):
+            return mask.matte(pixels)
+        if mask is not None:
+            return matte_of_file(mask, pixels)
         if pixels.alpha is not None:
             return pixels.alpha
         raise InputError(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera, calibrate
-from ghgs_lit.prediction.capture.masks import matte_of_file
 from ghgs_lit.prediction.capture.photographs import (
     MASK_ENDING,
     Pixels,
@@ -20,7 +19,7 @@ from ghgs_lit.prediction.capture.photographs import (
     image_named,
     images_in,
 )
-from ghgs_lit.prediction.capture.videos import SUFFIXES, Reader, Video, nearest, read_video
+from ghgs_lit.prediction.capture.videos import SUFFIXES, Reader, Video, read_video
 from ghgs_lit.readers import read_rows
 
 # Coding changes black and white by less than this.
@@ -28,36 +27,27 @@ _CODED = 16
 _DIGITS = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class VideoFrame:
-    """A photograph that is a frame of a video; its mask is one, too, or a file, or elsewhere (None)."""
+    """A photograph, or a mask, that is a frame of a video; ``mask``: that of the photograph, where known."""
 
     video: Reader
     number: int
-    masks: Reader | Mapping[int, Path] | None
+    mask: "VideoFrame | Path | None" = None
 
     def __str__(self) -> str:
         return f"{self.video.video.path}, frame {self.number}"
 
     def pixels(self) -> Pixels:
-        """The frame. InputError: it cannot be decoded."""
+        """The photograph. InputError: it cannot be decoded."""
         return Pixels(self.video.frame(self.number), None, 0)
 
     def matte(self, pixels: Pixels) -> np.ndarray:
-        """[h, w] uint8, where ``masks`` has it. InputError: it is missing or has another size."""
-        if isinstance(self.masks, Reader):
-            known, drawn = self.video.video.numbers, self.masks.video.numbers
-            # Masks that were drawn of frame after frame know of none that the camera dropped.
-            number = (
-                self.number if len(known) != len(drawn) else int(drawn[np.searchsorted(known, self.number)])
-            )
-            grey, place = self.masks.frame(number), str(self.masks.video.path)
-            expected = f"the size of its video, {pixels.size} (height, width)"
-            require(grey.shape == pixels.size, place, expected, grey.shape)
-            return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
-        path = self.masks.get(self.number)
-        require(path is not None, str(self), "a mask of this number", "none")
-        return matte_of_file(path, pixels)
+        """The mask [h, w] uint8 of a photograph. InputError: it cannot be decoded or has another size."""
+        grey = self.video.frame(self.number)
+        expected = f"the size of its video, {pixels.size} (height, width)"
+        require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
+        return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
@@ -98,29 +88,20 @@ def find_frames(
     with ThreadPoolExecutor(allowed_cores()) as pool:
         videos = dict(zip(paths, pool.map(read_video, paths.values()), strict=True))
     for name, video in videos.items():
-        try:
-            calibrate(cameras[name], convention, video.size)
-        except InputError as error:
-            raise InputError(f"{video.path}: {error}") from None
+        camera = cameras[name]
+        calibrate(replace(camera, origin=f"{video.path}: {camera.origin}"), convention, video.size)
     if isinstance(sync, str):
         numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
     else:
         numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
-    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
-    differ = len({video.count for video in videos.values()}) > 1
-    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
-    readers = {name: Reader(video, "rgb24", step) for name, video in videos.items()}
-    mattes = {name: _masks_of(video, folder, masks, step) for name, video in videos.items()}
-    known = {name: set(video.numbers.tolist()) for name, video in videos.items()}
+    frames = {name: _frames_of(video, folder, masks, step) for name, video in videos.items()}
     instants = {
-        f"{instant:0{_DIGITS}d}": {
-            name: VideoFrame(readers[name], number, mattes[name])
-            for name, number in shown.items()
-            if number in known[name]
-        }
+        f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
         for instant, shown in numbers.items()
     }
-    return instants, note if differ else ""
+    counts = ", ".join(f"{name} {video.count}" for name, video in videos.items())
+    note = f"videos differ in length ({counts} frames): the {len(numbers)} instants that all show are used"
+    return instants, note if len({video.count for video in videos.values()}) > 1 else ""
 
 
 def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[int, dict[str, int]]:
@@ -144,47 +125,53 @@ def _by_number(videos: Mapping[str, Video], offsets: Mapping[str, Any]) -> dict[
 
 def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) -> dict[int, dict[str, int]]:
     """The frame of each camera that is nearest to one of the first, within half of the time between its."""
-    times: dict[str, list[tuple[float, int]]] = {}
-    for row in read_rows(path, "CSV with the columns camera,frame,seconds"):
-        try:
-            name = composed(row["camera"])
-            entry = float(row["seconds"]), int(row["frame"])
-            if not np.isfinite(entry[0]):
-                raise ValueError("no time")
-            times.setdefault(names.get(name, name), []).append(entry)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{path}: expected camera,frame,seconds with numbers; found {row} ({error!r})"
-            ) from None
-    for name in videos:
-        require(name in times, str(path), f"the times of {', '.join(videos)}", ", ".join(times) or "none")
-    unknown = sorted(set(times) - set(videos))
-    require(not unknown, str(path), f"cameras among {', '.join(videos)}", unknown)
-    seconds = {name: np.array(sorted(times[name])) for name in videos}
+    import pandas as pd  # here: it takes time to import
+
+    columns, rows = {"camera": str, "frame": int, "seconds": float}, read_rows(path)
+    try:
+        table = pd.DataFrame(rows, columns=list(columns)).astype(columns)
+        if not np.isfinite(table.seconds).all():
+            raise ValueError("no time")
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected camera,frame,seconds with numbers; found {error}") from None
+    cameras = table.camera.map(lambda name: names.get(composed(name), composed(name)))
+    times = {name: found.sort_values("seconds") for name, found in table.groupby(cameras)}
+    require(times.keys() == videos.keys(), str(path), f"the times of {', '.join(videos)}", ", ".join(times))
     first, *others = videos
-    half = float(np.median(np.diff(seconds[first][:, 0]))) / 2 if len(seconds[first]) > 1 else np.inf
-    begin, end = (f([table[i, 0] for table in seconds.values()]) for f, i in ((max, 0), (min, -1)))
-    common = seconds[first][(seconds[first][:, 0] >= begin - half) & (seconds[first][:, 0] <= end + half)]
-    require(len(common) > 0, str(path), "times that all cameras share", "none")
-    found = {int(frame): {first: int(frame)} for frame in common[:, 1]}
+    steps = times[first].seconds.diff().dropna()
+    half = float(steps.median()) / 2 if len(steps) else np.inf
+    begin = max(found.seconds.iloc[0] for found in times.values()) - half
+    end = min(found.seconds.iloc[-1] for found in times.values()) + half
+    shared = times[first][times[first].seconds.between(begin, end)][["seconds", "frame"]]
+    require(len(shared) > 0, str(path), "times that all cameras share", "none")
+    shared = shared.rename(columns={"frame": first})
     for other in others:
-        rows = seconds[other][nearest(seconds[other][:, 0], common[:, 0])]
-        for (time, instant), (near, frame) in zip(common, rows, strict=True):
-            if abs(near - time) <= half:
-                found[int(instant)][other] = int(frame)
-    return found
+        found = times[other][["seconds", "frame"]].rename(columns={"frame": other})
+        shared = pd.merge_asof(shared, found, on="seconds", direction="nearest", tolerance=half)
+    entries = shared.drop(columns="seconds").to_dict("records")
+    return {entry[first]: {name: int(n) for name, n in entry.items() if n == n} for entry in entries}
 
 
-def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> Reader | dict[int, Path] | None:
-    """Where the masks of a video are."""
+def _frames_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame]:
+    """The frames of a video by their numbers."""
+    reader, found = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
+    return {n: VideoFrame(reader, n, found.get(n)) for n in video.numbers.tolist()}
+
+
+def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:
+    """The masks of a video by the numbers of its frames; none where there are none beside it."""
     name, place = composed(video.path.stem), folder if masks is None else masks
     marked = f"{name}{MASK_ENDING}"
     names = (marked,) if place.resolve() == folder.resolve() else (name, marked)
     path = image_named(place, *names, suffixes=SUFFIXES)
     if path is not None:
-        return Reader(read_video(path), "gray", step)
+        drawn = read_video(path)
+        reader, numbers = Reader(drawn, "gray", step), drawn.numbers.tolist()
+        # Masks that were drawn of frame after frame know of none that the camera dropped.
+        known = video.numbers.tolist() if len(numbers) == len(video.numbers) else numbers
+        return {n: VideoFrame(reader, its) for n, its in zip(known, numbers, strict=True)}
     if masks is None:
-        return None
+        return {}
     below = next((place / spelled for spelled in names if (place / spelled).is_dir()), None)
     require(below is not None, str(masks), f"a video {name} or a folder of it", "none")
     return _numbered(below, video)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from ghgs_lit.data.decoding import read_image
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.prediction.capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
 
 #: Choices of ``segment``.
@@ -79,12 +79,7 @@ def segmenter(name: str) -> Callable[[Pixels], np.ndarray]:
     """A function from a photograph to its matte. ``name``: one of :data:`SEGMENTERS`. InputError: its package
     is not installed."""
     choice("segment", name, SEGMENTERS)
-    try:
-        import rembg
-    except ImportError:
-        raise InputError(
-            "segment: expected the extra segment for rembg (pip install 'ghgs-lit[segment]'); found none"
-        ) from None
+    rembg = installed("rembg", "segment", "segment")
     session = rembg.new_session()
 
     def matte(pixels: Pixels) -> np.ndarray:

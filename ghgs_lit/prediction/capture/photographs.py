@@ -1,6 +1,7 @@
 """Photographs in a folder: which camera took each, and the pixels that its calibration is for."""
 
 import functools
+import re
 import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -53,10 +54,8 @@ def read_pixels(path: Path) -> Pixels:
     image = read_image(path)
     require(image.mode in _EIGHT_BITS, str(path), "a photograph of 8 bits a channel", f"mode {image.mode}")
     orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
-    if orientation not in _TURNS:
-        raise InputError(
-            f"{path}: expected a photograph that is not mirrored; found EXIF orientation {orientation}"
-        )
+    found = f"EXIF orientation {orientation}"
+    require(orientation in _TURNS, str(path), "a photograph that is not mirrored", found)
     turns, alpha = _TURNS[orientation], None
     if image.has_transparency_data:
         image = image.convert("RGBA")
@@ -134,7 +133,7 @@ def find_instants(
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     below = {
         composed(path.name): images_in(path)
-        for path in sorted(folder.iterdir())
+        for path in sorted(folder.iterdir(), key=lambda path: _counted(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }
     folders = {name: paths for name, paths in below.items() if paths}
@@ -145,6 +144,11 @@ def find_instants(
     return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
 
 
+def _counted(name: str) -> list[str | int]:
+    """What names are sorted by so that their numbers follow one another: 2 before 10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
 def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
     """``{camera: {instant: path}}`` the other way around."""
     first, *others = by_camera
@@ -152,7 +156,7 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
         shared = by_camera[first].keys() & by_camera[other].keys()
         expected, found = f"photographs named as those of {first}", ", ".join(list(by_camera[other])[:3])
         require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
-    instants = sorted({instant for paths in by_camera.values() for instant in paths})
+    instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=_counted)
     return {
         instant: {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
         for instant in instants

@@ -1,8 +1,8 @@
 """Videos of cameras: when each frame was taken, and frames that ffmpeg decodes as they are asked for."""
 
 import functools
+import io
 import math
-import queue
 import re
 import subprocess
 import threading
@@ -10,25 +10,24 @@ import weakref
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from PIL import Image
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.readers import require_file
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
-# ffmpeg says on stderr when each frame that it writes is shown.
-_TELL = "metadata=add:key=k:value=v,metadata=print"
-_TIME = re.compile(r"pts_time:(\S+)")
-_SIZE = re.compile(r"Output #0.*?Video:.*? (\d+)x(\d+)[ ,]", re.DOTALL)
+# ffmpeg says on stderr when each frame is shown, before it writes the frame.
+_TELL = r"metadata=add:key=k:value=v,metadata=print:file='pipe\:2':direct=1"
+_TIME = re.compile(rb"pts_time:(\S+)")
 # Colours as they were before they were coded: without it green is a level too dark.
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
 # How framecrc lists a packet that says no time, and one that is not shown.
 _UNTIMED, _HIDDEN = -(2**63), re.compile("F=0x[4-7]")
 #: Seconds of a video that are decoded for nothing before it is sought in.
 _PATIENCE = 10.0
-# Seconds until a decoder that says nothing of its frames is given up.
-_SILENCE = 60.0
 
 
 @dataclass(frozen=True)
@@ -59,14 +58,9 @@ class Video:
 
     def number_at(self, seconds: float) -> int | None:
         """The frame that is shown at a time; None: there is none within half a frame."""
-        place = int(nearest(self.seconds, np.array([seconds]))[0])
-        return int(self.numbers[place]) if abs(self.seconds[place] - seconds) < 0.5 / self.rate else None
-
-
-def nearest(ascending: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """The places in ``ascending`` [n] that are nearest to ``values`` [m]: [m]."""
-    middles = (ascending[1:] + ascending[:-1]) / 2
-    return np.searchsorted(middles, values)
+        away = np.abs(self.seconds - seconds)
+        place = int(away.argmin())
+        return int(self.numbers[place]) if away[place] < 0.5 / self.rate else None
 
 
 def read_video(path: Path) -> Video:
@@ -81,16 +75,16 @@ def read_video(path: Path) -> Video:
 
 @functools.lru_cache(maxsize=256)
 def _read_video(path: Path, changed: int) -> Video:
-    first = subprocess.run(_command(path, "gray", "-frames:v", "1"), capture_output=True)
-    told = first.stderr.decode(errors="replace")
-    time, size = _TIME.search(told), _SIZE.search(told)
+    options = ("-frames:v", "1", "-f", "image2pipe", "-c:v", "pgm")
+    first = subprocess.run(_command(path, "gray", *options, log="error"), capture_output=True)
+    time = _TIME.search(first.stderr)
     listing = [*_source(path), "-c", "copy", "-f", "framecrc", "-"]
     listed = subprocess.run(listing, capture_output=True).stdout.decode().splitlines()
     packets = [line.split(",")[1:3] for line in listed if line[:1].isdigit() and not _HIDDEN.search(line)]
-    decoded, shown = np.array(packets, np.int64).reshape(-1, 2).T
-    if time is None or size is None or not packets:
-        found = told.strip().splitlines()[-1:] or ["no output of ffmpeg"]
+    if time is None or not packets:
+        found = first.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no output of ffmpeg"]
         raise InputError(f"{path}: expected a video with frames that ffmpeg can decode; found {found[0]}")
+    decoded, shown = np.array(packets, np.int64).T
     unit = next(Fraction(line.split(":")[1].strip()) for line in listed if line.startswith("#tb"))
     is_timed = shown.min() > _UNTIMED
     seconds = np.sort(shown if is_timed else decoded) * float(unit)
@@ -99,25 +93,18 @@ def _read_video(path: Path, changed: int) -> Video:
     steps = np.diff(seconds)
     usual = max(float(np.median(steps)), 1e-6) if len(steps) else 1.0
     numbers = np.cumsum([0, *np.rint(steps / usual).clip(1)]).astype(np.int64)
-    return Video(path, (int(size[2]), int(size[1])), seconds, numbers)
+    return Video(path, Image.open(io.BytesIO(first.stdout)).size[::-1], seconds, numbers)
 
 
-def _source(path: Path, seek: float = 0.0) -> list[str]:
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-    except ImportError:
-        raise InputError(
-            f"{path}: expected the extra video for videos (pip install 'ghgs-lit[video]'); found none"
-        ) from None
+def _source(path: Path, seek: float = 0.0, log: str = "quiet") -> list[str]:
+    ffmpeg = installed("imageio_ffmpeg", "video", str(path)).get_ffmpeg_exe()
     start = ["-ss", f"{seek:.6f}"] if seek > 0 else []
-    options = ["-nostdin", "-hide_banner", "-nostats", "-copyts"]
-    return [get_ffmpeg_exe(), *options, *start, "-i", str(path), "-map", "0:v:0"]
+    return [ffmpeg, "-v", log, "-nostdin", "-copyts", *start, "-i", str(path), "-map", "0:v:0"]
 
 
-def _command(path: Path, pixels: str, *options: str, select: str = "1", seek: float = 0.0) -> list[str]:
-    filters = ["-vf", f"select='{select}',{_TELL}", "-sws_flags", _EXACT]
-    output = ["-fps_mode", "passthrough", *options, "-pix_fmt", pixels, "-f", "rawvideo", "-"]
-    return [*_source(path, seek), *filters, *output]
+def _command(path: Path, pixels: str, *output: str, select: str = "1", **source: Any) -> list[str]:
+    filters = ["-vf", f"select='{select}',{_TELL}", "-sws_flags", _EXACT, "-fps_mode", "passthrough"]
+    return [*_source(path, **source), *filters, "-pix_fmt", pixels, *output, "-"]
 
 
 class Reader:
@@ -130,8 +117,7 @@ class Reader:
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
         self.video, self.pixels, self.step = video, pixels, step
-        self._lock, self._times = threading.Lock(), queue.Queue()
-        self._end = self._pipe = None
+        self._lock, self._process = threading.Lock(), None
         # The numbers of the frame at hand and of the one before: no frame between them could be decoded.
         self._at = self._before = -1
         self._frame = np.zeros(0, np.uint8)
@@ -140,7 +126,7 @@ class Reader:
         """[h, w, 3] or [h, w] uint8. InputError: there is none of this number that can be decoded."""
         far = _PATIENCE * self.video.rate + self.step
         with self._lock:
-            if self._pipe is None or number <= self._before or number > self._at + far:
+            if self._process is None or number <= self._before or number > self._at + far:
                 self._open(number)
             while self._at < number and self._advance():
                 pass
@@ -156,38 +142,27 @@ class Reader:
         if self.step > 1 and uneven < length / 4:
             select = f"lt(mod(t-{time - length / 2:.6f},{self.step * length:.9f}),{length:.6f})"
         seek = time - float(video.seconds[0]) - 1.0
-        if self._end is not None:
+        if self._process is not None:
             self._end()
-        command = _command(video.path, self.pixels, select=select, seek=seek)
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        self._end = weakref.finalize(self, _stop, process)
-        self._pipe, self._times = process.stdout, queue.Queue()
-        threading.Thread(target=_listen, args=(process.stderr, self._times), daemon=True).start()
+        command = _command(video.path, self.pixels, "-f", "rawvideo", select=select, seek=seek)
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        self._end = weakref.finalize(self, _stop, self._process)
         self._at = self._before = number - 1
 
     def _advance(self) -> bool:
         """Read the next frame; False: there is none."""
         shape = (*self.video.size, 3) if self.pixels == "rgb24" else self.video.size
-        content = self._pipe.read(math.prod(shape))
-        if len(content) < math.prod(shape):
+        time = next(filter(None, map(_TIME.search, self._process.stderr)), None)
+        content = self._process.stdout.read(math.prod(shape))
+        if time is None or len(content) < math.prod(shape):
             return False
-        number = self.video.number_at(self._times.get(timeout=_SILENCE))
+        number = self.video.number_at(float(time[1]))
         if number is not None and number > self._at:
             self._before, self._at = self._at, number
             self._frame = np.frombuffer(content, np.uint8).reshape(shape)
         return True
 
 
-def _listen(stream, times: queue.Queue) -> None:
-    """Collect when the frames that ffmpeg writes are shown, which it says before it writes them."""
-    with stream:
-        for line in stream:
-            found = _TIME.search(line.decode(errors="replace"))
-            if found is not None:
-                times.put(float(found[1]))
-
-
 def _stop(process: subprocess.Popen) -> None:
     process.kill()
-    process.stdout.close()
-    process.wait()
+    process.communicate()

@@ -4,7 +4,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import torch
 
 from ghgs_lit.files import write_atomically
 from ghgs_lit.prediction.export.packed import COARSE, pack, unpack
-from ghgs_lit.prediction.export.page import page_of
+from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
 from ghgs_lit.prediction.export.video import mp4_bytes
@@ -80,27 +80,23 @@ class Instants:
         Raises:
             InputError: a file of another origin is in the way.
         """
-        contents: dict[str, Callable[[], bytes]] = {"viewer.html": self._page, "instants.mp4": self._video}
         self.count, self.others = len(self.folders), {n: made for n, made in self.others.items() if made}
         names = self.files
         if not names:
             return []
-        earlier = begin_files(directory, names)
-        # Of a longer sequence: other programs would play these, too.
-        for name in [name for name in earlier if name.startswith("sequence/")]:
-            (directory / name).unlink()
-            earlier.remove(name)
+        for name in begin_files(directory, names):
+            if name.startswith("sequence/"):  # of a longer sequence: other programs would play these, too
+                (directory / name).unlink()
+        contents = {name: partial(self.others.get, name) for name in self.others}
+        contents |= {"viewer.html": self._page, "instants.mp4": self._video}
         seconds, sources = {"code": self._seconds}, iter(self.folders)
         for name in names:
-            if name in self.others:
-                write_file(directory / name, partial(self.others.get, name))
-            elif name in contents:
+            if name in contents:
                 seconds[f"write {name}"] = write_file(directory / name, contents[name])
             else:
-                source = next(sources) / "gaussians.ply"
-                write_atomically(directory / name, partial(_link, source))
+                write_atomically(directory / name, partial(_link, next(sources) / "gaussians.ply"))
         report = {"instants": [folder.name for folder in self.folders], "seconds": seconds}
-        return end_files(directory, names, report, earlier)
+        return end_files(directory, names, report)
 
     def _path(self) -> np.ndarray:
         """How far the subject's smoothed mean is from that of the first instant [n, 3]."""
@@ -115,7 +111,7 @@ class Instants:
     def _page(self) -> bytes:
         first, name = self._first, self.folders[0].parent.name
         facts = (first.gaussians, first.cameras, first.views, first.up, first.center, name)
-        return page_of(self._packed, COARSE, *facts, self._path().tolist(), self.options.fps).encode()
+        return page(*facts, self._packed, self._path().tolist(), self.options.fps).encode()
 
     def _video(self) -> bytes:
         """From a camera that swings about the subject and shows all of it."""
@@ -128,13 +124,14 @@ class Instants:
         seen.extrinsics[:, :3, 3] -= (seen.extrinsics[:, :3, :3] @ shifts[..., None])[..., 0]
         larger = max(_VIDEO_SIDE / max(seen.height, seen.width), 1.0)
         seen = seen.resized(round(larger * seen.height), round(larger * seen.width))
-        pictures = []
-        for frame, packed in enumerate(self._packed):
-            gaussians = unpack(packed, first.pixel, first.center, COARSE, first.gaussians)
+
+        def picture(frame: int) -> np.ndarray:
+            gaussians = unpack(self._packed[frame], first.pixel, first.center, COARSE, first.gaussians)
             # Large pictures would show gaps.
             gaussians = smoothed(gaussians, first.pixel).to(seen.extrinsics.device)
-            pictures.append(to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0]))
-        return mp4_bytes(pictures, self.options.fps)
+            return to_uint8(first.renderer(gaussians, seen[frame : frame + 1][None]).image[0, 0])
+
+        return mp4_bytes(map(picture, range(len(path))), self.options.fps)
 
 
 def _link(source: Path, target: Path) -> None:

@@ -4,57 +4,47 @@ import base64
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 
 from torch import Tensor
 
-from ghgs_lit.prediction.export.packed import FINE, pack
+from ghgs_lit.prediction.export.packed import COARSE, FINE, pack
 from ghgs_lit.types import Cameras, Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
 
 
 def page(
-    gaussians: Gaussians, cameras: Cameras, views: Sequence[str], up: Tensor, center: Tensor, name: str
-) -> str:
-    """The text of the page of one instant, which begins at the first camera, and has a button for each.
-
-    Args:
-        gaussians: of one subject, RGB colours.
-        cameras: of the photographs [V].
-        up: the unit vector [3] that points up.
-        center: the point [3] that it turns about.
-    """
-    packed = [pack(gaussians, pixel_size(cameras, center), center, FINE)]
-    return page_of(packed, FINE, gaussians, cameras, views, up, center, name)
-
-
-def page_of(
-    packed: Sequence[bytes],
-    steps: Mapping[str, int],
     gaussians: Gaussians,
     cameras: Cameras,
     views: Sequence[str],
     up: Tensor,
     center: Tensor,
     name: str,
+    packed: Sequence[bytes] = (),
     path: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
     fps: float = 1.0,
 ) -> str:
-    """The text of the page that plays several instants.
+    """The text of the page of an instant, or of several that it plays; it has a button for each camera.
 
     Args:
-        packed: of each instant what :func:`pack` gives with ``steps`` and the size of pixels at ``center``.
-        gaussians, cameras, views, up, center: of the first instant, as of :func:`page`.
-        path: how far from the first instant the viewer's camera moves along with the subject [instants, 3].
+        gaussians: of one subject, RGB colours; of several instants the first.
+        cameras: of the photographs [V]; the page begins at the first.
+        up: the unit vector [3] that points up.
+        center: the point [3] that it turns about.
+        packed: of each of several instants what :func:`pack` gives with ``COARSE`` and the size of pixels at
+            ``center``.
+        path: how far from the first instant the page's camera moves along with the subject [instants, 3].
         fps: instants a second.
     """
+    steps, pixel = COARSE if packed else FINE, pixel_size(cameras, center)
+    packed = packed or [pack(gaussians, pixel, center, steps)]
     scene = {
         "size": [cameras.width, cameras.height],
         "up": up.tolist(),
         "target": center.tolist(),
-        "pixel": pixel_size(cameras, center),
-        "steps": dict(steps),
+        "pixel": pixel,
+        "steps": steps,
         "low_pass": gaussians.low_pass,
         "antialiased": gaussians.antialiased,
         "cameras": [
@@ -63,7 +53,7 @@ def page_of(
                 views, cameras.intrinsics.tolist(), cameras.extrinsics.tolist(), strict=True
             )
         ],
-        "path": [list(shift) for shift in path],
+        "path": path,
         "fps": fps,
     }
     text = files("ghgs_lit.prediction.export").joinpath("page.html").read_text()

@@ -5,14 +5,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.geometry.frame import HEIGHT
 from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.metrics import psnr
@@ -29,6 +27,9 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
+
+#: The picture to look at.
+SHEET = "sheet.png"
 
 
 @dataclass(frozen=True)
@@ -71,16 +72,15 @@ def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubje
     return lambda subject: [partial(content, subject)]
 
 
-def _html(s: ExportedSubject) -> bytes:
-    return page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()
-
-
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
     **{name: _converted(name) for name in CONVERTED},
     "splat": Format(("gaussians.splat",), _one(lambda s: to_records(s.for_other_renderers).tobytes())),
     "glb": Format(("gaussians.glb",), _one(lambda s: glb_bytes(s.for_other_renderers, s.up)), "pygltflib"),
-    "html": Format(("viewer.html",), _one(_html)),
+    "html": Format(
+        ("viewer.html",),
+        _one(lambda s: page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()),
+    ),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
     "mp4": Format(
         ("turntable.mp4",),
@@ -103,10 +103,8 @@ def output_options(config: Mapping[str, Any]) -> OutputOptions:
     formats = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
     for name in formats:
         choice("formats", name, ("all", *FORMATS))
-        needed = FORMATS[name].package
-        if needed is not None and find_spec(needed) is None:
-            hint = f"pip install 'ghgs-lit[{FORMATS[name].extra}]'"
-            raise InputError(f"formats: expected the package {needed} for {name} ({hint}); found none")
+        if FORMATS[name].package is not None:
+            installed(FORMATS[name].package, FORMATS[name].extra, f"formats={name}")
     frames = config["turntable"]["frames"]
     require(frames > 0 or "mp4" not in formats, "turntable.frames", "at least 1 for formats=mp4", frames)
     return OutputOptions(formats, config["up"], config["smooth"], frames, config["turntable"]["fps"])
@@ -116,7 +114,7 @@ def output_files(options: OutputOptions, views: Sequence[str]) -> list[str]:
     """The names below the directory of the files that :func:`write_prediction` writes of these views beside
     the report."""
     names = [name for format in options.formats for name in FORMATS[format].names(views, options.frames)]
-    return [*names, "sheet.png"]
+    return [*names, SHEET]
 
 
 @torch.no_grad()
@@ -147,30 +145,26 @@ def write_prediction(
     """
     subject = exported_subject(batch, prediction, renderer, options)
     names, seconds = output_files(options, subject.views), {}
-    earlier = begin_files(directory, names)
-    files = iter([directory / name for name in names])
+    begin_files(directory, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
         pool.submit(palette, "turbo")  # the sheet needs it: matplotlib is imported meanwhile
         tasks = {}
         for name in options.formats:
             begin = time.perf_counter()
-            contents = FORMATS[name].contents(subject)
-            count = len(FORMATS[name].names(subject.views, options.frames))
-            places = islice(files, count)
-            tasks[name] = [
-                pool.submit(write_file, path, made) for made, path in zip(contents, places, strict=True)
-            ]
+            files = FORMATS[name].names(subject.views, options.frames)
+            contents = zip(files, FORMATS[name].contents(subject), strict=True)
+            tasks[name] = [pool.submit(write_file, directory / file, made) for file, made in contents]
             seconds[f"write {name}"] = time.perf_counter() - begin
         seen = batch.cameras if batch.targets is None else batch.targets.cameras
         image = renderer(prediction.gaussians, seen).image
         overview = sheet(batch, image, 0, prediction.depth, prediction.depth_valid)
-        write_file(next(files), partial(png, overview))
+        write_file(directory / SHEET, partial(png, overview))
         facts = dict(facts or {})
         report = {**_report(subject), **facts}
         for name, begun in tasks.items():
             seconds[f"write {name}"] += sum(task.result() for task in begun)
     report["seconds"] = {**facts.get("seconds", {}), **seconds}
-    return end_files(directory, names, report, earlier)
+    return end_files(directory, names, report)
 
 
 def _report(subject: ExportedSubject) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.readers import read_json
 from ghgs_lit.runs.results import plain
@@ -19,41 +19,37 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
     """Refuse to replace an input, or a file of ``names`` or a report that no earlier prediction wrote.
     InputError: names the first such file."""
     read = {path.resolve() for path in inputs}
-    written = {REPORT, *_written_before(directory)} if _report_before(directory) else set()
+    written = _written_before(directory)
     for name in (*names, REPORT):
         path = directory / name
-        if path.resolve() in read:
-            raise InputError(
-                f"{path}: expected another folder (out=...) than that of an input; found the input"
-            )
-        if path.exists() and name not in written:
-            expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
-            raise InputError(f"{path}: expected {expected}; found another file")
+        expected = "another folder (out=...) than that of an input"
+        require(path.resolve() not in read, str(path), expected, "the input")
+        expected = "no file, or one that an earlier prediction wrote (out=... names another folder)"
+        require(name in written or not path.exists(), str(path), expected, "another file")
 
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
     """Note files that are about to be written; those of a run that is cut off are known as ours, too.
 
     Returns:
-        Files of earlier predictions that stay, for :func:`end_files`.
+        Files of earlier predictions beside these.
 
     Raises:
         InputError: a file of another origin is in the way.
     """
     require_free(directory, names)
-    earlier = [n for n in _written_before(directory) if n not in names and (directory / n).exists()]
+    earlier = _beside(directory, names)
     known = {"files": dict.fromkeys(names), "earlier_files": earlier}
     write_text_atomically(directory / REPORT, json.dumps(known, indent=1))
     return earlier
 
 
-def end_files(
-    directory: Path, names: Sequence[str], report: Mapping[str, Any], earlier: Sequence[str]
-) -> list[Path]:
+def end_files(directory: Path, names: Sequence[str], report: Mapping[str, Any]) -> list[Path]:
     """Write the report, with the sizes of the files. Returns: their paths, that of the report last."""
     paths = [directory / name for name in names]
     sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
-    kept = {"earlier_files": list(earlier)} if earlier else {}
+    earlier = _beside(directory, names)
+    kept = {"earlier_files": earlier} if earlier else {}
     text = json.dumps(plain({**report, "files": sizes, **kept}), indent=1, allow_nan=False)
     write_text_atomically(directory / REPORT, text)
     return [*paths, directory / REPORT]
@@ -67,16 +63,18 @@ def write_file(path: Path, content: Callable[[], bytes]) -> float:
     return time.perf_counter() - begin
 
 
-def _report_before(directory: Path) -> dict[str, Any]:
-    """The report of an earlier prediction in a directory; empty where there is none."""
-    try:
-        report = read_json(directory / REPORT)
-    except InputError:
-        return {}
-    return report if isinstance(report, dict) and isinstance(report.get("files"), dict) else {}
+def _beside(directory: Path, names: Sequence[str]) -> list[str]:
+    """Files of earlier predictions that are there beside ``names`` and the report."""
+    written = _written_before(directory)
+    return [name for name in written if name not in (REPORT, *names) and (directory / name).exists()]
 
 
 def _written_before(directory: Path) -> list[str]:
-    report = _report_before(directory)
-    earlier = report.get("earlier_files")
-    return [*report.get("files", ()), *(earlier if isinstance(earlier, list) else ())]
+    """The report of an earlier prediction and the files that it lists; nothing where there is none."""
+    try:
+        report = read_json(directory / REPORT)
+    except InputError:
+        return []
+    if not isinstance(report, dict) or not isinstance(report.get("files"), dict):
+        return []
+    return [REPORT, *report["files"], *report.get("earlier_files", ())]

@@ -1,6 +1,7 @@
 """Pictures as an MP4 that browsers and phones play (H.264, 4:2:0, BT.709)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,12 +13,14 @@ _COLORS = (
 )
 
 
-def mp4_bytes(pictures: Sequence[np.ndarray], fps: int) -> bytes:
+def mp4_bytes(pictures: Iterable[np.ndarray], fps: int) -> bytes:
     """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
-    ``pictures``: at least one."""
+    ``pictures``: at least one; they are taken one after another, so that a long video fits in memory."""
     import imageio_ffmpeg
 
-    height, width = pictures[0].shape[:2]
+    pictures = iter(pictures)
+    first = next(pictures)
+    height, width = first.shape[:2]
     pad = ((0, height % 2), (0, width % 2), (0, 0))
     with TemporaryDirectory() as folder:
         path = Path(folder, "video.mp4")
@@ -30,7 +33,7 @@ def mp4_bytes(pictures: Sequence[np.ndarray], fps: int) -> bytes:
             output_params=[*_COLORS.split(), "-movflags", "+faststart"],
         )
         writer.send(None)
-        for picture in pictures:
+        for picture in chain([first], pictures):
             writer.send(np.ascontiguousarray(np.pad(picture, pad, mode="edge")))
         writer.close()
         return path.read_bytes()

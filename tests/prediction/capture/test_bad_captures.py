@@ -95,7 +95,7 @@ BAD = {
     "mirrored": (mirrored, "cam1.png: expected a photograph that is not mirrored", "orientation 2"),
     "another ratio": (lambda p: image(p, "cam1", WIDE), "size of its photograph", "(128, 128)", "(128, 96)"),
     "no masks": (lambda p: remove(p, "cam1_mask.png"), "cam1.png: expected a mask", "segment=rembg"),
-    "missing mask": (missing_mask, "masks: expected a mask cam1.png", "found 'none'"),
+    "missing mask": (missing_mask, "masks: expected a mask of ", "cam1.png; found 'none'"),
     "no mask folder": (lambda p: {"masks": p / "nowhere"}, "masks: expected a folder", "nowhere"),
     "mask size": (
         lambda p: image(p, "cam1_mask", WIDE[:64, :, 0]),
@@ -140,7 +140,11 @@ BAD = {
         lambda p: {"calibration": {"axes": "maya"}},
         "calibration.axes: expected one of opencv, opengl",
     ),
-    "no such option": (lambda p: {"calibration": {"axis": "y"}}, "calibration: expected keys among", "axis"),
+    "no such option": (
+        lambda p: {"calibration": {"axis": "y"}},
+        "calibration key: expected one of",
+        "found 'axis'",
+    ),
     "no segmenter": (
         lambda p: (remove(p, "cam1_mask.png"), {"segment": "sam"})[1],
         "segment: expected one of rembg",

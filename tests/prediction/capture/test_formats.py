@@ -1,12 +1,14 @@
 """Files of cameras that other programs wrote, read back to the same projection."""
 
 import json
+from typing import get_args
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
 
+from ghgs_lit.config import nodes
 from ghgs_lit.errors import InputError
 from ghgs_lit.prediction.capture.calibration import (
     Calibration,
@@ -15,7 +17,7 @@ from ghgs_lit.prediction.capture.calibration import (
     extrinsics_of,
     quarter_turned,
 )
-from ghgs_lit.prediction.capture.formats import read_cameras
+from ghgs_lit.prediction.capture.formats import FORMATS, read_cameras
 from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from tests.helpers.rigs import POINTS, SIZE, opencv_pixels, rig
 from tests.helpers.scenes import FIXTURES
@@ -204,3 +206,7 @@ def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
     )
     np.testing.assert_allclose(millimetres[:3, 3], metres[:3, 3] / 1000)
     np.testing.assert_array_equal(millimetres[:3, :3], metres[:3, :3])
+
+
+def test_every_format_can_be_said():
+    assert get_args(nodes.Calibration.model_fields["format"].annotation) == ("auto", *FORMATS)

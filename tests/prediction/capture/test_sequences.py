@@ -299,6 +299,35 @@ def test_masks_of_videos_in_folders_count_from_0_or_from_1(place, first):
         opened(place)
 
 
+def test_masks_beside_videos_count_where_nothing_else_is_said(place):
+    """Beside photographs they do, too: a background that is given comes first."""
+    for camera, name in enumerate(FIGURE.names):
+        shutil.move(place / "masks" / f"{name}.mp4", place / "images" / f"{name}_mask.mp4")
+        (place / "backgrounds").mkdir(exist_ok=True)
+        background = FIGURE.images[camera].copy()
+        background[FIGURE.masks[camera]] += np.uint8(128)
+        background[:16] += np.uint8(128)
+        Image.fromarray(background).save(place / "backgrounds" / f"{name}.png")
+    for camera, photograph in enumerate(opened(place, masks=None).photographs("000003")):
+        assert (photograph.mask ^ FIGURE.masks[camera]).mean() < 0.01
+    other = opened(place, masks=None, backgrounds=place / "backgrounds").photographs("000003")
+    assert all(photograph.mask[:12, 16:].mean() > 0.9 for photograph in other)
+
+
+def test_instants_and_their_numbers_are_in_order_without_zeros_before(place):
+    folder = place / "counted"
+    for number in (10, 9, 1):
+        for camera, name in enumerate(FIGURE.names):
+            (folder / f"frame{number}").mkdir(parents=True, exist_ok=True)
+            (place / "by_camera" / name).mkdir(parents=True, exist_ok=True)
+            Image.fromarray(FIGURE.images[camera]).save(folder / f"frame{number}" / f"{name}.png")
+            shutil.copy(
+                folder / f"frame{number}" / f"{name}.png", place / "by_camera" / name / f"frame{number}.png"
+            )
+    for images in ("counted", "by_camera"):
+        assert opened(place, images).instants == ["frame1", "frame9", "frame10"]
+
+
 def test_offsets(place):
     """A camera that began two frames before the others is two frames ahead."""
     found = all_numbers(opened(place, sequence={"sync": {"cam1": 2}}))
@@ -337,9 +366,12 @@ ROWS = [(name, n, n / FPS) for name in FIGURE.names for n in range(FRAMES)]
 WRONG = {
     "a camera is missing": (ROWS[:-FRAMES], "the times of cam0, cam1, cam2, cam3"),
     "other names": ([("left", n, t) for _, n, t in ROWS], "the times of .*found 'left'"),
-    "one more": ([*ROWS, ("cam9", 0, 0.0)], r"cameras among cam0, .*found \['cam9'\]"),
+    "one more": ([*ROWS, ("cam9", 0, 0.0)], "the times of cam0, .*found '.*cam9'"),
     "no number": ([*ROWS, ("cam0", "x", 0.0)], "camera,frame,seconds with numbers; found"),
     "no time": ([*ROWS, ("cam0", 3, "nan")], "camera,frame,seconds with numbers; found"),
+    "no frame": ([*ROWS, ("cam0", "", 0.3)], "camera,frame,seconds with numbers; found"),
+    "a part of a line": ([*ROWS, ("cam0",)], "camera,frame,seconds with numbers; found"),
+    "nothing": ([], "the times of cam0, cam1, cam2, cam3; found ''"),
     "no shared time": ([(c, n, t + 9 * (c == "cam1")) for c, n, t in ROWS], "times that all cameras share"),
 }
 
@@ -420,5 +452,7 @@ def test_two_people_are_said(place, capsys):
 
 def test_videos_without_ffmpeg(place, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(InputError, match=r"expected the extra video .*ghgs-lit\[video\].*found none"):
+    with pytest.raises(
+        InputError, match=r"expected the package imageio_ffmpeg .*ghgs-lit\[video\].*found none"
+    ):
         opened(place)

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import subprocess
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -132,6 +133,23 @@ def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     data = base64.b64decode(parts["data"])
     found = unpack(data, scene["pixel"], torch.tensor(scene["target"]), scene["steps"], gaussians)
     assert decibels(found, gaussians) > 50
+
+
+def test_a_long_video_is_not_in_memory_as_a_whole():
+    """A picture is made when the one before is written."""
+    made, alive = [], []
+
+    def pictures():
+        for number in range(20):
+            picture = np.full((16, 16, 3), 10 * number, np.uint8)
+            made.append(weakref.ref(picture))
+            yield picture
+            del picture
+            alive.append(sum(ref() is not None for ref in made))
+
+    assert mp4_bytes(pictures(), 10)
+    assert len(alive) == 20
+    assert max(alive) <= 2
 
 
 def test_a_video_shows_the_pictures_in_their_colors(tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import imageio.v3 as iio
 import numpy as np
@@ -193,10 +194,9 @@ def test_options_are_read():
 
 
 def test_a_missing_package_is_named_before_any_work(monkeypatch):
-    monkeypatch.setattr("ghgs_lit.prediction.export.prediction.find_spec", lambda name: None)
-    with pytest.raises(
-        InputError, match=r"gaussforge for spz \(pip install 'ghgs-lit\[formats\]'\); found none"
-    ):
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    line = r"formats=spz: expected the package gaussforge \(pip install 'ghgs-lit\[formats\]'\); found none"
+    with pytest.raises(InputError, match=line):
         output_options(CONFIG | {"formats": ["ply", "spz"]})
 
 
@@ -286,5 +286,5 @@ def test_only_files_of_earlier_predictions_are_replaced(subject, tmp_path):
         write("ply", "depth")
     assert (tmp_path / "depth.npz").read_text() == "somebody's"
     (tmp_path / "report.json").write_text("{}")
-    with pytest.raises(InputError, match=r"found another file"):
+    with pytest.raises(InputError, match=r"found 'another file'"):
         write("ply")

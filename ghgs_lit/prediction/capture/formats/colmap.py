@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
 
@@ -34,12 +34,7 @@ def read_colmap(path: Path) -> CameraFile:
     a camera model is not known."""
     folder = model_folder(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
-    try:
-        import pycolmap
-    except ImportError:
-        raise InputError(
-            f"{path}: expected pycolmap to read COLMAP's models (pip install 'ghgs-lit[colmap]'); found none"
-        ) from None
+    pycolmap = installed("pycolmap", "colmap", str(path))
     names = _names(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))
