@@ -29,7 +29,7 @@ from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 _SHOWN = 0.03
 #: Steps at each instant. They may go farther than those of a single one: an error of the flow is larger than
 #: that of a prediction.
-_STEPS = 3
+_STEPS = 2
 _CHANGES = {
     "means": Change(10.0, 0.1),
     "scales": Change(1.0, 0.02),
