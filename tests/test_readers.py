@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ghgs_lit.runs.listing import list_runs
 from PIL import Image, PngImagePlugin
 
 from ghgs_lit.data.completeness import Completeness
@@ -18,6 +17,7 @@ from ghgs_lit.evaluation.tables.others import read_others
 from ghgs_lit.evaluation.tables.records import read_sweep
 from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
 from ghgs_lit.runs.journal import Journal
+from ghgs_lit.runs.listing import list_runs
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.synthesis.progress import Progress
