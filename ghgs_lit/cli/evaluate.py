@@ -18,7 +18,7 @@ from ghgs_lit.cli.methods import baselines_of, trained_method
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.encoder import FeatureCacheOptions
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
 from ghgs_lit.evaluation.report import measure_and_write
@@ -35,6 +35,8 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
     if path is not None:
         methods["model"], found = trained_method(config, device)
         model = methods["model"].model
+        expected = "1: ghgs evaluate measures each subject by itself (skip=temporal is of ghgs predict)"
+        require(model.skip.every == 1, "skip.every", expected, model.skip.every)
         model.feature_cache = FeatureCacheOptions.read(config["feature_cache"], "feature_cache").build(
             model.recalibration.tokens
         )

@@ -95,6 +95,12 @@ MISSING = [
     ),
     ("evaluate", 1, "data: expected data=<option>"),
     ("evaluate data=synthetic", 1, "checkpoint: expected a checkpoint or baselines=[...]; found neither"),
+    (
+        "evaluate data=synthetic checkpoint=shipped skip=temporal",
+        1,
+        "skip.every: expected 1: ghgs evaluate",
+        "found 8",
+    ),
     ("evaluate checkpoint={tmp}/none.ckpt", 1, "{tmp}/none.ckpt: expected"),
     ("evaluate checkpoint={ckpt}", 1, "data: expected data=<option>", "{ckpt}"),
     ("evaluate checkpoint={ckpt} data=thuman2 model.pad=multiple", 1, "data.root: expected", "found null"),
