@@ -28,7 +28,7 @@ class Recording:
     def __init__(self, directory: Path):
         self.directory, self.instants = directory, {}
         before = [f"sequence/{path.name}" for path in (directory / "sequence").glob("*")]
-        self._earlier = begin_files(directory, before)
+        begin_files(directory, before)
         for name in before:
             (directory / name).unlink()
 
@@ -39,7 +39,7 @@ class Recording:
 
     def end(self) -> None:
         """Write the report, by which a later run knows the files."""
-        end_files(self.directory, [*self.instants], {"instants": [*self.instants.values()]}, self._earlier)
+        end_files(self.directory, [*self.instants], {"instants": [*self.instants.values()]})
 
 
 class Pause:

@@ -21,7 +21,7 @@ def nothing(gaussians, cameras):
 
 
 def named(name, renderer):
-    return baseline(name, renderer, Standin, {"steps": 1, "start": "hull"})
+    return baseline(name, renderer, Standin, {"steps": 1})
 
 
 @pytest.mark.parametrize("views", [3, 5])
