@@ -181,7 +181,7 @@ def rig_of(
     why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
     took = time.perf_counter() - begin
     print(f"{moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
-    return rig, json_text(rig.calibrations(folder, captures[0])).encode()
+    return rig, json_text(rig.calibrations(folder, captures)).encode()
 
 
 def advice_of(directory: Path) -> Iterator[str]:

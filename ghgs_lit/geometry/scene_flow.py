@@ -21,6 +21,8 @@ from ghgs_lit.types import Cameras
 
 #: Metres between the nodes of the grid.
 _CELL = 0.08
+#: Metres from the middle beyond which points are strays: the grid would have no end.
+_REACH = 3.0
 #: One point in so many has equations; all of them move.
 _EVERY = 4
 #: Deviation of a colour at which an equation counts half.
@@ -71,7 +73,7 @@ class _Grid:
         """Values between the nodes."""
         last = points.new_tensor(self.shape[::-1]) - 1
         place = 2 * (points - self.low) / (_CELL * last) - 1
-        found = F.grid_sample(nodes[None], place[None, None, None], align_corners=True)
+        found = F.grid_sample(nodes[None], place[None, None, None], padding_mode="border", align_corners=True)
         return found[0, :, 0, 0].mT
 
 
@@ -122,10 +124,11 @@ def scene_flow(
         shown: which views show them there.
         before, after: the same views in their order; a camera may be cropped otherwise, but stands still.
     """
-    if not len(points):
+    near = ((points - points.nanmedian(0).values).abs() < _REACH).all(-1) if len(points) else shown.any(-1)
+    if not near.any():
         return torch.zeros_like(points), torch.zeros_like(points)
-    some, seen = points[::_EVERY], shown[::_EVERY]
-    grid, (index, view) = _Grid.around(points), seen.nonzero().unbind(-1)
+    some, seen = points[::_EVERY], (shown & near[:, None])[::_EVERY]
+    grid, (index, view) = _Grid.around(points[near]), seen.nonzero().unbind(-1)
     moved = points.new_zeros(3, *grid.shape)
     from_, _ = _seen(some[index], view, before.cameras)
     for level, was, now in zip(_LEVELS, before.levels, after.levels, strict=True):

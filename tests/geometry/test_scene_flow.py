@@ -78,3 +78,18 @@ def test_the_origin_of_the_world_does_not_matter_to_the_subjects_middle():
     true, found, _ = flow(motion((0.03, 0.0, 0.0)))
     assert CENTER.norm() > 0.5
     assert (found - true).norm(dim=1).mean() < 6e-3
+
+
+def test_strays_and_points_without_a_place_change_nothing_for_others():
+    """A depth without bounds may be a kilometre off: a grid up to there would take all memory."""
+    before, after = instant(motion()), instant(motion((0.03, 0.0, 0.0)))
+    points = unproject_maps(before.depths, INPUTS)[before.masks]
+    own = before.masks.flatten(0, 1).nonzero()[:, 0]
+    shown = torch.nn.functional.one_hot(own, 4).bool()
+    both = [Instant(pyramid(b.images[0]), b.cameras[0]) for b in (before, after)]
+    alone, _ = scene_flow(points, shown, *both)
+    strays = torch.tensor([[1e3, 0.0, 0.0], [torch.nan, 0.0, 0.0], [0.0, -1e6, 1e6]])
+    more, seen = torch.cat((points, strays)), torch.cat((shown, torch.ones(3, 4, dtype=torch.bool)))
+    found, _ = scene_flow(more, seen, *both)
+    torch.testing.assert_close(found[:-3], alone, rtol=0, atol=1e-6)
+    assert found[[-3, -1]].isfinite().all()

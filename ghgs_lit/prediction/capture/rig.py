@@ -48,34 +48,36 @@ class Rig:
         return dataclasses.replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
 
     def _corrected(self, photograph: Photograph) -> Photograph:
-        intrinsics = photograph.intrinsics.copy()
-        intrinsics[[0, 1], [0, 1]] *= self.zoom[photograph.name]
-        return dataclasses.replace(
-            photograph, intrinsics=intrinsics, extrinsics=self.extrinsics[photograph.name]
-        )
+        """A camera that most instants lack stays as it is."""
+        pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
+        lens = self._zoomed(photograph.name, photograph.intrinsics)
+        return dataclasses.replace(photograph, intrinsics=lens, extrinsics=pose)
+
+    def _zoomed(self, name: str, intrinsics: np.ndarray) -> np.ndarray:
+        intrinsics = intrinsics.copy()
+        intrinsics[[0, 1], [0, 1]] *= self.zoom.get(name, 1.0)
+        return intrinsics
 
     def calibrations(
-        self, folder: CaptureFolder, capture: Capture
+        self, folder: CaptureFolder, captures: Sequence[Capture]
     ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
         """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
 
         Args:
-            capture: one of the folder, with the cameras as they were given.
+            captures: of the folder, with the cameras as they were given.
         """
         found = {}
-        for photograph in capture.photographs:
-            stored = folder.file.cameras[photograph.name]
+        for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
+            stored = folder.file.cameras[name]
             size = stored.size or photograph.mask.shape
             given = calibrate(stored, folder.convention, size)
-            intrinsics = given.intrinsics.copy()
-            intrinsics[[0, 1], [0, 1]] *= self.zoom[photograph.name]
             # A photograph may be turned upright: what moved is the same before.
-            moved = np.linalg.inv(photograph.extrinsics) @ self.extrinsics[photograph.name]
-            extrinsics = given.extrinsics @ moved
-            found[photograph.name] = (
-                dataclasses.replace(given, intrinsics=intrinsics, extrinsics=extrinsics),
-                size,
-            )
+            moved = np.linalg.inv(photograph.extrinsics) @ self._corrected(photograph).extrinsics
+            changed = {
+                "intrinsics": self._zoomed(name, given.intrinsics),
+                "extrinsics": given.extrinsics @ moved,
+            }
+            found[name] = (dataclasses.replace(given, **changed), size)
         return found
 
 

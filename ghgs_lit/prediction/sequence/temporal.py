@@ -126,7 +126,7 @@ def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]
     seen = last.prediction.gaussians
     metre = 1.0 if seen.metre is None else float(seen.metre[0])
     # Near the origin and in metres: the world may be anywhere, and have any unit.
-    origin = seen.means.double().mean(0)
+    origin = seen.means.double().nanmedian(0).values if len(seen) else seen.means.new_zeros(3).double()
     points = ((seen.means.double() - origin) / metre).to(levels[0])
     before, after = (
         Instant(maps, _around(each.cameras, origin, metre).to(points.dtype))
@@ -165,9 +165,8 @@ def _as_drawn(
     """A prediction with other Gaussians, and with the depths of their renders."""
     valid, drawn = batch.masks, depth > 0
     # Pixels that no Gaussian covers have the mean depth of their view.
-    mean = (depth.sum((-2, -1), keepdim=True) / drawn.sum((-2, -1), keepdim=True).clamp(min=1)).clamp(
-        min=1e-6
-    )
+    sums, counts = (each.sum((-2, -1), keepdim=True) for each in (depth, drawn))
+    mean = torch.where(counts > 0, sums / counts.clamp(min=1), 1)
     depth = torch.where(valid, torch.where(drawn, depth, mean), 1)
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
     points = dataclasses.replace(prediction.points, pixels=pixels, valid=valid)

@@ -55,7 +55,7 @@ def test_the_file_of_a_rig_gives_the_corrected_cameras(tmp_path, orientation):
     folder = CaptureFolder(tmp_path / "images", path)
     given = Capture(folder.instants[0], folder.photographs(folder.instants[0]))
     rig = some_rig(figure)
-    (tmp_path / "rig.json").write_text(json_text(rig.calibrations(folder, given)))
+    (tmp_path / "rig.json").write_text(json_text(rig.calibrations(folder, [given])))
     read = Capture.read(tmp_path / "images", tmp_path / "rig.json")
     same(read, rig.applied(given))
     assert np.abs(read.photographs[1].extrinsics - given.photographs[1].extrinsics).max() > 0.01
@@ -124,3 +124,17 @@ def test_an_instant_that_lacks_a_camera_takes_no_part(tmp_path, asked, model):
     given = whole[0].photographs[0].extrinsics
     moved = rig.applied(three).photographs[0].extrinsics - given
     assert moved[0, 3] == pytest.approx(0.01)
+
+
+def test_a_camera_that_most_instants_lack_stays_as_it_is(tmp_path, asked, model):
+    """It is in the file of the rig, too: the next capture may have it."""
+    whole = captures(tmp_path)
+    three = [Capture(c.name, c.photographs[:3]) for c in whole[:3]]
+    rig = corrected_rig([*three, whole[3]], model, (56, 56), 3, 0, Renderer())
+    assert list(rig.extrinsics) == NAMES[:3]
+    last = rig.applied(whole[3]).photographs[3]
+    np.testing.assert_array_equal(last.extrinsics, whole[3].photographs[3].extrinsics)
+    folder = CaptureFolder(tmp_path, tmp_path / "cameras.json")
+    found = rig.calibrations(folder, [*three, whole[3]])
+    assert list(found) == NAMES
+    np.testing.assert_allclose(found["cam3"][0].extrinsics, last.extrinsics, atol=1e-12)
