@@ -88,7 +88,9 @@ class Verb:
 
 
 def read_yaml_quickly() -> None:
-    """Let OmegaConf parse by LibYAML, where PyYAML has it: half the time of a composition."""
+    """Let OmegaConf 2.3 parse by LibYAML, where PyYAML has it: half the time of a composition."""
+    if not hasattr(omegaconf._utils, "get_yaml_loader"):
+        return
     before, yaml.SafeLoader = yaml.SafeLoader, getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     loader = omegaconf._utils.get_yaml_loader()
     yaml.SafeLoader = before
