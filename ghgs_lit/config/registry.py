@@ -29,9 +29,15 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
     "encoder": {"vggt": "ghgs_lit.encoder.VGGTOptions"},
     "feature_cache": {None: "ghgs_lit.encoder.FeatureCacheOptions"},
-    "depth_head": {"dpt": "ghgs_lit.heads.depth.DepthHeadOptions"},
+    "depth_head": {
+        "dpt": "ghgs_lit.heads.depth.DepthHeadOptions",
+        "stereo": "ghgs_lit.heads.stereo.StereoHeadOptions",
+    },
     "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
-    "recalibration": {"semantic": "ghgs_lit.recalibration.RecalibrationOptions"},
+    "recalibration": {
+        "none": "ghgs_lit.recalibration.none.NoRecalibrationOptions",
+        "semantic": "ghgs_lit.recalibration.RecalibrationOptions",
+    },
     "gaussian_head": {"dpt": "ghgs_lit.heads.gaussian.GaussianHeadOptions"},
     "rounds": {"recurrent": "ghgs_lit.rounds.RoundsOptions"},
     "skip": {None: "ghgs_lit.skipping.SkipOptions"},

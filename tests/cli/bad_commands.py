@@ -50,7 +50,7 @@ MISSPELT = [
     ("table run={tmp}", 1, "run: expected a key", "did you mean runs?"),
     ("table runs={tmp} test.unt=1", 1, "test.unt", "did you mean test.unit?"),
     ("train encoder=vggt_nanoo", 1, "encoder: expected one of vggt_1b", "'vggt_nanoo'", "vggt_nano?"),
-    ("train model=hul", 1, "model: expected one of hull, paper", "did you mean hull?"),
+    ("train model=hul", 1, "model: expected one of gps, hull, paper", "did you mean hull?"),
     ("train ablation=no_semantics", 1, "ablation: expected one of", "did you mean no_semantic?"),
     ("train views=4", 1, "views=4: expected overrides that Hydra can apply", "found"),
     ("train skip=balancd", 1, "skip: expected one of", "did you mean balanced?"),
