@@ -18,8 +18,8 @@ PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
 """PSNR in dB of equal images, and the largest value reported: float32 resolves no smaller errors."""
 CROP = (1000 / 1024, 500 / 1024)
-"""Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as the published
-scripts of GHG and LIFe-GoM have it."""
+"""Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as published
+scripts of GHG and LIFe-GoM crop."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 """Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
