@@ -181,6 +181,19 @@ def test_depths_lie_between_the_bounds_of_the_subject():
         assert (model.depth_head.update.change[-1].bias.grad * change > 0).all()
 
 
+def test_half_precision_stays_near():
+    """Correlations and the estimate stay in float32 under autocast; gradients stay finite."""
+    batch, model = make_batch(1, 3, 56, 56), peer("gps")
+    expected = model(batch).depth
+    with torch.autocast("cpu", torch.bfloat16):
+        found = model(batch).depth
+    assert found.dtype == torch.float32
+    error = (found - expected)[batch.masks].abs().mean() / expected[batch.masks].std()
+    assert 0 < error < 0.1
+    found[batch.masks].square().sum().backward()
+    assert all(p.grad.isfinite().all() for p in model.depth_head.parameters() if p.grad is not None)
+
+
 @pytest.mark.parametrize("name", PEERS)
 def test_every_weight_learns(name):
     """Of the depth head, from the Gaussians."""
