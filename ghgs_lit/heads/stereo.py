@@ -21,7 +21,7 @@ from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.heads.activations import bounded_sigmoid
 from ghgs_lit.heads.depth import BOUNDED
 from ghgs_lit.heads.dpt import ResidualUnit
-from ghgs_lit.kernels.precision import without_float16
+from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DecodedPixels, DepthBounds, DepthMaps, Tokens, true_places
 
 #: Pixels along the side of a cell, and channels of a cell's features and of the GRU's memory.
@@ -159,7 +159,7 @@ class Update(nn.Module):
         hidden = self.change[:-1](memory)
         last = self.change[-1]
         # The last projection stays in float32 under autocast: a step of inverse depth is centimetres.
-        with torch.autocast(hidden.device.type, enabled=False):
+        with exact(hidden.device.type):
             return memory, at_least_float32(last(hidden.to(last.weight.dtype)))
 
 
@@ -213,7 +213,7 @@ def correlations(
     height, width = features.shape[-2:]
     flat = features.flatten(0, 1)
     image, place = cells // (height * width), cells % (height * width)
-    with torch.no_grad(), torch.autocast(features.device.type, enabled=False):
+    with torch.no_grad(), exact(features.device.type):
         share = torch.linspace(0, 1, steps, device=features.device, dtype=features.dtype)
         depth = _inverse(share, *(bound.flatten()[image, None].to(features) for bound in (near, far)))
         matrices = [m.to(features).flatten(0, 1) for m in (cameras.intrinsics, cameras.extrinsics)]
