@@ -54,10 +54,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 @contextlib.contextmanager
 def naming(folder: Path) -> Iterator[None]:
     """Name the ``folder`` that is written to in errors of the system that name no file, as of a full disk.
-
-    Raises:
-        OSError: with ``folder`` as its ``filename``.
-    """
+    OSError: with ``folder`` as its ``filename``."""
     try:
         yield
     except OSError as error:
@@ -85,11 +82,8 @@ def _refusal(path: Path) -> OSError | None:
 
 
 def resolved(path: str | Path) -> Path:
-    """The absolute path without links; ``~`` is the user's folder.
-
-    Raises:
-        InputError: its links go in a loop (before Python 3.13; later whatever opens it says so).
-    """
+    """The absolute path without links; ``~`` is the user's folder. InputError: its links go in a loop (before
+    Python 3.13; later whatever opens it says so)."""
     try:
         return Path(path).expanduser().resolve()
     except RuntimeError as error:

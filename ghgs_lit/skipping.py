@@ -194,12 +194,9 @@ def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tenso
     """FLOPs of a pair of the encoder's blocks for each element, with the patches that are kept.
 
     Products with weights take 24 n C^2 in a block (6 for queries, keys and values, 2 for what leaves the
-    attention, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in
-    the frame block, among all views in the global block.
-
-    Args:
-        encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
-        kept: patches that take part.
+    attention, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
+    frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+    ``kept``: patches that take part.
     """
     tokens = (kept.flatten(2).sum(-1) + encoder.aggregator.special).double()
     width, both = encoder.dim_latent // 2, tokens.sum(1)

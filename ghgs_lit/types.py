@@ -336,12 +336,8 @@ class Gaussians(_TensorStruct):
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
-        """The Gaussians at ``index`` (a slice, a mask or indices).
-
-        Args:
-            index: which Gaussians.
-            splits: how many of them belong to each batch element.
-        """
+        """The Gaussians at ``index`` (a slice, a mask or indices). ``index``: which Gaussians. ``splits``:
+        how many of them belong to each batch element."""
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in dataclasses.fields(self)

@@ -51,12 +51,8 @@ def silhouettes(
 
 
 def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it).
-
-    Args:
-        masks: to be grown.
-        radius: one for all masks, or integers that broadcast with them.
-    """
+    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it). ``masks``: to
+    be grown. ``radius``: one for all masks, or integers that broadcast with them."""
     grown = masks
     for dim in (-2, -1):
         size = masks.shape[dim]

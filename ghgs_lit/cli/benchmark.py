@@ -68,11 +68,8 @@ _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """Every source in every preset, the yardstick always among them.
-
-    Raises:
-        FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.
-    """
+    """Every source in every preset, the yardstick always among them. FileNotFoundError, InputError: as for
+    :meth:`Source.of_checkpoint` and :func:`cases_of`."""
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
     presets = presets_of(list(names), config["skip"])
     if config["checkpoint"] is None:

@@ -19,11 +19,8 @@ _LISTED = 6
 
 
 def run(cfg: DictConfig) -> None:
-    """Print what was found; write ``cameras.png``, and ``cameras.json`` of a meaning that fits.
-
-    Raises:
-        InputError: the cameras do not fit as they are.
-    """
+    """Print what was found; write ``cameras.png``, and ``cameras.json`` of a meaning that fits. InputError:
+    the cameras do not fit as they are."""
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
     inputs = {path.resolve() for path in folder.input_files}

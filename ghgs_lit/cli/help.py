@@ -55,11 +55,7 @@ def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = 
 
 
 def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
-    """The keys of a group: meaning, default and range of each.
-
-    Raises:
-        InputError: the verb has no such group.
-    """
+    """The keys of a group: meaning, default and range of each. InputError: the verb has no such group."""
     known = [*defaults_of(verb), *(name for name in compose(verb) if name in KINDS)]
     known = list(dict.fromkeys([*known, *(["rounds"] if "model" in known else [])]))
     if group not in known:

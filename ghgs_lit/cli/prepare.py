@@ -42,15 +42,13 @@ def render(data: PhotographsDataModule) -> None:
 
 
 def check(data: PhotographsDataModule, folder: Path, min_iou: float, min_agreement: float) -> None:
-    """Read everything once; print tables, write ``check.json`` and a contact sheet.
+    """Read everything once; print tables, write ``check.json`` and a contact sheet. InputError: training
+    cannot start.
 
     Args:
         data: the data set with its protocols.
         folder: where the files are written.
         min_iou, min_agreement: as for :func:`inspect`.
-
-    Raises:
-        InputError: training cannot start.
     """
     report = inspect(data, min_iou, min_agreement)
     show(report)

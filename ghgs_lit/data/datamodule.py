@@ -35,11 +35,7 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
     """Batches that each process has trained on so far, also after a restart from a checkpoint.
 
     The last step of an epoch takes the batches that are left, fewer than ``accumulate_grad_batches`` where
-    the epoch is no multiple.
-
-    Args:
-        trainer: None outside of training.
-        length: batches of an epoch.
+    the epoch is no multiple. ``trainer``: None outside of training. ``length``: batches of an epoch.
     """
     if trainer is None:
         return 0
@@ -54,15 +50,13 @@ def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
 
 
 class PhotographsDataModule(LightningDataModule):
-    """Batches of a data set.
+    """Batches of a data set. InputError: an unknown key or an impossible value; when data is read, files that
+    are missing or bad.
 
     Args:
         views: :class:`ViewProtocol` or its mapping.
         targets: :class:`TargetProtocol` or its mapping.
         augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
-
-    Raises:
-        InputError: an unknown key or an impossible value; when data is read, files that are missing or bad.
     """
 
     def __init__(

@@ -32,10 +32,8 @@ def color_gains(
     """What each camera multiplies stored colours by; the geometric mean over the cameras is 1.
 
     Photographs do not tell which camera is right, so that only differences between cameras can be undone.
-
-    Args:
-        exposure: greatest deviation of a camera in stops.
-        white_balance: greatest deviation of red and of blue from green in stops.
+    ``exposure``: greatest deviation of a camera in stops. ``white_balance``: greatest deviation of red and of
+    blue from green in stops.
     """
     deviation = rng.uniform(-1, 1, (views, 3))
     deviation -= deviation.mean(0)

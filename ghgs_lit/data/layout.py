@@ -70,7 +70,8 @@ class Rendered(DataOptions):
 
 
 class Layout(Reader):
-    """Subjects of one phase of a rendered data set.
+    """Subjects of one phase of a rendered data set. InputError: the root or phase is missing, empty, not
+    completely rendered, or lacks one of ``names``.
 
     Args:
         names: the subjects to read (None: all that there are). Those that the folder of the phase lacks are
@@ -78,9 +79,6 @@ class Layout(Reader):
         limit: number of subjects, the first ones (None: all).
         pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
             package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
-
-    Raises:
-        InputError: the root or phase is missing, empty, not completely rendered, or lacks one of ``names``.
     """
 
     def __init__(

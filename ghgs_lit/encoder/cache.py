@@ -45,11 +45,8 @@ class FeatureCacheOptions(Options):
     """Size of all files, 10^9 bytes; beyond it the oldest are deleted; null: no limit"""
 
     def build(self, recalibrated: str = "subject") -> "FeatureCache | PhotographCache | None":
-        """The cache; None without a directory.
-
-        Args:
-            recalibrated: ``recalibration.tokens`` of the model; with ``all``, all tokens are kept.
-        """
+        """The cache; None without a directory. ``recalibrated``: ``recalibration.tokens`` of the model; with
+        ``all``, all tokens are kept."""
         if self.directory is None:
             return None
         if self.of == "photographs":

@@ -15,11 +15,8 @@ class KeptPatches:
 
     Packed tokens [T, C] are the sequences of all images, one after another: the special tokens of an image
     (class, camera or registers), then its kept patches, row by row. An image without a kept patch has its
-    special tokens only.
-
-    Args:
-        kept: which patches take part; it may be on the CPU where the tokens are not.
-        device: of the tokens.
+    special tokens only. ``kept``: which patches take part; it may be on the CPU where the tokens are not.
+    ``device``: of the tokens.
     """
 
     def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):

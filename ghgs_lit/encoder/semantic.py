@@ -54,13 +54,10 @@ class SemanticBranch(nn.Module):
     consistency (Eq. 4), is then the overlap of two distributions (Bhattacharyya's coefficient): 1 where they
     are equal, 0 where no part is shared.
 
-    Attention is inside a view, among a learned token and the patches with a pixel of the subject. All
-    choices of ``skip.tokens`` keep these, so features are those of the photograph and its mask, whatever
-    is kept beside them and whichever views there are.
-
-    Args:
-        options: of the branch.
-        patch_size: side of a patch in pixels.
+    Attention is inside a view, among a learned token and the patches with a pixel of the subject. All choices
+    of ``skip.tokens`` keep these, so features are those of the photograph and its mask, whatever is kept
+    beside them and whichever views there are. ``options``: of the branch. ``patch_size``: side of a patch in
+    pixels.
     """
 
     def __init__(self, options: SemanticOptions, patch_size: int):

@@ -30,14 +30,12 @@ WIDEST = -0.6
 @torch.no_grad()
 def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
     """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient.
+    Returns: 0 outside the subject, and where no other view has the point inside its mask.
 
     Args:
         batch: images, masks and cameras are read.
         bounds: near and far of each pixel, in metres.
         steps: S, how many depths are compared: the middles of S equal parts of near to far.
-
-    Returns:
-        0 outside the subject, and where no other view has the point inside its mask.
     """
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     found = consistency_of(batch, batch.pixels, near, far, steps)

@@ -40,11 +40,7 @@ def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Floa
 def relative_depth(
     depth: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 H W"]:
-    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient.
-
-    Args:
-        depth: in metres.
-        masks: of the subject; the map is 0 outside.
-    """
+    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient. ``depth``:
+    in metres. ``masks``: of the subject; the map is 0 outside."""
     depth = depth.detach()
     return torch.where(masks, (depth - subject_mean(depth, masks)) / UNIT, 0)[:, :, None]

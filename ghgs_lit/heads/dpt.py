@@ -260,12 +260,8 @@ class DPTHead(nn.Module):
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
-        """Windows of each level that a window of the result depends on, from fine to coarse.
-
-        Args:
-            result: the window.
-            grid: rows and columns of patches.
-        """
+        """Windows of each level that a window of the result depends on, from fine to coarse. ``result``: the
+        window. ``grid``: rows and columns of patches."""
         s = self.scratch
         full = result.grown(reach(s.output_conv2))
         fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))

@@ -239,10 +239,7 @@ class GaussianHead(nn.Module):
 
     Colours are the input pixels', unless ``color_limit`` lets them change. Published names of the networks:
     ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, with linear layers 0, 2 and 4.
-
-    Args:
-        options: of the head.
-        dim_latent: width of the tokens (from the encoder).
+    ``options``: of the head. ``dim_latent``: width of the tokens (from the encoder).
     """
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):

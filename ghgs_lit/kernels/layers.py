@@ -38,11 +38,8 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
 def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
     """Layers one after another, as one flat array.
 
-    Of each the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases.
-
-    Args:
-        numbers: weight and bias of each.
-        transposed: pack the transposed weights; their biases are zeros.
+    Of each the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases. ``numbers``:
+    weight and bias of each. ``transposed``: pack the transposed weights; their biases are zeros.
     """
     found = []
     for weight, bias in _pairs(numbers):

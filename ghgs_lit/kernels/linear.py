@@ -39,15 +39,12 @@ def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias``.
+    """``x @ weight.T + bias``. Returns: [..., n].
 
     Args:
         x: [..., k].
         weight: [n, k].
         bias: [n], or None for no bias.
-
-    Returns:
-        [..., n].
     """
     if not prefers_onednn(x, weight):
         return F.linear(x, weight, bias)

@@ -85,12 +85,8 @@ def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
-    """The backend for tensors on ``device``, with ``auto`` resolved.
-
-    Raises:
-        InputError: a backend that does not run on ``device``.
-        BackendUnavailable: gsplat cannot run on this machine.
-    """
+    """The backend for tensors on ``device``, with ``auto`` resolved. InputError: a backend that does not run
+    on ``device``. BackendUnavailable: gsplat cannot run on this machine."""
     choice("renderer.backend", backend, BACKENDS)
     is_cuda = device.type == "cuda"
     if backend == "auto":

@@ -78,12 +78,8 @@ class State:
 
 
 def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
-    """What the last of several states predicts.
-
-    Args:
-        states: before the first round and after each.
-        keeps_drafts: whether the prediction has the Gaussians before each round.
-    """
+    """What the last of several states predicts. ``states``: before the first round and after each.
+    ``keeps_drafts``: whether the prediction has the Gaussians before each round."""
     last = states[-1]
     return Prediction(
         last.gaussians,

@@ -66,12 +66,8 @@ class CaptureRig:
 
     @classmethod
     def of(cls, cameras: Sequence[RigCamera], fill: tuple[float, float]) -> "CaptureRig":
-        """The rig of two or more cameras.
-
-        Raises:
-            InputError: there are fewer, they look in one direction, or the place that they look at is behind
-                one of them.
-        """
+        """The rig of two or more cameras. InputError: there are fewer, they look in one direction, or the
+        place that they look at is behind one of them."""
         require(len(cameras) > 1, "data.cameras", "two or more cameras", len(cameras))
         columns = ([getattr(c, n) for c in cameras] for n in ("intrinsics", "extrinsics", "height"))
         rig = cls(*map(tuple, columns), fill)

@@ -77,12 +77,8 @@ class RigOptions(Options):
 
 @dataclass(frozen=True)
 class Poses:
-    """How cameras [...] deviate from their ring.
-
-    Attributes:
-        pitch, roll: degrees [...].
-        shift: metres [..., 3].
-    """
+    """How cameras [...] deviate from their ring. ``pitch``, ``roll``: degrees [...]. ``shift``: metres [...,
+    3]."""
 
     pitch: np.ndarray | float = 0.0
     roll: np.ndarray | float = 0.0

@@ -28,12 +28,9 @@ _FIT_SIZES = {"global_orient": (3,), "scale": (1,), "translation": (3,), "transl
 
 @dataclass(frozen=True)
 class SmplxFit:
-    """The content of ``smplx_param.pkl``.
-
-    Attributes:
-        parameters: of the male SMPL-X model, by name, [1, n].
-        scale, translation: from the model's frame to the scan's: ``v * scale + translation``, scale first.
-    """
+    """The content of ``smplx_param.pkl``. ``parameters``: of the male SMPL-X model, by name, [1, n].
+    ``scale``, ``translation``: from the model's frame to the scan's: ``v * scale + translation``, scale
+    first."""
 
     parameters: Mapping[str, np.ndarray]
     scale: float

@@ -29,7 +29,7 @@ def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
 
 
 class GHGSModule(BudgetedModule):
-    """Trains a model through a renderer.
+    """Trains a model through a renderer. ``guard``: looks for steps whose loss or gradient is not finite.
 
     Args:
         model: gives the Gaussians and depths of a batch.
@@ -37,9 +37,6 @@ class GHGSModule(BudgetedModule):
         losses: the terms that are trained on.
         optimization, config: as of :class:`BudgetedModule`.
         token_budgets: drawn from in each training step; None: the model stays as it is configured.
-
-    Attributes:
-        guard: looks for steps whose loss or gradient is not finite.
     """
 
     def __init__(
@@ -156,10 +153,8 @@ class GHGSModule(BudgetedModule):
         """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
 
         A scaler of the loss is undone before. Where it overflowed it skips the step and halves its factor;
-        only a gradient that overflows without any factor is the guard's.
-
-        Raises:
-            DivergedError: a loss or the norm is not finite, and the guard does not skip the step.
+        only a gradient that overflows without any factor is the guard's. DivergedError: a loss or the norm is
+        not finite, and the guard does not skip the step.
         """
         self.optimization.drop_frozen_gradients(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)

@@ -38,11 +38,8 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     """Draw the query (outlined) and its neighbours on the views of its subject.
 
     The first row shows the neighbours, the nearest brightest; captions give their number in each view. One
-    row for each layer follows with the weights, averaged over heads, the largest brightest; captions give
-    the share of each view.
-
-    Args:
-        batch: gives the photographs, padded to whole patches.
+    row for each layer follows with the weights, averaged over heads, the largest brightest; captions give the
+    share of each view. ``batch``: gives the photographs, padded to whole patches.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views

@@ -113,15 +113,13 @@ def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> di
 
 
 def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Refuse tensors that are not exactly those of ``module``.
+    """Refuse tensors that are not exactly those of ``module``. InputError: a key is missing, unknown or has
+    another shape; names source, key and both shapes.
 
     Args:
         module: its tensors may be on the meta device.
         state: tensors by name.
         source: where they come from, for messages.
-
-    Raises:
-        InputError: a key is missing, unknown or has another shape; names source, key and both shapes.
     """
     own = module.state_dict()
     for key in own:
@@ -133,11 +131,7 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
 
 def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
     """Refuse weights with NaN or infinity, of which every prediction would be empty; names the first tensor.
-
-    Args:
-        state: tensors by name.
-        source: where they come from, for messages.
-    """
+    ``state``: tensors by name. ``source``: where they come from, for messages."""
     for key, value in state.items():
         # A sum is not finite where a term is not, and needs no second tensor. Half precision would overflow.
         total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))

@@ -17,14 +17,12 @@ from ghgs_lit.weights.switches import differences
 
 def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
     """Write the tensors of ``checkpoint``, bit for bit, under their published names; returns a report.
+    InputError: both files are None, or a tensor has no published name; then nothing is written.
 
     Args:
         checkpoint: a checkpoint of this package.
         vggt: the file for the encoder (safetensors or PyTorch, by its suffix); None to leave it out.
         release: the PyTorch file for everything else; None to leave it out.
-
-    Raises:
-        InputError: both files are None, or a tensor has no published name; then nothing is written.
     """
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
     content = read_checkpoint(checkpoint, whole=True)
@@ -56,15 +54,13 @@ def _unpublished(checkpoint: str | Path, name: str, config: Mapping[str, Any]) -
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:
-    """Write tensors by name as safetensors or a PyTorch file, by the suffix of ``path``.
+    """Write tensors by name as safetensors or a PyTorch file, by the suffix of ``path``. InputError:
+    ``entry`` is given for safetensors, which have no levels.
 
     Args:
         path: the file to write.
         tensors: tensors by name.
         entry: the key of the PyTorch file under which they are stored; None for no such level.
-
-    Raises:
-        InputError: ``entry`` is given for safetensors, which have no levels.
     """
     if Path(path).suffix == ".safetensors":
         require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")

@@ -154,14 +154,9 @@ def import_weights(
 
 
 def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> list[str]:
-    """Find the file of each tensor of ``state`` (``Source.used``), by names and shapes alone.
-
-    Returns:
-        The names of tensors that are in no file and keep their values.
-
-    Raises:
-        InputError: a tensor on the meta device is in no file, or a file does not fit.
-    """
+    """Find the file of each tensor of ``state`` (``Source.used``), by names and shapes alone. Returns: the
+    names of tensors that are in no file and keep their values. InputError: a tensor on the meta device is in
+    no file, or a file does not fit."""
     for source in files:
         source.match(state)
     missing = [name for name in state if not any(name in source.used for source in files)]

@@ -34,6 +34,7 @@ class _Frame:
 
 class HuMManReader(FrameReader):
     """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
+    InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
 
     Args:
         sequences: names of folders; missing ones are left out.
@@ -42,9 +43,6 @@ class HuMManReader(FrameReader):
         body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
             cameras inside all masks; ``none``.
         limit: number of frames in all, the first ones (None: all).
-
-    Raises:
-        InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
     """
 
     def __init__(

@@ -60,16 +60,14 @@ class _Frame:
 class ZJUMoCapReader(FrameReader):
     """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
 
-    Missing sequences are left out (``ghgs prepare task=check`` counts them).
+    Missing sequences are left out (``ghgs prepare task=check`` counts them). InputError: all sequences are
+    missing, or annotations are bad.
 
     Args:
         cameras: number of cameras used of each sequence, the first ones (None: all 21 or 23).
         undistorted: remove the lens distortion of photographs and masks.
         masks: folders of label maps; those that a sequence has are united.
         limit: number of frames in all, the first ones (None: all).
-
-    Raises:
-        InputError: all sequences are missing, or annotations are bad.
     """
 
     def __init__(

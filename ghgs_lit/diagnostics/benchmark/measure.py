@@ -81,12 +81,8 @@ def order(turn: int, count: int) -> list[int]:
 def time_cases(
     cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
 ) -> list[dict[str, Times]]:
-    """The seconds of each stage of each case, means over the batches, in interleaved rounds.
-
-    Args:
-        warmup: rounds that do not count.
-        repeats: rounds that count, at least 1.
-    """
+    """The seconds of each stage of each case, means over the batches, in interleaved rounds. ``warmup``:
+    rounds that do not count. ``repeats``: rounds that count, at least 1."""
     seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(cases)):
@@ -140,12 +136,8 @@ def record_cases(
     device: torch.device,
     repeats: int,
 ) -> list[Record]:
-    """Measure work and error of cases on batches, then their times.
-
-    Args:
-        cases: of each source the yardstick first.
-        batches: on the device, with targets.
-    """
+    """Measure work and error of cases on batches, then their times. ``cases``: of each source the yardstick
+    first. ``batches``: on the device, with targets."""
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):

@@ -38,12 +38,8 @@ class Comparison:
 
 
 def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> Comparison:
-    """Compare two rows; equal ones have p = 1.
-
-    Args:
-        row, reference: values by seed (index) and subject (columns).
-        alpha: one minus the probability of the interval.
-    """
+    """Compare two rows; equal ones have p = 1. ``row``, ``reference``: values by seed (index) and subject
+    (columns). ``alpha``: one minus the probability of the interval."""
     row, reference = row.align(reference, join="inner")
     differences = (row - reference).dropna(axis="columns")
     seeds, subjects = differences.shape

@@ -104,17 +104,15 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tuple[np.ndarray, ...]:
-    """Find the face that each texel of a texture shows.
+    """Find the face that each texel of a texture shows. Returns: Flat indices [k] of the covered texels,
+    their face [k] and barycentric coordinates [k, 3], and `nearest` [height * width]: for each texel the
+    position among the k of the nearest covered one.
 
     Args:
         uv: [n, 2] in [0, 1], origin at the bottom left.
         faces: [m, 3].
         height: of the texture in texels.
         width: of the texture in texels.
-
-    Returns:
-        Flat indices [k] of the covered texels, their face [k] and barycentric coordinates [k, 3], and
-        `nearest` [height * width]: for each texel the position among the k of the nearest covered one.
     """
     corners = np.stack([uv[faces][..., 0] * width, (1 - uv[faces][..., 1]) * height], -1) - 0.5
     low = np.maximum(np.ceil(corners.min(1) - 1e-6).astype(np.int64), 0)

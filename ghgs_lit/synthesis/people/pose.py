@@ -63,7 +63,7 @@ class _Skeleton:
 def sample_pose(
     body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
 ) -> np.ndarray:
-    """Draw a pose.
+    """Draw a pose. Returns: Transforms [b, 3, 4] of the bones from rest to pose.
 
     Args:
         body: the body model.
@@ -71,9 +71,6 @@ def sample_pose(
         rng: random numbers.
         widen: 0 to 1, how far the arms move away from the body.
         active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or walking.
-
-    Returns:
-        Transforms [b, 3, 4] of the bones from rest to pose.
     """
     if active:
         stance = str(rng.choice(list(BENT), p=(0.4, 0.3, 0.2, 0.1)))
