@@ -1,13 +1,13 @@
 """The measurement: what a case computes and predicts, and how long each stage takes."""
 
-import statistics
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 
 from ghgs_lit.diagnostics.benchmark.error import differences
@@ -52,13 +52,10 @@ class Work:
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
         """Of several batches: the mean, and the largest peak."""
-        flops = _merged([work.flops for work in works], statistics.fmean)
-        peaks = _merged([work.peaks for work in works], max)
-        return cls(flops, peaks, _merged([work.counts for work in works], statistics.fmean))
-
-
-def _merged(numbers: Sequence[dict[str, float]], merge: Callable[..., float]) -> dict[str, float]:
-    return {name: merge(one[name] for one in numbers) for name in numbers[0]}
+        flops, peaks, counts = (
+            pd.DataFrame([getattr(work, name) for work in works]) for name in ("flops", "peaks", "counts")
+        )
+        return cls(flops.mean().to_dict(), peaks.max().to_dict(), counts.mean().to_dict())
 
 
 @dataclass
