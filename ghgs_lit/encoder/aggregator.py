@@ -58,13 +58,8 @@ class Aggregator(nn.Module):
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
         """Tokens of the layers that are read out. Returns: For each layer in ``layers`` the packed tokens
         after its frame block and after its global block, special tokens included; and the patch tokens that
-        entered.
-
-        Args:
-            images: normalised images, [B, V, channels, H, W].
-            kept: the patches that take part; all others are as if they did not exist.
-            embed: gives the patch tokens; None: ``patch_embed``.
-        """
+        entered. ``kept``: the patches that take part; all others are as if they did not exist. ``embed``:
+        gives the patch tokens; None: ``patch_embed``."""
         b, v = images.shape[:2]
         patches = (embed or self.patch_embed)(images.flatten(0, 1), kept)
         special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)

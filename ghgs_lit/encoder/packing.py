@@ -49,15 +49,8 @@ class KeptPatches:
         return flat if len(flat) == len(self.index) else flat[self.index]
 
     def join(self, special: Tensor, patches: Tensor) -> Tensor:
-        """Packed tokens.
-
-        Args:
-            special: of every image, [B * V, s, C].
-            patches: the kept ones, [N, C].
-
-        Returns:
-            [B * V * s + N, C], in the wider precision of both.
-        """
+        """Packed tokens. ``special``: of every image, [B * V, s, C]. Returns: [B * V * s + N, C], in the
+        wider precision of both."""
         images, count, width = special.shape
         number = torch.arange(images, device=patches.device)
         before = number * count + torch.searchsorted(self.image, number)

@@ -81,12 +81,7 @@ class SemanticBranch(nn.Module):
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], kept: KeptPatches
     ) -> Float[Tensor, "N p"]:
         """Logarithms of the shares of the parts in ``kept``, patches of :meth:`subject`; float32 or wider.
-
-        Args:
-            images: RGB in [0, 1].
-            masks: of the subject.
-            kept: all patches of the subject, unless a caller wants fewer.
-        """
+        ``kept``: all patches of the subject, unless a caller wants fewer."""
         x = torch.cat((images, masks[:, :, None].to(images.dtype)), dim=2).flatten(0, 1)
         patches = self.stem((2 * x - 1).to(self.token.dtype), kept)
         x = kept.join(self.token.to(patches.dtype).expand(masks.shape[0] * masks.shape[1], -1, -1), patches)

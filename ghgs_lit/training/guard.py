@@ -88,7 +88,6 @@ class Guard:
 
 
 def _write(path: Path, module: L.LightningModule, step: Step, fault: Fault) -> None:
-    """A step with all that it depends on, as plain data and tensors (``weights_only=True`` reads it)."""
     content = {
         "fault": str(fault),
         "global_step": module.global_step,

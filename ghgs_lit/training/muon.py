@@ -69,7 +69,6 @@ class Muon(torch.optim.AdamW):
     """Muon for the matrices among ``parameters``, AdamW for all others.
 
     Args:
-        parameters: of the model.
         matrix_lr: learning rate of matrices, in units of AdamW's: steps are as long as AdamW's of this rate.
         **options: of AdamW, for the other parameters; weight decay is for both.
     """
