@@ -20,15 +20,8 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     """Let ``write(temporary)`` write a file beside ``path``, wait for the disk, then rename it to ``path``.
 
     Readers see the old file or the new one, never a part. Folders are made. A temporary file of a process
-    that was killed is removed by the next write of the same path on the same machine.
-
-    Args:
-        path: the file to write.
-        write: writes the whole content to the path that it is given.
-
-    Raises:
-        InputError: ``path`` is a directory.
-        OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
+    that was killed is removed by the next write of the same path on the same machine. InputError: ``path`` is
+    a directory. OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
     """
     path = Path(path)
     require(not path.is_dir(), str(path), "a file to write", "a directory")

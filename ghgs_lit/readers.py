@@ -39,15 +39,8 @@ def require_data_folder(folder: Path) -> None:
 
 
 def read_text(path: Path, expected: str = "text") -> str:
-    """The text of a file in UTF-8; a byte order mark is left out.
-
-    Args:
-        path: the file.
-        expected: what it should be, for messages.
-
-    Raises:
-        InputError: it is missing, no file, larger than 256 MB or in another encoding.
-    """
+    """The text of a file in UTF-8; a byte order mark is left out. InputError: it is missing, no file, larger
+    than 256 MB or in another encoding."""
     require_file(path, expected)
     try:
         size = path.stat().st_size

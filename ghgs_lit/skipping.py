@@ -154,14 +154,8 @@ class AutoSkip:
         self, encoder: Any, masks: Bool[Tensor, "B V H W"]
     ) -> tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"]]:
         """The preset of each element, which depends on its own masks alone; of equals the most accurate.
-
-        Args:
-            encoder: the :class:`ghgs_lit.encoder.VGGTEncoder` that will see them.
-            masks: sides are divisible by the patch size.
-
-        Returns:
-            The decisions, and the patches that they keep, on the CPU.
-        """
+        ``masks``: sides are divisible by the patch size. Returns: the decisions, and the patches that they
+        keep, on the CPU."""
         choices = []
         for preset in self.presets.values():
             with seeing(encoder, preset.view):

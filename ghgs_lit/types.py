@@ -90,14 +90,8 @@ class Cameras(_TensorStruct):
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
-        """The same cameras for a crop of the image.
-
-        Args:
-            top: row of the image at which the crop starts; negative pads.
-            left: column of the image at which the crop starts.
-            height: rows of the crop in pixels.
-            width: columns of the crop in pixels.
-        """
+        """The same cameras for a crop of the image. ``top``: row of the image at which the crop starts;
+        negative pads. ``left``: column of the image at which the crop starts."""
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top

@@ -88,13 +88,8 @@ def subject_box(
 
     Carved twice: the second grid fills the box of the first one. Where nothing is left (masks that contradict
     one another) the box of the previous pass stays. Returns: the corners with the smallest and with the
-    largest coordinates, in metres.
-
-    Args:
-        masks: of the views.
-        cameras: [B, V], of the masks' size.
-        radius: dilation of the masks in pixels.
-        tolerance: how many views may say "outside" of a point that is kept.
+    largest coordinates, in metres. ``radius``: dilation of the masks in pixels. ``tolerance``: how many views
+    may say "outside" of a point that is kept.
     """
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)

@@ -28,14 +28,8 @@ class Silhouettes:
 def silhouettes(
     masks: Bool[Tensor, "B V H W"], cameras: Cameras, resolution: int, dilation: float
 ) -> Silhouettes:
-    """Masks at a resolution that limits the cost of the search.
-
-    Args:
-        masks: of the views.
-        cameras: [B, V], of the masks' size.
-        resolution: cells along the longer side of the image, at most.
-        dilation: as a fraction of the image's longer side.
-    """
+    """Masks at a resolution that limits the cost of the search. ``resolution``: cells along the longer side
+    of the image, at most. ``dilation``: as a fraction of the image's longer side."""
     stride = ceil(max(masks.shape[-2:]) / resolution)
     if stride > 1:
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
@@ -76,12 +70,8 @@ def look_up(
     """Entries of ``tables`` at homogeneous pixels; overwrites ``x``, ``y`` and ``w``.
 
     Points outside the frame take the entry of the nearest border pixel: a mask that does not touch the border
-    has the whole subject in its frame. Points behind the camera land far outside the frame.
-
-    Args:
-        tables: one for each image.
-        image: which table; broadcasts with the pixels.
-        x, y, w: homogeneous pixels.
+    has the whole subject in its frame. Points behind the camera land far outside the frame. ``image``: which
+    table; broadcasts with the pixels. ``x``, ``y``, ``w``: homogeneous pixels.
     """
     height, width = tables.shape[1:]
     inverse = w.clamp_(min=NEAREST).reciprocal_()

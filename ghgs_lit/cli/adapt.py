@@ -114,7 +114,6 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
 
 
 def _measure(config: dict[str, Any], data: "PhotographsDataModule", directory: Path) -> float:
-    """Mean PSNR in dB of the weights that training starts from, on validation people in the rig."""
     device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
     inference = {**config, "precision": "inherit"}
     method = ModelMethod(load_model(inference, device), build_renderer(config, device))

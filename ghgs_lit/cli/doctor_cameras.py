@@ -50,7 +50,6 @@ def run(cfg: DictConfig) -> None:
 
 
 def _show(diagnosis: Diagnosis) -> None:
-    """The meanings that were tried, the best first, and what follows."""
     table = Table("meaning", "worst agreement", *diagnosis.ranking[0].shares)
     for hypothesis in diagnosis.ranking[:_LISTED]:
         shares = (f"{share:.0%}" for share in hypothesis.shares.values())
@@ -60,7 +59,6 @@ def _show(diagnosis: Diagnosis) -> None:
 
 
 def _sheet(folder: CaptureFolder, hypothesis: Hypothesis):
-    """The picture of a meaning."""
     views = hypothesis.views
     images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
     return camera_sheet([v.name for v in views], images, hypothesis.silhouettes(folder))

@@ -35,7 +35,6 @@ def defaults_of(verb: str) -> dict[str, str | None]:
 
 
 def _files(group: str, folders: Sequence[Path]) -> list[Path]:
-    """The files of a group's options, also in folders of the user's own."""
     return [path for folder in (conf_dir(), *folders) for path in sorted((folder / group).glob("*.yaml"))]
 
 

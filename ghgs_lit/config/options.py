@@ -131,7 +131,6 @@ def _immutable(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` as YAML has it."""
     if isinstance(value, tuple):
         return list(map(_plain, value))
     return {key: _plain(item) for key, item in value.items()} if isinstance(value, dict) else value

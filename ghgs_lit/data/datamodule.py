@@ -51,13 +51,8 @@ def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
 
 class PhotographsDataModule(LightningDataModule):
     """Batches of a data set. InputError: an unknown key or an impossible value; when data is read, files that
-    are missing or bad.
-
-    Args:
-        views: :class:`ViewProtocol` or its mapping.
-        targets: :class:`TargetProtocol` or its mapping.
-        augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
-    """
+    are missing or bad. ``augmentation``: what varies in training, :class:`Augmentation` or its mapping (None:
+    nothing)."""
 
     def __init__(
         self,
@@ -146,7 +141,6 @@ class PhotographsDataModule(LightningDataModule):
             views: number of inputs (None: the view protocol's).
             targets: a protocol or its mapping, or several, whose targets a sample has one after another
                 (None: this module's).
-            split: one of the data set's.
             batch_size: samples of a batch (None: this module's).
         """
         protocols = _protocols(self.targets if targets is None else targets)

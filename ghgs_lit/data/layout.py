@@ -201,7 +201,6 @@ def position_name(name: str, position: int) -> str:
 
 
 def _read_camera(folder: Path, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics [3, 3] and extrinsics [4, 4] in float64."""
     path = folder / f"{view}_intrinsic.npy"
     intrinsics = check_intrinsics(path, read_array(path, [(3, 3)]))
     path = folder / f"{view}_extrinsic.npy"
@@ -209,7 +208,6 @@ def _read_camera(folder: Path, view: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _positions(images: Path) -> dict[str, list[int]]:
-    """Ring positions of each subject that ``images`` has folders of."""
     positions: dict[str, list[int]] = {}
     for entry in images.iterdir() if images.is_dir() else ():
         if match := _POSITION.fullmatch(entry.name):

@@ -45,7 +45,6 @@ def measure_and_write(
         config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used, and the
             model's where one is measured).
         directory: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
-        facts: further entries of the provenance.
     """
     evaluation = config["evaluation"]
     targets = target_protocols(config)

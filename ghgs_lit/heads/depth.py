@@ -112,7 +112,6 @@ class DepthHead(nn.Module):
         replaced by 1 m and are not valid.
 
         Args:
-            tokens: from the encoder.
             batch: images, masks and cameras are read.
             bounds: None where :attr:`is_bounded` is false.
             pixels: ``subject``: only windows around the subject are decoded; other depths have no meaning.

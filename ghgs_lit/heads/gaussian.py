@@ -277,10 +277,7 @@ class GaussianHead(nn.Module):
         """Raw attributes of the valid pixels in the order of element, view, row, column.
 
         Args:
-            tokens: recalibrated.
             batch: images, masks and cameras are read.
-            points: of the pixels.
-            depth_maps: of the same pixels.
             pixels: ``subject`` decodes windows around the subject and runs the networks on its pixels,
                 ``all`` computes every pixel and selects afterwards; the result is the same.
         """
@@ -313,7 +310,6 @@ class GaussianHead(nn.Module):
     def _activated(
         self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Means, quaternions, scales, opacities and colours."""
         image, pixel = raw.image, raw.pixel
         focal = (
             at_least_float32(batch.cameras.intrinsics)

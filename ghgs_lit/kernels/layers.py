@@ -57,16 +57,9 @@ def _pairs(numbers: Sequence) -> list[tuple]:
 
 
 class Sums:
-    """Sums of the gradients of layers, of each task of a kernel.
-
-    Args:
-        numbers: weight and bias of each layer.
-        tasks: how many add them up.
-
-    Attributes:
-        places: of each layer, where its packed weights begin, its transposed ones, and its sums.
-        of_task: the sums of each task, as :func:`learn` adds them up.
-    """
+    """Sums of the gradients of layers, of each task of a kernel. ``places``: of each layer, where its packed
+    weights begin, its transposed ones, and its sums. ``of_task``: the sums of each task, as :func:`learn`
+    adds them up."""
 
     def __init__(self, numbers: Sequence[Tensor], tasks: int):
         self._shapes = [tuple(weight.shape) for weight, _ in _pairs(numbers)]

@@ -32,13 +32,8 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     """The autocast context of a forward pass. InputError: float16 on a CPU, or bfloat16 where the device has
-    none.
-
-    Args:
-        name: one of :data:`PRECISIONS`. ``inherit`` keeps the caller's; ``auto`` is bfloat16 where the device
-            has it, else float16 on CUDA and float32 on a CPU.
-        device: where the pass runs.
-    """
+    none. ``name``: one of :data:`PRECISIONS`. ``inherit`` keeps the caller's; ``auto`` is bfloat16 where the
+    device has it, else float16 on CUDA and float32 on a CPU."""
     choice("precision", name, PRECISIONS)
     if name == "inherit":
         return nullcontext()

@@ -43,7 +43,6 @@ def render(
     Args:
         gaussians: a zero quaternion is the identity; a Gaussian with NaN in its geometry or opacity is not
             drawn.
-        cameras: [B, T].
         backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
             means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].

@@ -57,7 +57,6 @@ def _best(run: RunDirectory) -> str:
 
 
 def _overrides(path: Path) -> str:
-    """What the command line said; nothing where the run was not started by Hydra."""
     file = path / ".hydra" / "overrides.yaml"
     said = read_yaml(file) if file.is_file() else []
     return " ".join(map(str, said)) if isinstance(said, list) else ""

@@ -164,7 +164,6 @@ class PlacedRig:
     """A rig around one subject.
 
     Attributes:
-        rig: the cameras.
         scale: metres of their unit.
         middle: the point [3] that the cameras look at, in the subject's world.
         vertices: [n, 3] of the subject.

@@ -79,7 +79,6 @@ class LightRig:
         directions: [l, 3] unit vectors towards the lights.
         strengths: [l].
         ambient: brightness without any light.
-        softness: see :class:`Lights`.
     """
 
     directions: np.ndarray

@@ -60,7 +60,6 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 def _tiles(
     images: list[np.ndarray], tokens: Tokens, attention: TokenAttention, strengths: Tensor
 ) -> list[np.ndarray]:
-    """Each view, darker, with its neighbours in the colours of their ``strengths`` in [0, 1]."""
     scale = max(1, -(-_SIDE // images[0].shape[0]))
     side, views = tokens.patch_size * scale, tokens.grid[1]
 

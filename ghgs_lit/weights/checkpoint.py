@@ -114,13 +114,7 @@ def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> di
 
 def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
     """Refuse tensors that are not exactly those of ``module``. InputError: a key is missing, unknown or has
-    another shape; names source, key and both shapes.
-
-    Args:
-        module: its tensors may be on the meta device.
-        state: tensors by name.
-        source: where they come from, for messages.
-    """
+    another shape; names source, key and both shapes. ``module``: its tensors may be on the meta device."""
     own = module.state_dict()
     for key in own:
         require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(own[key].shape)}", "nothing")
@@ -160,14 +154,7 @@ def shape_of(value: Any) -> tuple[int, ...] | str:
 def write_checkpoint(
     path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any
 ) -> None:
-    """Write a checkpoint.
-
-    Args:
-        path: the file to write.
-        state: the model's tensors by name.
-        config: the configuration that builds the model.
-        facts: further plain data to store.
-    """
+    """Write a checkpoint."""
     content = {
         "state_dict": {f"{STATE_PREFIX}{key}": value for key, value in state.items()},
         "config": dict(config),

@@ -117,10 +117,7 @@ def import_weights(
     Args:
         state: the model's tensors. Those on the meta device must come from the files, others may keep
             their values.
-        config: the configuration that builds the model.
-        out: the checkpoint to write.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
-        release: the authors' checkpoint; None without it.
         dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
         depth_head: what the depth head starts from without ``release``, ``fresh`` or ``vggt``.
 

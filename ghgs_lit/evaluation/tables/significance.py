@@ -58,13 +58,9 @@ def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> 
 
 
 def needed_errors(alpha: float, count: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ to be marked first among ``comparisons``.
-
-    Args:
-        alpha: level of significance of all comparisons together.
-        count: number of seeds, or of subjects where they are fewer; 2 or more.
-        comparisons: tests in the table.
-    """
+    """Standard errors by which rows must differ to be marked first among ``comparisons``. ``alpha``: level of
+    significance of all comparisons together. ``count``: number of seeds, or of subjects where they are fewer;
+    2 or more."""
     return float(stats.t.isf(alpha / 2 / comparisons, count - 1))
 
 

@@ -47,13 +47,8 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class Person:
-    """A dressed, posed person.
-
-    Attributes:
-        name: in files and tables.
-        parts: body, hair, clothes.
-        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts; None: unknown.
-    """
+    """A dressed, posed person. ``body_vertices``: [k, 3] float32, the body under the clothes in the frame of
+    the parts; None: unknown."""
 
     name: str
     parts: tuple[TexturedMesh, ...]

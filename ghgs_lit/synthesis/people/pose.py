@@ -66,9 +66,7 @@ def sample_pose(
     """Draw a pose. Returns: Transforms [b, 3, 4] of the bones from rest to pose.
 
     Args:
-        body: the body model.
         joints: [b, 3] at rest, of one shape.
-        rng: random numbers.
         widen: 0 to 1, how far the arms move away from the body.
         active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or walking.
     """
@@ -119,7 +117,6 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
 
 
 def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """World-axis rotations [b, 3, 3] from rotations relative to the parent."""
     rotations = local.copy()
     for bone, parent in enumerate(parents):
         if parent >= 0:
