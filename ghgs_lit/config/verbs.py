@@ -276,7 +276,7 @@ class Table(Options):
     runs: Annotated[
         Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")
     ]
-    """The directory of a sweep, or a list of directories; sweep=... is the same key."""
+    """The directory of a sweep, or a list of directories."""
     list: bool = False
     """No table, but all runs with their state, their best figure and their overrides."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"
