@@ -25,7 +25,7 @@ def run(cfg: DictConfig) -> None:
     tasks = tasks_of(config["stages"], config["families"], config["quick"])
     require(bool(tasks), "families", "a family that one of the stages has", config["families"])
     workers = allowed_cores() if config["workers"] is None else config["workers"]
-    rows = run_tasks(tasks, directory / "cells.jsonl", workers)
+    rows = run_tasks(tasks, workers)
     _print(rows)
     source = provenance(config, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))
@@ -42,7 +42,6 @@ def run(cfg: DictConfig) -> None:
 
 
 def _replay(path: str) -> None:
-    """Print what is wrong with a saved step; exit code 1 where it still is."""
     step, recorded, fault = replay(path)
     print(f"step {step}, when it was saved: {recorded}")
     print(f"step {step}, now: {fault or 'all values are finite'}")
@@ -51,7 +50,6 @@ def _replay(path: str) -> None:
 
 
 def _print(rows: list[report.Row]) -> None:
-    """The worst error of each stage, by dtype."""
     worst = pd.DataFrame([{**row, "error": report.bounded(row["error"])} for row in report.worst_of(rows)])
     table = pivoted(worst, "stage", "dtype", "error", "{}")
     stages = pd.DataFrame(rows).groupby("stage", sort=False)

@@ -56,10 +56,8 @@ class ImageMetrics:
 
     The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
     ``_subject`` added for the other regions (no FLIP for the subject's pixels alone, since it blurs).
-
-    Attributes:
-        protocol: the name that is reported with every number.
-        left_out: why metrics are left out, by name.
+    ``protocol``: the name that is reported with every number. ``left_out``: why metrics are left out, by
+    name.
     """
 
     def __init__(self, options: MetricsOptions):

@@ -92,7 +92,6 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
 
 
 def _planned_here(rows: pd.DataFrame, sweep: Sweep, layout: Layout) -> list[Planned]:
-    """Training runs of the sweep that belong to the models and data of this table."""
     models, data = {variant.trained for variant in rows["variant"]}, set(rows["data"])
     return [
         p
