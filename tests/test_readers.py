@@ -16,6 +16,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.others import read_others
 from ghgs_lit.evaluation.tables.records import read_sweep
 from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
+from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.listing import list_runs
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
@@ -154,3 +155,4 @@ def test_lines_that_a_killed_process_left_are_skipped(tmp_path):
     path = tmp_path / "a.jsonl"
     path.write_bytes(b'{"a": 1}\n5\n{"a": \n[[[\n\xff\n{"b": 2}')
     assert list(read_lines_of_json(path)) == [{"a": 1}, {"b": 2}]
+    assert "x" not in Journal(path)
