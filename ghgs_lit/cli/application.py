@@ -115,7 +115,13 @@ def composed_once(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced."""
+    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced.
+
+    A file of ``sweep`` asks for a sweep, which Hydra 1.4 wants to know before it composes.
+    """
+    sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
+    if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
+        return [*arguments, "hydra.mode=MULTIRUN"]
     has_data = any(argument.startswith("data=") for argument in arguments)
     if verb in ("evaluate", "predict", "view") and not has_data:
         return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import omegaconf
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -65,9 +66,11 @@ def register_resolvers() -> None:
     ``${config_hash:}`` is a run's directory, ``${sqlite:path}`` a database's URL, ``${folder:first,second}``
     the first of two folders, or the second where that is null.
     """
-    OmegaConf.register_new_resolver("folder", _folder, replace=True)
-    OmegaConf.register_new_resolver("config_hash", _hash_of_run, replace=True)
-    OmegaConf.register_new_resolver("sqlite", _sqlite, replace=True)
+    is_old = omegaconf.__version__.startswith("2.3")
+    register = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver
+    register("folder", _folder, replace=True)
+    register("config_hash", _hash_of_run, replace=True)
+    register("sqlite", _sqlite, replace=True)
 
 
 def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
