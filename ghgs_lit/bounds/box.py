@@ -16,6 +16,7 @@ from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Cells along the longer side of the masks that are searched, and along each side of the grid that is carved.
@@ -49,7 +50,7 @@ class SubjectBox(Options):
     @torch.no_grad()
     def __call__(self, batch: Batch) -> DepthBounds:
         """Bounds of all pixels; reads masks and cameras."""
-        with torch.autocast(batch.masks.device.type, enabled=False):
+        with exact(batch.masks.device.type):
             coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, self.dilation)
             voting = self._voting(coarse)
             lower, upper = subject_box(

@@ -9,30 +9,48 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.precision import exact
+
+#: Distances that an accelerator holds at a time, and candidates of each query whose distance is exact.
+_DISTANCES, _CANDIDATES = 1 << 26, 4
 
 
-def nearest(
-    queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], chunk: int = 2048
-) -> Int[Tensor, " n"]:
+def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
     """Index of the nearest reference of each query.
 
-    On the CPU by a k-d tree in float64; on an accelerator by explicit differences (the matrix-product form of
-    the distance is off by a millimetre at two metres).
+    On the CPU by a k-d tree in float64; elsewhere by matrix products, see :func:`nearest_by_products`.
 
     Args:
         queries: a point that is not finite gets any reference; its distance is not finite either.
         references: finite coordinates, one point at least.
-        chunk: queries that are compared at once on an accelerator.
     """
     queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
     queries = queries.nan_to_num(0.0, 0.0, 0.0)
-    if queries.device.type == "cpu":
-        tree = cKDTree(references.double().numpy(), balanced_tree=False, compact_nodes=False)
-        index = tree.query(queries.double().numpy(), workers=torch.get_num_threads())[1]
-        return torch.from_numpy(index)
-    exact = "donot_use_mm_for_euclid_dist"
-    blocks = [torch.cdist(block, references, compute_mode=exact).argmin(-1) for block in queries.split(chunk)]
-    return torch.cat(blocks) if blocks else queries.new_zeros(0, dtype=torch.long)
+    if queries.device.type != "cpu":
+        return nearest_by_products(queries, references)
+    tree = cKDTree(references.double().numpy(), balanced_tree=False, compact_nodes=False)
+    index = tree.query(queries.double().numpy(), workers=torch.get_num_threads())[1]
+    return torch.from_numpy(index)
+
+
+def nearest_by_products(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
+    """:func:`nearest` among the few references that are nearest by ``|r|^2 - 2 q r``.
+
+    In float32 products are off by some 1e-7 of a squared metre around the middle of the references; explicit
+    differences decide among the candidates. Explicit differences to all (``torch.cdist`` without products)
+    take 4 s of a GPU where this takes milliseconds: 160 000 Gaussians and 10 475 vertices.
+    """
+    middle = references.mean(0)
+    queries, references = queries - middle, references - middle
+    squares, count = references.square().sum(1), min(_CANDIDATES, len(references))
+    index = [queries.new_zeros(0, dtype=torch.long)]
+    with exact(queries.device.type):
+        for block in queries.split(max(1, _DISTANCES // len(references))):
+            scores = torch.addmm(squares, block, references.mT, alpha=-2)
+            candidates = scores.topk(count, largest=False, sorted=False).indices
+            distances = (references[candidates] - block[:, None]).square().sum(-1)
+            index.append(candidates.gather(1, distances.argmin(1, keepdim=True))[:, 0])
+    return torch.cat(index)
 
 
 def subsample(points: Float[Tensor, "n 3"], limit: int | None) -> Float[Tensor, "m 3"]:

@@ -17,6 +17,7 @@ from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, world_to_camera
 from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions
 from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
 
 #: Height (or width, if larger) of the subject in its frame, in metres.
@@ -40,7 +41,7 @@ class Frame:
     def of(cls, batch: Batch) -> "Frame":
         """The frame of each element, from its masks and cameras alone."""
         cameras = batch.cameras.to(torch.float64)
-        with torch.autocast(batch.masks.device.type, enabled=False):
+        with exact(batch.masks.device.type):
             origin = subject_center(batch.masks, cameras)
             return cls(origin, _axes(cameras), _size(batch.masks, cameras, origin) / HEIGHT)
 
@@ -59,7 +60,7 @@ class Frame:
         cameras, dtype = batch.cameras, at_least_float32(batch.images).dtype
         extrinsics = cameras.extrinsics.double()
         moved = extrinsics.clone()
-        with torch.autocast(batch.masks.device.type, enabled=False):
+        with exact(batch.masks.device.type):
             moved[..., :3, :3] = extrinsics[..., :3, :3] @ self.axes[:, None].mT
             moved[..., :3, 3] = _in_cameras(self.origin, extrinsics) / self.metre[:, None, None]
         inside = Cameras(cameras.intrinsics.to(dtype), moved.to(dtype), cameras.height, cameras.width)

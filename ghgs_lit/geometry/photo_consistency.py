@@ -14,6 +14,7 @@ from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Samples that are held at once (bounds memory).
@@ -60,7 +61,7 @@ def consistency_of(
     near, far = at_least_float32(near), at_least_float32(far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     # All of it: half a pixel in bfloat16 is a different colour.
-    with torch.autocast(batch.masks.device.type, enabled=False):
+    with exact(batch.masks.device.type):
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
         if cpu.is_supported(near, far):
             size = tuple(batch.masks.shape[2:])

@@ -17,7 +17,7 @@ from ghgs_lit.heads.position import add_positions_
 from ghgs_lit.heads.window import Span, Window, reach
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.parts import even_parts
-from ghgs_lit.kernels.precision import without_float16
+from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.types import Tokens
 
 LEVELS = 4
@@ -64,7 +64,7 @@ class _Halving(nn.Conv2d):
         if x.device.type != "cpu" or x.shape[-1] > 1:
             return super().forward(x)
         # Of maps one cell wide in bfloat16, PyTorch 2.13 leaves parts of the weight's gradient unset.
-        with torch.autocast("cpu", enabled=False):
+        with exact("cpu"):
             return super().forward(at_least_float32(x))
 
 
@@ -247,7 +247,7 @@ class DPTHead(nn.Module):
         x = layers[:-1](x)
         # The last projection stays in float32 under autocast: depths and offsets of millimetres depend on it.
         last = layers[-1]
-        with torch.autocast(x.device.type, enabled=False):
+        with exact(x.device.type):
             return seen.cut(_pointwise(last, x.to(last.weight.dtype)), result)
 
     def _parts(self, x: Float[Tensor, "n c h w"], window: Window) -> list[Window]:

@@ -29,7 +29,7 @@ from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.heads.window import subject_windows
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.pool import multiplies
-from ghgs_lit.kernels.precision import without_float16
+from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.types import (
     Batch,
     DecodedPixels,
@@ -72,7 +72,7 @@ def float32_last(mlp: nn.Sequential, x: Tensor) -> Tensor:
     """
     with without_float16(x.device.type):
         hidden, last = mlp[:-1](x), mlp[-1]
-    with torch.autocast(x.device.type, enabled=False):
+    with exact(x.device.type):
         return at_least_float32(last(hidden.to(last.weight.dtype)))
 
 

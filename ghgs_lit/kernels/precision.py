@@ -1,6 +1,7 @@
 """Half precision where it is safe: products of networks; geometry and last projections stay in float32."""
 
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
 
@@ -56,6 +57,28 @@ def precision_of(name: str, device: torch.device) -> AbstractContextManager:
     if name == "float32":
         return torch.autocast(device.type, enabled=False)
     return torch.autocast(device.type, getattr(torch, name))
+
+
+@contextmanager
+def exact(device: str) -> Iterator[None]:
+    """Float32 as it is: no autocast, and products that round their factors neither to TF32 nor to bfloat16.
+
+    ``torch.set_float32_matmul_precision`` asks for such products (TF32 on CUDA has 11 bits: 1 mm at 2 m).
+
+    Args:
+        device: its type.
+    """
+    backends = [b.matmul for b in (torch.backends.cuda, torch.backends.mkldnn) if hasattr(b, "matmul")]
+    before = {b: getattr(b, "fp32_precision", "ieee") for b in backends}  # PyTorch 2.9 and later
+    rounding = [b for b, value in before.items() if value not in ("ieee", "none")]
+    for backend in rounding:
+        backend.fp32_precision = "ieee"
+    try:
+        with torch.autocast(device, enabled=False):
+            yield
+    finally:
+        for backend in rounding:
+            backend.fp32_precision = before[backend]
 
 
 def without_float16(device: str) -> AbstractContextManager:

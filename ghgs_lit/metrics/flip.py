@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.functional import correlate
 
 PIXELS_PER_DEGREE = 67.0206
@@ -131,7 +132,7 @@ def _features(lightness: Tensor, ppd: float) -> tuple[Tensor, Tensor]:
 def flip_map(image: Float[Tensor, "n 3 h w"], target: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h w"]:
     """FLIP of each pixel, in [0, 1]. ``image``, ``target``: values outside [0, 1] are clamped first."""
     # Each image separately: rounding can depend on the position in memory, and equal images must give 0.
-    with torch.autocast(image.device.type, enabled=False):
+    with exact(image.device.type):
         image, target = at_least_float32(image).clamp(0, 1), at_least_float32(target).clamp(0, 1)
         to_xyz, _ = _xyz_matrices(image)
         first, second = (_opponent(_transform_colors(_linear_rgb(i), to_xyz)) for i in (image, target))

@@ -12,6 +12,7 @@ from torch import Tensor
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.precision import exact
 
 REGIONS = ("image", "box", "subject")
 PADDINGS = ("valid", "reflect", "zeros")
@@ -121,7 +122,7 @@ def ssim_map(
     large = padding == "zeros" or min(found) >= SSIM_WINDOW
     expected = f"images of at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, or padding zeros"
     require(large, "ssim", expected, found)
-    with torch.autocast(image.device.type, enabled=False):
+    with exact(image.device.type):
         x, y = at_least_float32(image), at_least_float32(target)
         if padding != "valid":
             border, mode = [SSIM_WINDOW // 2] * 4, "reflect" if padding == "reflect" else "constant"

@@ -14,6 +14,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.recalibration.neighbors import Neighbors
 
 #: How the similarity of two tokens changes their logit; see :class:`SemanticAttention`.
@@ -135,7 +136,7 @@ class SemanticAttention(nn.Module):
         cosines: Float[Tensor, "m k"] | None,
     ) -> Float[Tensor, "m i"]:
         """Weighted values of the neighbours of ``m`` tokens (Eq. 3), in float32 or wider."""
-        with torch.autocast(q.device.type, enabled=False):
+        with exact(q.device.type):
             if q.device.type != "cpu" or self.num_heads * len(q) * len(k) > _SCORES:
                 return self._attend_gathered(q, k, v, neighbors, cosines)
             q, k, v = (t.unflatten(1, (self.num_heads, -1)).transpose(0, 1) for t in (q, k, v))

@@ -12,6 +12,7 @@ from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors, widened
 from ghgs_lit.types import Points, Tokens, true_places
@@ -122,7 +123,7 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
     Features are normalised once, before the neighbours are gathered. A feature of length 0 has cosine 0 with
     every other.
     """
-    with torch.autocast(semantic.device.type, enabled=False):
+    with exact(semantic.device.type):
         semantic = at_least_float32(semantic)
         # Allocated first: after the features it would keep their memory occupied once they are freed.
         cosines = semantic.new_empty(neighbors.index.shape)

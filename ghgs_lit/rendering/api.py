@@ -14,6 +14,7 @@ from torch import Tensor
 from ghgs_lit.config.options import Options, Positive
 from ghgs_lit.errors import InputError, choice, require
 from ghgs_lit.geometry.projection import at_least_float32, world_to_camera
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import gsplat_backend
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
@@ -66,7 +67,7 @@ def render(
     backend = resolve_backend(backend, gaussians.means.device)
     module = importlib.import_module(f"ghgs_lit.rendering.{_MODULES[backend]}")
     metre = gaussians.metre
-    with torch.autocast(gaussians.means.device.type, enabled=False):
+    with exact(gaussians.means.device.type):
         gaussians, cameras = _in_metres(*_around_cameras(_in_one_dtype(gaussians), cameras))
         cameras = cameras.to(gaussians.means.dtype) if backend == "reference" else cameras
         rendering = module.rasterize(gaussians, cameras, settings, float(near), float(far))

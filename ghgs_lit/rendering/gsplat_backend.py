@@ -9,6 +9,11 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
 
+#: The limit of alpha that is compiled into gsplat.
+_ALPHA_MAX = RasterSettings().alpha_max
+#: In a batch, gsplat 1.5.3 adds up a warp's gradients by the number of a Gaussian in its element alone: those
+#: of elements with fewer Gaussians than a warp has threads would be mixed.
+_WARP = 32
 _FIXED = ("alpha_min", "stop", "extent", "frustum_margin")
 
 
@@ -42,14 +47,14 @@ def rasterize(
 ) -> Rendering:
     """Gaussians on black, in float32; see :func:`ghgs_lit.rendering.render`.
 
-    A limit of alpha below the one that is compiled into gsplat applies to opacities: alphas differ by at most
-    ``1 - alpha_max`` from those of the other backends, where an opacity is above it.
+    A limit of alpha below :data:`_ALPHA_MAX` applies to opacities: alphas differ by at most ``1 - alpha_max``
+    from those of the other backends, where an opacity is above it.
     """
     default = RasterSettings()
     require(
-        settings.alpha_max <= default.alpha_max,
+        settings.alpha_max <= _ALPHA_MAX,
         "renderer.settings.alpha_max",
-        f"at most {default.alpha_max}, which is compiled into gsplat",
+        f"at most {_ALPHA_MAX}, which is compiled into gsplat",
         settings.alpha_max,
     )
     for name in _FIXED:
@@ -70,8 +75,9 @@ def rasterize(
 def _drawn(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near, far) -> Tensor:
     """All views of all elements, [B, T, C + 2, h, w]: colours, expected depth, alpha. One call of gsplat."""
     means, quaternions, scales, opacities, colors = _sanitized(*_side_by_side(gaussians))
-    # Opacities above the limit keep their gradient, as they do beside the middle of a splat elsewhere.
-    opacities = opacities - (opacities - settings.alpha_max).clamp(min=0).detach()
+    if settings.alpha_max < _ALPHA_MAX:
+        # Opacities above the limit keep their gradient, as they do beside the middle of a splat elsewhere.
+        opacities = opacities - (opacities - settings.alpha_max).clamp(min=0).detach()
     values, alpha, _ = rasterization(
         means=means,
         quats=quaternions,
@@ -95,7 +101,8 @@ def _drawn(rasterization, gaussians: Gaussians, cameras: Cameras, settings, near
 def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
     """Means, quaternions, scales, opacities and colors of each element, [B, N, ...], in float32.
 
-    Elements with fewer Gaussians than others get some of zeros: their opacity of 0 is not drawn.
+    Elements with fewer Gaussians than others, or than :data:`_WARP`, get some of zeros: their
+    opacity of 0 is not drawn.
     """
     names = ("means", "quaternions", "scales", "opacities", "colors")
     fields = [getattr(gaussians, name).float() for name in names]
@@ -104,6 +111,7 @@ def _side_by_side(gaussians: Gaussians) -> tuple[Tensor, ...]:
     fields[3] = fields[3][:, None]
     packed = torch.cat(fields, dim=-1).split(gaussians.splits)
     padded = torch.nn.utils.rnn.pad_sequence(packed, batch_first=True)
+    padded = torch.nn.functional.pad(padded, (0, 0, 0, max(0, _WARP - padded.shape[1])))
     means, quaternions, scales, opacities, colors = padded.split([f.shape[1] for f in fields], dim=-1)
     return means, quaternions, scales, opacities[..., 0], colors
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds.observation import looked_up
 from ghgs_lit.types import Batch, Gaussians
@@ -49,7 +50,7 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
     Gaussians that both see; each counts the less the more it deviates (Cauchy weights), so that wrong depths
     do not decide. 0 where views share nothing.
     """
-    with torch.autocast(gaussians.means.device.type, enabled=False):
+    with exact(gaussians.means.device.type):
         depth = render(gaussians, batch.cameras).depth
         some = _thinned(gaussians)
         ratios, weights = _compared(some, batch, depth)

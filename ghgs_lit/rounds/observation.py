@@ -8,6 +8,7 @@ from torch import Tensor
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.kernels.pool import is_supported
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import cpu
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
@@ -31,7 +32,7 @@ def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
         gaussians: with the images that they come from.
         batch: photographs, masks and cameras.
     """
-    with torch.autocast(gaussians.means.device.type, enabled=False):
+    with exact(gaussians.means.device.type):
         return _compare(gaussians, batch, render(gaussians, batch.cameras))
 
 

@@ -26,6 +26,7 @@ from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.parts import at_once, even_parts
 from ghgs_lit.kernels.pool import multiplies
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
@@ -63,7 +64,7 @@ class Rays(NamedTuple):
     @classmethod
     def of(cls, raw: RawGaussians, batch: Batch) -> "Rays":
         place = raw.image * batch.masks[0, 0].numel() + raw.pixel
-        with torch.autocast(raw.pixel.device.type, enabled=False):
+        with exact(raw.pixel.device.type):
             return cls(place, ray_directions(batch.cameras).flatten(0, 3)[place])
 
 

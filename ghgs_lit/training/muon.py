@@ -58,7 +58,10 @@ def _polynomials(gram: Tensor) -> Tensor:
     a, b, c = COEFFICIENTS
     square = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]  # of the Frobenius norm
     square = square + (square == 0)
-    gram, found = gram / square, square.rsqrt() * torch.eye(gram.shape[-1]).to(gram)
+    gram, found = (
+        gram / square,
+        square.rsqrt() * torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device),
+    )
     for _ in range(ITERATIONS):
         polynomial = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
         polynomial.diagonal(dim1=-2, dim2=-1).add_(a)

@@ -3,6 +3,7 @@
 from typing import Annotated, Any, Literal
 
 import lightning.pytorch as L
+import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
@@ -25,7 +26,7 @@ class TrainerOptions(Options):
     devices: Count | tuple[Index, ...] | Literal[-1, "auto"] = 1
     """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters."""
     precision: Text | Literal[16, 32, 64] = "32-true"
-    """32-true (the paper's), bf16-mixed or 16-mixed."""
+    """32-true (the paper's), tf32, bf16-mixed or 16-mixed; geometry is float32 in each."""
     max_steps: int = Field(200000, ge=-1)
     """Steps of the optimizer (the paper's 200000); -1: no limit."""
     max_time: Duration | None = None
@@ -43,10 +44,14 @@ class TrainerOptions(Options):
 
     def build(self, **arguments: Any) -> L.Trainer:
         """The Trainer, with further ``arguments`` of it; InputError: it refuses its options."""
+        precision = self.precision
+        if precision == "tf32":
+            precision = "32-true"
+            torch.set_float32_matmul_precision("high")
         alone = self.devices == 1 or (isinstance(self.devices, tuple) and len(self.devices) == 1)
         try:
             return L.Trainer(
-                **dict(self),
+                **(dict(self) | {"precision": precision}),
                 # Not every parameter has a gradient in every step (ablations, skipped work).
                 strategy="auto" if alone else "ddp_find_unused_parameters_true",
                 max_epochs=-1,

@@ -7,14 +7,17 @@ than CUDA in one point: an index on the CPU is refused, since CUDA copies it at 
         model.to(DEVICE)(batch.to(DEVICE))
     print(log.waits)
 
-PyTorch's interface for backends in Python is experimental; all of its use is in this file.
+PyTorch's interface for backends in Python is experimental; all of its use is in this file. A process has one
+accelerator: where CUDA is, tests of this one are skipped.
 """
 
+import functools
 import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import SkipTest
 
 import torch
 from torch import library
@@ -144,8 +147,8 @@ class _Backend(_DummyBackendModule):
         return False
 
 
-_setup_privateuseone_for_python_backend("pretend", _Backend())
-CPU, DEVICE = torch.device("cpu"), torch.device("pretend", 0)
+# Called "pretend" once :func:`_register` has run.
+CPU, DEVICE = torch.device("cpu"), torch.device("privateuseone", 0)
 
 
 class PretendTensor(torch.Tensor):
@@ -194,6 +197,9 @@ class _Mode(TorchDispatchMode):
 @contextmanager
 def pretend_device(by_line: bool = False) -> Iterator[Log]:
     """Inside, ``device="pretend"`` works for every function of PyTorch; gives what is asked of it."""
+    if torch.cuda.is_available():
+        raise SkipTest("the pretend device needs a process without CUDA (CUDA_VISIBLE_DEVICES=)")
+    _register()
     log = Log(by_line)
     _logs.append(log)
     try:
@@ -290,8 +296,12 @@ def _copy_from(source, target, non_blocking=False):
     return _call(torch.ops.aten.copy_.default, (target, source), {"non_blocking": non_blocking})
 
 
-# Indexing by lists and a few others come from C++ without passing through the mode.
-_library = library.Library("aten", "IMPL")
-_library.impl("empty_strided", _empty_strided, "PrivateUse1")
-_library.impl("empty.memory_format", _empty, "PrivateUse1")
-_library.impl("_copy_from", _copy_from, "PrivateUse1")
+@functools.cache
+def _register() -> library.Library:
+    _setup_privateuseone_for_python_backend("pretend", _Backend())
+    # Indexing by lists and a few others come from C++ without passing through the mode.
+    ours = library.Library("aten", "IMPL")
+    ours.impl("empty_strided", _empty_strided, "PrivateUse1")
+    ours.impl("empty.memory_format", _empty, "PrivateUse1")
+    ours.impl("_copy_from", _copy_from, "PrivateUse1")
+    return ours

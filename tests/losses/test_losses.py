@@ -7,7 +7,8 @@ import torch
 from scipy.spatial.distance import cdist
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.chamfer import chamfer, nearest
+from ghgs_lit.geometry import chamfer as geometry_chamfer
+from ghgs_lit.geometry.chamfer import chamfer, nearest, nearest_by_products
 from ghgs_lit.losses import terms
 from ghgs_lit.metrics.functional import ssim_map
 from ghgs_lit.types import (
@@ -85,6 +86,20 @@ def test_nearest_neighbours_are_exact():
     a, b = torch.rand(300, 3, generator=g), torch.rand(200, 3, generator=g)
     expected = torch.from_numpy(cdist(a.double(), b.double()).argmin(1))
     assert torch.equal(nearest(a, b), expected)
+
+
+@pytest.mark.parametrize("away", [0.0, 500.0])
+def test_products_find_the_nearest_as_a_tree_does(monkeypatch, away):
+    """Also where blocks are small, far from the origin, and for one reference or no query."""
+    monkeypatch.setattr(geometry_chamfer, "_DISTANCES", 7000)
+    generator = torch.Generator().manual_seed(3)
+    a, b = (torch.randn(n, 3, generator=generator) + away for n in (999, 2000))
+    found, expected = nearest_by_products(a, b), nearest(a, b)
+    assert (found == expected).float().mean() > 0.995
+    distances = [(b[index] - a).square().sum(-1).double() for index in (found, expected)]
+    assert (distances[0] - distances[1]).abs().max() < 1e-6
+    assert nearest_by_products(a, b[:1]).tolist() == [0] * 999
+    assert len(nearest_by_products(a[:0], b)) == 0
 
 
 def test_chamfer_is_scipys():

@@ -119,13 +119,14 @@ def test_gsplat_is_called_as_documented(monkeypatch, antialiased):
     gaussians.quaternions[3] = 0
     gaussians.quaternions[4] *= 1e-25
     gaussians.means[5, 0] = float("nan")
+    gaussians.opacities[15:] = 1  # gsplat limits alpha itself, not opacity
     settings = RasterSettings(low_pass=0.2, antialiased=antialiased)
     gaussians = with_gradients(gaussians)
     found = gsplat_backend.rasterize(gaussians, views, settings, 0.5, 20.0)
     wanted = render(gaussians, views, "cpu", settings=settings, near=0.5, far=20.0)
     for name in ("image", "alpha", "depth"):
         torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-4, atol=1e-4)
-    assert calls == [(3, 25, 3)]
+    assert calls == [(3, 32, 3)]  # as many as a warp has threads
     found.image.sum().backward()
     assert all(torch.isfinite(getattr(gaussians, name).grad).all() for name in FIELDS)
 

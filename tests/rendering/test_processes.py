@@ -89,6 +89,7 @@ class _Renderings(torch.utils.data.Dataset):
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this platform")
+@pytest.mark.skipif(torch.cuda.is_available(), reason="beside CUDA, PyTorch refuses gradients after a fork")
 @pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes")
 def test_training_in_four_workers_of_a_data_loader():
     """Rendering with gradients works in worker processes."""

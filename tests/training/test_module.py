@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.progress import Lines, track
@@ -202,6 +203,23 @@ def test_several_processes_have_all_parameters(devices, processes):
     trainer = TrainerOptions(accelerator="cpu", devices=devices, max_steps=1).build(logger=False)
     assert trainer.num_devices == processes
     assert isinstance(trainer.strategy, DDPStrategy) == (processes > 1)
+
+
+def test_tf32_is_for_networks_alone():
+    """``trainer.precision=tf32`` lets products round; geometry's do not, and the setting comes back."""
+    matmul = torch.backends.cuda.matmul
+    try:
+        trainer = TrainerOptions(accelerator="cpu", precision="tf32", max_steps=1).build(logger=False)
+        assert trainer.precision == "32-true"
+        assert matmul.fp32_precision == "tf32"
+        with exact("cpu"), torch.autocast("cpu"), exact("cpu"):
+            assert matmul.fp32_precision == "ieee"
+            assert not torch.is_autocast_enabled("cpu")
+        with pytest.raises(KeyError), exact("cpu"):
+            raise KeyError
+        assert matmul.fp32_precision == "tf32"
+    finally:
+        torch.set_float32_matmul_precision("highest")
 
 
 def test_without_a_terminal_lines_say_how_far_the_run_is(tmp_path, capsys, monkeypatch):

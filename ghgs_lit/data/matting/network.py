@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.kernels.precision import exact
 
 #: Channels at the full size of the image and at each half of it.
 _WIDTHS = (16, 32, 48, 64)
@@ -76,7 +77,7 @@ def _convolutions(before: int, after: int) -> nn.Sequential:
 def _features(
     images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
 ) -> Float[Tensor, "B features h w"]:
-    with torch.autocast(images.device.type, enabled=False):
+    with exact(images.device.type):
         inside = np.stack([_insideness(mask) for mask in (mattes > 0.5).cpu().numpy()])
         depth = torch.from_numpy(inside).to(images)[:, None]
         parts = [images - 0.5, mattes[:, None] - 0.5, depth]

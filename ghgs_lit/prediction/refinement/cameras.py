@@ -24,6 +24,7 @@ from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.motion import after_motions, rigid, without_common
 from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.prediction.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
@@ -150,7 +151,7 @@ class CameraRefinement:
         optimizer = torch.optim.Adam([raw], lr=_RATE, betas=(0.8, 0.95), eps=1e-15)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS, 0.05 * _RATE)
         for _ in range(_STEPS):
-            with torch.autocast(axes.device.type, enabled=False), torch.enable_grad():
+            with exact(axes.device.type), torch.enable_grad():
                 motion = _of_free(raw.expand(len(axes), -1, -1), axes, free)
                 drawn = self.renderer(_moved(views, motion), views.cameras, background=0.0)
                 losses.append(self._loss(drawn, views, batch))
@@ -159,7 +160,7 @@ class CameraRefinement:
                 optimizer.step()
             schedule.step()
         is_better = losses[-1].detach() < (1 - worth) * losses[0].detach()
-        with torch.autocast(axes.device.type, enabled=False):
+        with exact(axes.device.type):
             motion = _of_free(raw.detach().expand(len(axes), -1, -1), axes, free)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
         corrected = dataclasses.replace(cameras, extrinsics=extrinsics)

@@ -23,6 +23,7 @@ from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.mattes import coverage
 from ghgs_lit.geometry.motion import after_motions, without_common
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.prediction.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.types import Batch, Cameras
 
@@ -136,7 +137,7 @@ def coherent_cameras(
     mattes, lens, pose = (part.float().cpu() for part in parts)
     middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
     each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
-    with torch.autocast("cpu", enabled=False):
+    with exact("cpu"):
         rigs = [_coherent(mattes[part], lens[part], pose[part][0], middle[part]) for part in each]
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count, device = len(pose) // len(rigs), batch.masks.device

@@ -17,6 +17,7 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import world_to_camera
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
@@ -99,7 +100,7 @@ class Descent:
         weights: Weights = WEIGHTS,
     ) -> Rendering:
         """One step towards photographs on black and silhouettes; the renders that it follows from."""
-        with torch.autocast(self._footprint.device.type, enabled=False), torch.enable_grad():
+        with exact(self._footprint.device.type), torch.enable_grad():
             drawn = renderer(self._changed(), cameras, background=0.0)
             self._optimizer.zero_grad()
             _loss(drawn, photographs, silhouettes, weights).backward()

@@ -16,6 +16,7 @@ from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps
 
 _SIZE = 12
@@ -80,7 +81,7 @@ def _hits(cameras: Cameras, middle: Tensor, half: Tensor) -> Tensor:
 def _rays(v: Values) -> Values:
     """Rays, and where those meet the box that neither graze nor barely miss it: that is a decision."""
     cameras = cameras_of(v, 4)
-    with torch.autocast("cpu", enabled=False):  # as in the stage
+    with exact("cpu"):  # as in the stage
         bounds = depths_in_box(cameras, v["middle"] - v["half"], v["middle"] + v["half"])
         near, far = (torch.where(v["clear"], x, 0.0) for x in (bounds.near, bounds.far))
         return {"directions": ray_directions(cameras), "near": near, "far": far}

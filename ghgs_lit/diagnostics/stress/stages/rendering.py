@@ -5,6 +5,7 @@ from torch import Generator
 
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case
+from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import RasterSettings, reference, render
 from ghgs_lit.types import Cameras, Gaussians
 
@@ -43,7 +44,7 @@ def _cameras(v: Values) -> Cameras:
 
 def _project(v: Values) -> Values:
     """Centres, covariances, their inverses and determinants of the splats before the camera."""
-    with torch.autocast("cpu", enabled=False):  # as in render()
+    with exact("cpu"):  # as in render()
         splats = reference.project(
             Gaussians(*(v[name] for name in _FIELDS), splits=(len(v["means"]),)),
             _cameras(v)[0],
