@@ -23,8 +23,8 @@ import numpy as np
 import torch
 
 from ghgs_lit import GHGS
+from ghgs_lit.cli.evaluate import baselines_of
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
-from ghgs_lit.cli.methods import baselines_of
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.groups import read_option
 from ghgs_lit.config.settings import image_size

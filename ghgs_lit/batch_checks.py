@@ -16,16 +16,14 @@ Finding = tuple[str, str, Tensor]
 def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
     """Refuse a batch that the stages cannot work on.
 
-    Values are looked at together, so that the host waits for a GPU once.
+    Values are looked at together, so that the host waits for a GPU once. InputError: names the field, what
+    was expected and what was found, and where.
 
     Args:
         batch: the inputs; targets are not looked at.
         patch_size: must divide height and width, in pixels.
         values: look also at every value, which would spread through every view: one NaN in the background
             leaves no Gaussian.
-
-    Raises:
-        InputError: names the field, what was expected and what was found, and where.
     """
     _check_shapes(batch, patch_size)
     findings = _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])

@@ -20,15 +20,8 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
     """Let ``write(temporary)`` write a file beside ``path``, wait for the disk, then rename it to ``path``.
 
     Readers see the old file or the new one, never a part. Folders are made. A temporary file of a process
-    that was killed is removed by the next write of the same path on the same machine.
-
-    Args:
-        path: the file to write.
-        write: writes the whole content to the path that it is given.
-
-    Raises:
-        InputError: ``path`` is a directory.
-        OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
+    that was killed is removed by the next write of the same path on the same machine. InputError: ``path`` is
+    a directory. OSError: the disk is full, or the folder cannot be written to; its ``filename`` is ``path``.
     """
     path = Path(path)
     require(not path.is_dir(), str(path), "a file to write", "a directory")
@@ -54,10 +47,7 @@ def write_atomically(path: str | Path, write: Callable[[Path], Any]) -> None:
 @contextlib.contextmanager
 def naming(folder: Path) -> Iterator[None]:
     """Name the ``folder`` that is written to in errors of the system that name no file, as of a full disk.
-
-    Raises:
-        OSError: with ``folder`` as its ``filename``.
-    """
+    OSError: with ``folder`` as its ``filename``."""
     try:
         yield
     except OSError as error:
@@ -85,11 +75,8 @@ def _refusal(path: Path) -> OSError | None:
 
 
 def resolved(path: str | Path) -> Path:
-    """The absolute path without links; ``~`` is the user's folder.
-
-    Raises:
-        InputError: its links go in a loop (before Python 3.13; later whatever opens it says so).
-    """
+    """The absolute path without links; ``~`` is the user's folder. InputError: its links go in a loop (before
+    Python 3.13; later whatever opens it says so)."""
     try:
         return Path(path).expanduser().resolve()
     except RuntimeError as error:

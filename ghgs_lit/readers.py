@@ -39,15 +39,8 @@ def require_data_folder(folder: Path) -> None:
 
 
 def read_text(path: Path, expected: str = "text") -> str:
-    """The text of a file in UTF-8; a byte order mark is left out.
-
-    Args:
-        path: the file.
-        expected: what it should be, for messages.
-
-    Raises:
-        InputError: it is missing, no file, larger than 256 MB or in another encoding.
-    """
+    """The text of a file in UTF-8; a byte order mark is left out. InputError: it is missing, no file, larger
+    than 256 MB or in another encoding."""
     require_file(path, expected)
     try:
         size = path.stat().st_size
@@ -58,11 +51,8 @@ def read_text(path: Path, expected: str = "text") -> str:
 
 
 def read_json(path: Path, expected: str = "JSON") -> Any:
-    """The content of a JSON file; arguments and errors as for :func:`read_text`.
-
-    Raises:
-        InputError: also where it is no JSON, or nested deeper than 64 levels.
-    """
+    """The content of a JSON file; arguments and errors as for :func:`read_text`. InputError: also where it is
+    no JSON, or nested deeper than 64 levels."""
     return _parsed(path, expected, json.loads)
 
 
@@ -91,11 +81,8 @@ def read_lines_of_json(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray":
-    """The array of an ``.npy`` file without objects.
-
-    Raises:
-        InputError: it is missing, another format, or shorter than its header says.
-    """
+    """The array of an ``.npy`` file without objects. InputError: it is missing, another format, or shorter
+    than its header says."""
     import numpy as np  # here: commands that read no array start sooner
 
     require_file(path, expected)

@@ -154,14 +154,8 @@ class AutoSkip:
         self, encoder: Any, masks: Bool[Tensor, "B V H W"]
     ) -> tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"]]:
         """The preset of each element, which depends on its own masks alone; of equals the most accurate.
-
-        Args:
-            encoder: the :class:`ghgs_lit.encoder.VGGTEncoder` that will see them.
-            masks: sides are divisible by the patch size.
-
-        Returns:
-            The decisions, and the patches that they keep, on the CPU.
-        """
+        ``masks``: sides are divisible by the patch size. Returns: the decisions, and the patches that they
+        keep, on the CPU."""
         choices = []
         for preset in self.presets.values():
             with seeing(encoder, preset.view):
@@ -194,12 +188,9 @@ def encoder_products(encoder: Any, kept: Bool[Tensor, "B V h w"]) -> Float[Tenso
     """FLOPs of a pair of the encoder's blocks for each element, with the patches that are kept.
 
     Products with weights take 24 n C^2 in a block (6 for queries, keys and values, 2 for what leaves the
-    attention, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in
-    the frame block, among all views in the global block.
-
-    Args:
-        encoder: a :class:`ghgs_lit.encoder.VGGTEncoder`.
-        kept: patches that take part.
+    attention, 16 for the MLP of four times the width), attention among m tokens 4 m^2 C: within a view in the
+    frame block, among all views in the global block. ``encoder``: a :class:`ghgs_lit.encoder.VGGTEncoder`.
+    ``kept``: patches that take part.
     """
     tokens = (kept.flatten(2).sum(-1) + encoder.aggregator.special).double()
     width, both = encoder.dim_latent // 2, tokens.sum(1)

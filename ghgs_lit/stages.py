@@ -145,11 +145,8 @@ class Loss(Protocol):
 
 
 def require_bounds(bounds: Bounds, encoder: Encoder, depth_head: DepthHead, rounds: Any) -> None:
-    """Refuse stages that need bounds beside one that gives none, and the other way round.
-
-    Raises:
-        InputError: names the stage.
-    """
+    """Refuse stages that need bounds beside one that gives none, and the other way round. InputError: names
+    the stage."""
     head = f"a depth head {'between' if depth_head.is_bounded else 'without'} bounds"
     expected = "none with depth_head.parameterization=inverse_linear, box or hull with all others"
     fits = bounds.is_bounded == depth_head.is_bounded

@@ -119,8 +119,6 @@ def computing(
     Args:
         precision: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`.
         auto: chooses what the encoder sees of each subject (``skip=auto``); None: the encoder does itself.
-        encoder: the one that will see them.
-        masks: sides are divisible by the patch size.
 
     Yields:
         The choices, and the patches that take part, None where the encoder decides.

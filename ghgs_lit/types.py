@@ -90,14 +90,8 @@ class Cameras(_TensorStruct):
         return dataclasses.replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Cameras":
-        """The same cameras for a crop of the image.
-
-        Args:
-            top: row of the image at which the crop starts; negative pads.
-            left: column of the image at which the crop starts.
-            height: rows of the crop in pixels.
-            width: columns of the crop in pixels.
-        """
+        """The same cameras for a crop of the image. ``top``: row of the image at which the crop starts;
+        negative pads. ``left``: column of the image at which the crop starts."""
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top
@@ -336,12 +330,8 @@ class Gaussians(_TensorStruct):
         return torch.stack([field.isfinite().all(1) for field in fields]).all(0)
 
     def select(self, index: Tensor | slice, splits: tuple[int, ...]) -> "Gaussians":
-        """The Gaussians at ``index`` (a slice, a mask or indices).
-
-        Args:
-            index: which Gaussians.
-            splits: how many of them belong to each batch element.
-        """
+        """The Gaussians at ``index`` (a slice, a mask or indices). ``index``: which Gaussians. ``splits``:
+        how many of them belong to each batch element."""
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in dataclasses.fields(self)

@@ -48,7 +48,9 @@ NOT_RUN = [
     (r"ghgs stress dump=", "needs a training step that was not finite"),
     (r"ghgs (train|evaluate|benchmark) .*split=bench", "renders forty people"),
     (r"(ghgs table|python benchmarks/when_recalibration\.py) .*runs/ablation", "needs twelve runs"),
+    (r"ghgs (train|table) .*runs/peers", "needs five runs"),
     (r"ghgs (train|export) .*runs/shipped", "renders 344 people"),
+    (r"python benchmarks/(protocols|attention_on_parts)", "renders twelve people"),
     (r"ghgs evaluate .*per_scene", "fits Gaussians to each person, for minutes"),
     (r"ghgs stress$", "takes a quarter of an hour"),
     (r"python benchmarks/half_precision", "takes an hour"),
@@ -62,7 +64,7 @@ if importlib.util.find_spec("smplx") is None:
 CPU = "encoder=vggt_nano optimizer=from_scratch trainer=cpu"
 TINY = "data.people='{train: 2, val: 2}' data.size=56 data.render.samples=1 data.render_workers=0"
 SHORT = "trainer.max_steps=2 trainer.val_check_interval=2 trainer.limit_val_batches=1"
-FEW = "miniature.size=128 miniature.people.train=2 miniature.people.val=1"
+FEW = "--size 128 --train 2 --val 1"
 TRAIN = r"^(ghgs train (?!.*(?:dry_run|-help))"  # begins the pattern of a command that trains
 # A pattern, what is put in its place, and why.
 SMALL = [
@@ -87,7 +89,7 @@ SMALL = [
     (r"data\.render\.size=\d+", "data.render.size=56 data.render.samples=1 data.render_workers=0",
      "small photographs"),
     (r"^(ghgs prepare task=render(?!.*render\.size).*)", r"\1 data.render.size=56", "small photographs"),
-    (r"^(.*(?:task=miniature|miniature\.py).*)", rf"\1 {FEW}", "few people"),
+    (r"^(.*miniature\.py.*)", rf"\1 {FEW}", "few people"),
     (r"^(python benchmarks/loading\.py.*)", r"\1 --seconds 1 --size 128 --workers 0,1", "one second"),
     (r"^(python benchmarks/captures\.py.*)", r"\1 --people 1", "one person"),
     (r"^(python scripts/check_resume\.py)(?: --steps 40 --kill-at 20)?(.*)",
@@ -101,7 +103,7 @@ SMALL = [
     (TRAIN + r".*)", rf"\1 {SHORT}", "two steps"),
 ]  # fmt: skip
 
-_SCANS = "ghgs prepare task=miniature data=thuman2 data.source={} miniature.size=64 miniature.people.train=2"
+_SCANS = "python scripts/miniature.py data=thuman2 data.source={} --size 64 --train 2"
 _RENDER = "ghgs prepare task=render data=scans data.source={} data.root=rendered data.render.size=60"
 _RENDERED = (_SCANS.format("scans"), _RENDER.format("scans"))
 _RUN = f"ghgs train experiment=demo {TINY} {SHORT}"
@@ -166,7 +168,7 @@ BEFORE = {
     "docs/outputs.md": _CHECKPOINTS,
     "docs/photographs.md": (
         f"{_RUN} hydra.run.dir=runs/mine",
-        f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW} miniature.size=112",
+        f"python scripts/miniature.py data=thuman2 data.root=rendered {FEW} --size 112",
         _CAPTURE,
     ),
     "docs/rounds.md": _RENDERED,
@@ -190,8 +192,8 @@ cameras = Cameras(torch.tensor([[[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]]), tor
 }
 # Beginnings of the commands of a document that end within seconds, and of those that they need.
 FAST = {
-    "README.md": r"ghgs \S*--help|ghgs train --help|.*dry_run=true|ghgs prepare .*(my_scans|rendered)|"
-    r"ghgs train experiment=scans .*runs/mine|ghgs predict|#python",
+    "README.md": r"ghgs \S*--help|ghgs train --help|.*dry_run=true|.*data\.source=my_scans|"
+    r"ghgs prepare .*rendered|ghgs train experiment=scans .*runs/mine|ghgs predict|#python",
     "docs/first_day.md": r".*dry_run=true",
     "docs/rasterizer.md": r"#python",
     "docs/sweeps.md": r".*dry_run=true",

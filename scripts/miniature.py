@@ -1,11 +1,13 @@
 """A small data set of built-in people in a published layout, to try its loader without the real data.
 
-    python scripts/miniature.py data=humman data.root=humman miniature.people.train=2 miniature.people.val=2
+    python scripts/miniature.py data=humman data.root=humman --train 2 --val 2
 
-Takes the keys of ``ghgs prepare``: ``data`` says which layout, ``data.root`` where. A folder that holds
+Takes the keys of ``ghgs prepare``: ``data`` says which layout, ``data.root`` where. With ``data=thuman2
+data.source=my_scans`` raw scans are written, with ``data.root`` renders of them. A folder that holds
 anything but a miniature is refused. Prints the folders that were written.
 """
 
+import argparse
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,9 +20,9 @@ from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.miniature import writing
 from ghgs_lit.synthesis.thuman2 import THuman2
-from scripts.miniatures import humman, thuman2, zju_mocap
+from scripts.miniatures import humman, scans, thuman2, zju_mocap
+from scripts.miniatures.scans import writing
 
 
 def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
@@ -41,7 +43,7 @@ def make_miniature(dataset: DataSet, people: Mapping[str, int], size: int, seed:
     """
     for kind, make in _MAKERS.items():
         if isinstance(dataset, kind):
-            return make(dataset, _root(dataset), people, size, seed)
+            return make(dataset, people, size, seed)
     raise InputError(f"miniature: expected a data set with a published layout; found {dataset.name}")
 
 
@@ -49,21 +51,28 @@ def _root(dataset: DataSet) -> Path:
     return required_folder("data.root", "a folder to write to", dataset.root)
 
 
-def _zju_mocap(dataset: ZJUMoCap, root: Path, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
+def _zju_mocap(dataset: ZJUMoCap, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
     chosen = []
     for phase in PHASES:
         chosen += [s for some in dataset.split.of(phase) for s in some.sequences][: people[phase]]
+    root = _root(dataset)
     with writing(root):
         return zju_mocap.make(root, chosen, size, seed)
 
 
-def _humman(dataset: HuMMan, root: Path, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
+def _humman(dataset: HuMMan, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
+    root = _root(dataset)
     with writing(root, humman.body_models(root)):
         return humman.make(root, dataset.split.val, people, size, seed)
 
 
-def _thuman2(dataset: THuman2, root: Path, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
-    """Renders as the published scripts make them; scans are those of ``ghgs prepare task=miniature``."""
+def _thuman2(dataset: THuman2, people: Mapping[str, int], size: int, seed: int) -> list[Path]:
+    """Renders as the published scripts make them; with ``data.source`` raw scans with their fits."""
+    if dataset.source is not None:
+        source = dataset.source_folder
+        with writing(source, scans.fit_folder(source)):
+            return [scans.make_scans(source, people, size, seed)]
+    root = _root(dataset)
     with writing(root):
         return [thuman2.make(root, people, size, seed)]
 
@@ -77,10 +86,14 @@ _MAKERS: dict[type[DataSet], Callable[..., list[Path]]] = {
 
 def main() -> None:
     """The command."""
-    cfg = compose("prepare", sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--train", type=int, default=4, help="people of training")
+    parser.add_argument("--val", type=int, default=2, help="people of validation")
+    parser.add_argument("--size", type=int, default=256, help="longer side of photographs, half of textures'")
+    given, overrides = parser.parse_known_args()
+    cfg, people = compose("prepare", overrides), {"train": given.train, "val": given.val}
     data = build(cfg.data, key="data", views=cfg.views, targets=cfg.targets, seed=cfg.seed)
-    miniature = cfg.miniature
-    for folder in make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed):
+    for folder in make_miniature(data.dataset, people, given.size, cfg.seed):
         print(f"wrote {folder}")
 
 

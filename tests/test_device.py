@@ -197,7 +197,7 @@ def test_the_feature_cache_serves_the_device(tmp_path):
     model = make_model("model=hull", "encoder.trainable=none").eval()
     with pretend_device(), torch.no_grad():
         model, batch = model.to(DEVICE), make_batch(2, 3, 28, 42).to(DEVICE)
-        model.feature_cache = FeatureCache(tmp_path, tokens="all")
+        model.feature_cache = FeatureCache(tmp_path)
         first, second = (model(batch).to("cpu") for _ in range(2))
     assert (model.feature_cache.made, model.feature_cache.hits) == (2, 2)
     close(first.gaussians, second.gaussians, 0)

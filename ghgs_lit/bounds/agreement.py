@@ -30,7 +30,6 @@ def trusted_views(
 
     Args:
         coarse: masks of at most :data:`RESOLUTION` cells.
-        center: a point in the subject's middle.
         reach: a generous radius of the subject.
         tolerance: how many views may say "outside" of a point that is kept.
     """

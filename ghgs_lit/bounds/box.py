@@ -87,17 +87,10 @@ def subject_box(
 ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
     """The axis-aligned box of the space that masks and cameras leave to the subject.
 
-    Carved twice: the second grid fills the box of the first one. Where nothing is left (masks that
-    contradict one another) the box of the previous pass stays.
-
-    Args:
-        masks: of the views.
-        cameras: [B, V], of the masks' size.
-        radius: dilation of the masks in pixels.
-        tolerance: how many views may say "outside" of a point that is kept.
-
-    Returns:
-        The corners with the smallest and with the largest coordinates, in metres.
+    Carved twice: the second grid fills the box of the first one. Where nothing is left (masks that contradict
+    one another) the box of the previous pass stays. Returns: the corners with the smallest and with the
+    largest coordinates, in metres. ``radius``: dilation of the masks in pixels. ``tolerance``: how many views
+    may say "outside" of a point that is kept.
     """
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)

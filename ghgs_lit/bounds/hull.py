@@ -58,8 +58,6 @@ def hull_bounds(
     Computed for the subject's pixels; others, and rays that miss the hull, keep their bounds.
 
     Args:
-        masks: of the views.
-        cameras: [B, V], of the masks' size.
         start: where the search begins and ends.
         radius: dilation of the masks in pixels.
         tolerance: how many other views may say "outside" of a depth that is allowed.

@@ -39,12 +39,8 @@ def pixel_axes(cameras: Cameras) -> tuple[Float[Tensor, " w"], Float[Tensor, " h
 def depths_in_box(cameras: Cameras, lower: Float[Tensor, "B 3"], upper: Float[Tensor, "B 3"]) -> DepthBounds:
     """Depths at which the ray of each pixel enters and leaves an axis-aligned box.
 
-    A ray that misses the box gets the range of depths of the whole box.
-
-    Args:
-        cameras: [B, V].
-        lower: corner of each element's box with the smallest coordinates, in metres.
-        upper: corner with the largest coordinates.
+    A ray that misses the box gets the range of depths of the whole box. ``lower``: corner of each element's
+    box with the smallest coordinates, in metres. ``upper``: corner with the largest coordinates.
     """
     directions = ray_directions(cameras)
     centers = cameras.centers[:, :, None, None]

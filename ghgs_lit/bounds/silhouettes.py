@@ -28,14 +28,8 @@ class Silhouettes:
 def silhouettes(
     masks: Bool[Tensor, "B V H W"], cameras: Cameras, resolution: int, dilation: float
 ) -> Silhouettes:
-    """Masks at a resolution that limits the cost of the search.
-
-    Args:
-        masks: of the views.
-        cameras: [B, V], of the masks' size.
-        resolution: cells along the longer side of the image, at most.
-        dilation: as a fraction of the image's longer side.
-    """
+    """Masks at a resolution that limits the cost of the search. ``resolution``: cells along the longer side
+    of the image, at most. ``dilation``: as a fraction of the image's longer side."""
     stride = ceil(max(masks.shape[-2:]) / resolution)
     if stride > 1:
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
@@ -51,12 +45,8 @@ def silhouettes(
 
 
 def dilate(masks: Bool[Tensor, "*batch h w"], radius: int | Tensor) -> Bool[Tensor, "*batch h w"]:
-    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it).
-
-    Args:
-        masks: to be grown.
-        radius: one for all masks, or integers that broadcast with them.
-    """
+    """Masks grown by ``radius`` pixels along both axes (at a cost that does not depend on it). ``masks``: to
+    be grown. ``radius``: one for all masks, or integers that broadcast with them."""
     grown = masks
     for dim in (-2, -1):
         size = masks.shape[dim]
@@ -80,12 +70,8 @@ def look_up(
     """Entries of ``tables`` at homogeneous pixels; overwrites ``x``, ``y`` and ``w``.
 
     Points outside the frame take the entry of the nearest border pixel: a mask that does not touch the border
-    has the whole subject in its frame. Points behind the camera land far outside the frame.
-
-    Args:
-        tables: one for each image.
-        image: which table; broadcasts with the pixels.
-        x, y, w: homogeneous pixels.
+    has the whole subject in its frame. Points behind the camera land far outside the frame. ``image``: which
+    table; broadcasts with the pixels. ``x``, ``y``, ``w``: homogeneous pixels.
     """
     height, width = tables.shape[1:]
     inverse = w.clamp_(min=NEAREST).reciprocal_()

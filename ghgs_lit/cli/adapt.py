@@ -33,11 +33,7 @@ _SPREAD = 0.1
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """The verb; returns the mean PSNR of validation people in the rig.
-
-    Raises:
-        Interrupted: on Ctrl-C and SIGTERM.
-    """
+    """The verb; returns the mean PSNR of validation people in the rig. Interrupted: on Ctrl-C and SIGTERM."""
     config = resolve(cfg) | model_of(cfg.checkpoint, cfg)
     if config["out"] is not None and not config["overwrite"]:
         taken = Path(config["out"]).expanduser().exists()
@@ -47,11 +43,8 @@ def run(cfg: DictConfig) -> float | str | None:
 
 def with_rig(config: dict[str, Any]) -> dict[str, Any]:
     """``config`` whose people stand in the rig of ``cameras`` and are seen by all of it, where
-    ``views.training_counts`` is not said.
-
-    Raises:
-        InputError: the calibration, or a photograph, is missing or wrong.
-    """
+    ``views.training_counts`` is not said. InputError: the calibration, or a photograph, is missing or
+    wrong."""
     if config["images"] is None:
         entries, fill = _cameras_of_file(config), config["data"]["fill"]
     else:
@@ -121,7 +114,6 @@ def adapt(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
 
 
 def _measure(config: dict[str, Any], data: "PhotographsDataModule", directory: Path) -> float:
-    """Mean PSNR in dB of the weights that training starts from, on validation people in the rig."""
     device = pick_device("cpu" if config["trainer"]["accelerator"] == "cpu" else "auto")
     inference = {**config, "precision": "inherit"}
     method = ModelMethod(load_model(inference, device), build_renderer(config, device))

@@ -113,13 +113,7 @@ def composed_once(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Arguments in Hydra's terms.
-
-    ``table sweep=<directory>`` is the key ``runs``: to Hydra ``sweep`` is a group. Where the data is that of
-    a checkpoint, which Hydra does not know, its keys are forced.
-    """
-    if verb == "table":
-        return [re.sub("^sweep=", "runs=", argument) for argument in arguments]
+    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced."""
     has_data = any(argument.startswith("data=") for argument in arguments)
     if verb in ("evaluate", "predict", "view") and not has_data:
         return [re.sub(r"^data\.", "++data.", argument) for argument in arguments]

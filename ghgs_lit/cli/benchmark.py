@@ -68,11 +68,8 @@ _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """Every source in every preset, the yardstick always among them.
-
-    Raises:
-        FileNotFoundError, InputError: as for :meth:`Source.of_checkpoint` and :func:`cases_of`.
-    """
+    """Every source in every preset, the yardstick always among them. FileNotFoundError, InputError: as for
+    :meth:`Source.of_checkpoint` and :func:`cases_of`."""
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
     presets = presets_of(list(names), config["skip"])
     if config["checkpoint"] is None:
@@ -86,7 +83,6 @@ def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Ca
 
 
 def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
-    """Measure presets on data."""
     data = build_data(config)
     data.prepare_data([config["split"]])
     loader = data.evaluation_loader(split=config["split"])
@@ -115,7 +111,6 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
 
 
 def _weights(config: dict[str, Any], cases: list[Case]) -> str:
-    """The models in words."""
     number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
     own = config["checkpoint"] or f"{choices().get('encoder', 'encoder')}, random weights"
     against = f" vs: {config['vs']}" if config["vs"] else ""
@@ -123,7 +118,6 @@ def _weights(config: dict[str, Any], cases: list[Case]) -> str:
 
 
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
-    """Write all files of the run and print the tables; returns the path of ``benchmark.json``."""
     rows, words = content["rows"], (in_words(content["machine"]), content["about"])
     tables = report.tables_of(rows)
     save_figure(draw_presets(rows, *words), directory / "benchmark.png")

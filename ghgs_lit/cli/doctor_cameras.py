@@ -19,11 +19,8 @@ _LISTED = 6
 
 
 def run(cfg: DictConfig) -> None:
-    """Print what was found; write ``cameras.png``, and ``cameras.json`` of a meaning that fits.
-
-    Raises:
-        InputError: the cameras do not fit as they are.
-    """
+    """Print what was found; write ``cameras.png``, and ``cameras.json`` of a meaning that fits. InputError:
+    the cameras do not fit as they are."""
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
     inputs = {path.resolve() for path in folder.input_files}
@@ -53,7 +50,6 @@ def run(cfg: DictConfig) -> None:
 
 
 def _show(diagnosis: Diagnosis) -> None:
-    """The meanings that were tried, the best first, and what follows."""
     table = Table("meaning", "worst agreement", *diagnosis.ranking[0].shares)
     for hypothesis in diagnosis.ranking[:_LISTED]:
         shares = (f"{share:.0%}" for share in hypothesis.shares.values())
@@ -63,7 +59,6 @@ def _show(diagnosis: Diagnosis) -> None:
 
 
 def _sheet(folder: CaptureFolder, hypothesis: Hypothesis):
-    """The picture of a meaning."""
     views = hypothesis.views
     images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
     return camera_sheet([v.name for v in views], images, hypothesis.silhouettes(folder))

@@ -12,11 +12,8 @@ from ghgs_lit.files import write_text_atomically
 
 
 def run(cfg: DictConfig) -> None:
-    """Print each outcome as soon as it is known; write all, and the machine, to ``selfcheck.md``.
-
-    Raises:
-        InputError: a check failed; the exit status says so.
-    """
+    """Print each outcome as soon as it is known; write all, and the machine, to ``selfcheck.md``. InputError:
+    a check failed; the exit status says so."""
     config = resolve(cfg)
     device = pick_device(config["device"])
     outcomes = []

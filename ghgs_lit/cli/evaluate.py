@@ -1,32 +1,69 @@
 """``ghgs evaluate``: measure a checkpoint, baselines, or both on the same targets."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import lightning.pytorch as L
+import torch
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.inputs import (
+    MODEL_NODES,
     build_data,
+    build_renderer,
     check_size,
     choices,
+    load_model,
     model_of,
     pick_device,
     with_chosen_targets,
     with_trained_data,
 )
-from ghgs_lit.cli.methods import baselines_of, trained_method
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.encoder import FeatureCacheOptions
 from ghgs_lit.errors import InputError, require
+from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
 from ghgs_lit.evaluation.report import measure_and_write
+from ghgs_lit.model import GHGS
+from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.results import METHOD, read_results
+from ghgs_lit.weights.checkpoint import read_checkpoint
+
+
+def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
+    """The model of ``config["checkpoint"]`` on a device, refined as the verb says, and facts about it."""
+    renderer, model = build_renderer(config, device), load_model(config, device)
+    checkpoint = read_checkpoint(config["checkpoint"])
+    facts: dict[str, Any] = {
+        "checkpoint_config": checkpoint["config"],
+        "model_config": {node: config[node] for node in MODEL_NODES if node in config},
+        "parameters": {"total": sum(p.numel() for p in model.parameters())},
+    }
+    if "global_step" in checkpoint:
+        facts["training"] = {"steps": checkpoint["global_step"]}
+    steps, rounds = config.get("refine"), config.get("refine_cameras")
+    refinement = Refinement(steps, renderer) if steps else None
+    cameras = CameraRefinement(rounds, model, renderer) if rounds else None
+    return ModelMethod(model, renderer, refinement, cameras), facts
+
+
+def baselines_of(
+    names: str | Sequence[str], config: Mapping[str, Any], device: torch.device
+) -> dict[str, Method]:
+    """The baselines called ``names``, or ``all``; other arguments as for :func:`trained_method`."""
+    names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
+    renderer = build_renderer(config, device)
+
+    def untrained() -> GHGS:
+        return GHGS.from_config(config).to(device)
+
+    return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}
 
 
 def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:
-    """The methods to measure by name, and facts about them for the results."""
     path = config["checkpoint"]
     if path is None and not config["baselines"]:
         raise InputError("checkpoint: expected a checkpoint or baselines=[...]; found neither")
@@ -37,9 +74,7 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
         model = methods["model"].model
         expected = "1: ghgs evaluate measures each subject by itself (skip=temporal is of ghgs predict)"
         require(model.skip.every == 1, "skip.every", expected, model.skip.every)
-        model.feature_cache = FeatureCacheOptions.read(config["feature_cache"], "feature_cache").build(
-            model.recalibration.tokens
-        )
+        model.feature_cache = FeatureCacheOptions.read(config["feature_cache"], "feature_cache").build()
         facts |= found
     methods |= baselines_of(config["baselines"], config, device)
     return methods, facts

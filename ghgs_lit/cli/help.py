@@ -35,7 +35,6 @@ def defaults_of(verb: str) -> dict[str, str | None]:
 
 
 def _files(group: str, folders: Sequence[Path]) -> list[Path]:
-    """The files of a group's options, also in folders of the user's own."""
     return [path for folder in (conf_dir(), *folders) for path in sorted((folder / group).glob("*.yaml"))]
 
 
@@ -55,11 +54,7 @@ def print_verb(verb: str, summary: str, example: str, folders: Sequence[Path] = 
 
 
 def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
-    """The keys of a group: meaning, default and range of each.
-
-    Raises:
-        InputError: the verb has no such group.
-    """
+    """The keys of a group: meaning, default and range of each. InputError: the verb has no such group."""
     known = [*defaults_of(verb), *(name for name in compose(verb) if name in KINDS)]
     known = list(dict.fromkeys([*known, *(["rounds"] if "model" in known else [])]))
     if group not in known:

@@ -53,11 +53,7 @@ def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
 
 
 def build_renderer(config: Mapping[str, Any], device: torch.device) -> Renderer:
-    """The configured renderer.
-
-    Raises:
-        InputError: it does not run on ``device``.
-    """
+    """The configured renderer. InputError: it does not run on ``device``."""
     renderer = build(config["renderer"], "renderer")
     if (backend := getattr(renderer, "backend", None)) is not None:  # a plug-in's may have none
         resolve_backend(backend, device)
@@ -73,11 +69,8 @@ def load_model(config: Mapping[str, Any], device: torch.device) -> GHGS:
 
 
 def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
-    """Refuse photographs that ``model`` cannot take, before any of them is made or read.
-
-    Raises:
-        InputError: their sides are not divisible by the model's patch.
-    """
+    """Refuse photographs that ``model`` cannot take, before any of them is made or read. InputError: their
+    sides are not divisible by the model's patch."""
     size, multiple = data.dataset.size, side_multiple(model.options, model.encoder.patch_size)
     expected = f"sides divisible by the patch size {multiple} (or model.pad=multiple)"
     require(not any(side % multiple for side in size), "data.size", expected, list(size))
@@ -89,9 +82,7 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
     Keys of it that were said, such as ``data.root=...`` for data that moved, act on it.
 
     A checkpoint of somebody else does not say where this machine writes: ``data.cache_dir`` is the default.
-
-    Raises:
-        InputError: there is no checkpoint, or it was not trained.
+    InputError: there is no checkpoint, or it was not trained.
     """
     if "kind" in (cfg.get("data") or {}):
         return cfg
@@ -114,10 +105,8 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
     """The nodes that describe the model of a checkpoint, with what the command line changes in it.
 
-    Only what was said counts: the options that a verb composes by default describe another model.
-
-    Raises:
-        InputError: the command line changes what the weights were trained for; names the key.
+    Only what was said counts: the options that a verb composes by default describe another model. InputError:
+    the command line changes what the weights were trained for; names the key.
     """
     trained = read_checkpoint(checkpoint)["config"]
     for stage in STAGES:

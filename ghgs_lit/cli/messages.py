@@ -133,11 +133,8 @@ def takes_value(flag: str) -> bool:
 
 
 def flags_first(arguments: Sequence[str]) -> list[str]:
-    """``arguments`` with Hydra's flags before all overrides, between which Hydra allows none.
-
-    Raises:
-        BadUsage: a flag does not exist.
-    """
+    """``arguments`` with Hydra's flags before all overrides, between which Hydra allows none. BadUsage: a
+    flag does not exist."""
     flags, overrides = [], []
     rest: Iterator[str] = iter(arguments)
     for argument in rest:
@@ -159,11 +156,7 @@ def flags_first(arguments: Sequence[str]) -> list[str]:
 
 
 def check_deletions(arguments: Sequence[str]) -> None:
-    """Refuse to delete keys and groups (``~data.size``), which the package reads.
-
-    Raises:
-        InputError: names the key.
-    """
+    """Refuse to delete keys and groups (``~data.size``), which the package reads. InputError: names it."""
     for key in (text[1:].split("=", 1)[0] for text in arguments if text.startswith("~")):
         if key in _LIGHTNING or not is_below(key, _LIGHTNING):
             raise InputError(f"{key}: expected a value (or null where it may be empty); found ~{key}")

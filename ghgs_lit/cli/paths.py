@@ -22,14 +22,7 @@ _READERS = ("evaluate", "predict", "pretext", "train")
 
 def require_paths(verb: str, config: Mapping[str, Any]) -> None:
     """Refuse what is missing, in the words of what reads it later; photographs are decoded from here on.
-
-    Args:
-        verb: whose keys are of the right types.
-        config: plain data.
-
-    Raises:
-        FileNotFoundError, InputError: a file or folder is missing or wrong.
-    """
+    FileNotFoundError, InputError: a file or folder is missing or wrong."""
     for key in _WEIGHTS.get(verb, ()):
         if config[key] is not None:
             require_weights(config[key])

@@ -22,32 +22,23 @@ def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def capture_folder(config: Mapping[str, Any]) -> CaptureFolder:
-    """The folder that ``images``, ``cameras`` and the keys beside them describe.
-
-    Raises:
-        InputError: one of both is missing, or a file is missing or wrong.
-    """
+    """The folder that ``images``, ``cameras`` and the keys beside them describe. InputError: one of both is
+    missing, or a file is missing or wrong."""
     folder = CaptureFolder(**sources_of(config))
     return _BEGUN.pop() if [folder] == _BEGUN else folder
 
 
 def begin_to_read(config: Mapping[str, Any]) -> None:
     """Decode the photographs of the first instant, which the next :func:`capture_folder` then has.
-
-    Raises:
-        InputError: as :func:`capture_folder`.
-    """
+    InputError: as :func:`capture_folder`."""
     _BEGUN[:] = [capture_folder(config)]
     if config["segment"] is None:
         _BEGUN[0].begin(_BEGUN[0].instants[0])
 
 
 def check_cameras(folder: CaptureFolder) -> None:
-    """Print how cameras and masks agree, in a few instants of a sequence, and which contradict.
-
-    Raises:
-        InputError: all contradict, or the only instant cannot be read.
-    """
+    """Print how cameras and masks agree, in a few instants of a sequence, and which contradict. InputError:
+    all contradict, or the only instant cannot be read."""
     from ghgs_lit.prediction.capture.camera_report import diagnose, in_parts
 
     names, found = folder.instants, {}

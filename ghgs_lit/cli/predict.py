@@ -68,17 +68,8 @@ def run(cfg: DictConfig) -> None:
 def subject_batch(
     data: "PhotographsDataModule", subject: str | int, split: str, targets: dict[str, Any] | None
 ) -> Batch:
-    """The photographs of one subject.
-
-    Args:
-        data: the photographs of all subjects.
-        subject: its name, or its number in the split.
-        split: whose subjects are numbered.
-        targets: a protocol whose targets are read too; None: inputs only.
-
-    Raises:
-        InputError: there is no such subject.
-    """
+    """The photographs of one subject. InputError: there is no such subject. ``subject``: its name, or its
+    number in the split. ``targets``: a protocol whose targets are read too; None: inputs only."""
     names = list(data.subjects(split))
     if isinstance(subject, int) and 0 <= subject < len(names):
         subject = names[subject]

@@ -1,4 +1,4 @@
-"""``ghgs prepare``: render people or scans into training data, make a few scans, or check a data set."""
+"""``ghgs prepare``: render people or scans into training data, or check a data set."""
 
 import logging
 from pathlib import Path
@@ -12,7 +12,6 @@ from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis.datasets import Scans
-from ghgs_lit.synthesis.miniature import make_miniature
 
 log = logging.getLogger(__name__)
 
@@ -24,9 +23,6 @@ def run(cfg: DictConfig) -> None:
     if cfg.task == "render":
         render(data)
         announce(root)
-    elif cfg.task == "miniature":
-        miniature = cfg.miniature
-        announce(make_miniature(data.dataset, dict(miniature.people), miniature.size, cfg.seed))
     else:
         check(data, output_dir(), **cfg.check)
 
@@ -42,16 +38,8 @@ def render(data: PhotographsDataModule) -> None:
 
 
 def check(data: PhotographsDataModule, folder: Path, min_iou: float, min_agreement: float) -> None:
-    """Read everything once; print tables, write ``check.json`` and a contact sheet.
-
-    Args:
-        data: the data set with its protocols.
-        folder: where the files are written.
-        min_iou, min_agreement: as for :func:`inspect`.
-
-    Raises:
-        InputError: training cannot start.
-    """
+    """Read everything once; print tables, write ``check.json`` and a contact sheet. InputError: training
+    cannot start."""
     report = inspect(data, min_iou, min_agreement)
     show(report)
     announce(write(report, folder))

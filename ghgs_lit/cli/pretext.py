@@ -20,11 +20,8 @@ from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 
 def run(cfg: DictConfig) -> float | str | None:
-    """The verb: train the branch; returns its part accuracy on validation people.
-
-    Raises:
-        Interrupted: on Ctrl-C and SIGTERM.
-    """
+    """The verb: train the branch; returns its part accuracy on validation people. Interrupted: on Ctrl-C and
+    SIGTERM."""
     return run_job(resolve(cfg), RunDirectory(output_dir()), pretrain)
 
 

@@ -18,11 +18,8 @@ def output_dir() -> Path:
 
 
 def write_config(config: dict[str, Any], directory: Path) -> None:
-    """Write ``directory/config.yaml`` and print its path.
-
-    Raises:
-        InputError: such a file of another program is there.
-    """
+    """Write ``directory/config.yaml`` and print its path. InputError: such a file of another program is
+    there."""
     path = directory / "config.yaml"
     is_free = not path.is_file() or path.read_text(errors="replace").startswith(HEADER)
     require(is_free, str(path), "no file, or the configuration of an earlier run", "another file")

@@ -42,7 +42,6 @@ def run(cfg: DictConfig) -> None:
 
 
 def _replay(path: str) -> None:
-    """Print what is wrong with a saved step; exit code 1 where it still is."""
     step, recorded, fault = replay(path)
     print(f"step {step}, when it was saved: {recorded}")
     print(f"step {step}, now: {fault or 'all values are finite'}")
@@ -51,7 +50,6 @@ def _replay(path: str) -> None:
 
 
 def _print(rows: list[report.Row]) -> None:
-    """The worst error of each stage, by dtype."""
     worst = pd.DataFrame([{**row, "error": report.bounded(row["error"])} for row in report.worst_of(rows)])
     table = pivoted(worst, "stage", "dtype", "error", "{}")
     stages = pd.DataFrame(rows).groupby("stage", sort=False)

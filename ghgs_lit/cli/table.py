@@ -17,7 +17,6 @@ from ghgs_lit.runs.listing import list_runs
 
 
 def _listed(value: Any) -> tuple | None:
-    """A value or a list of values as a tuple; None for null and an empty list."""
     return (value,) if isinstance(value, str | int) else tuple(value or ()) or None
 
 

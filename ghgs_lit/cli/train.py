@@ -89,11 +89,8 @@ def resume_step(config: dict[str, Any], model: nn.Module) -> int | None:
 
 
 def build_trainer(config: dict[str, Any], directory: Path, *further: Callback) -> L.Trainer:
-    """The Trainer with its loggers and callbacks, which all write below ``directory``.
-
-    Raises:
-        InputError: the Trainer refuses its options.
-    """
+    """The Trainer with its loggers and callbacks, which all write below ``directory``. InputError: the
+    Trainer refuses its options."""
     logs = [build(node, f"logger.{name}", save_dir=str(directory)) for name, node in config["logger"].items()]
     callbacks = [*further, *(build(node, f"callbacks.{name}") for name, node in config["callbacks"].items())]
     return build(
@@ -117,10 +114,7 @@ def _environment() -> list[LightningEnvironment]:
 
 def run(cfg: DictConfig) -> float | str | None:
     """The verb: train and measure, in a sweep only what its run still lacks; returns the mean PSNR.
-
-    Raises:
-        Interrupted: on Ctrl-C and SIGTERM.
-    """
+    Interrupted: on Ctrl-C and SIGTERM."""
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
     if config["dry_run"]:
         return print_single_plan(config, run_directory)
@@ -129,11 +123,8 @@ def run(cfg: DictConfig) -> float | str | None:
 
 
 def run_job(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
-    """What ``train`` returns; where it is interrupted, print how to go on.
-
-    Raises:
-        Interrupted: on Ctrl-C and SIGTERM.
-    """
+    """What ``train`` returns; where it is interrupted, print how to go on. Interrupted: on Ctrl-C and
+    SIGTERM."""
     with interruptible():
         try:
             return _run(config, run_directory, train)
@@ -175,8 +166,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     data = build_data(config)
     model = GHGS.from_config(config)
     check_size(data, model)
-    cache = FeatureCacheOptions.read(config.get("feature_cache") or {}, "feature_cache")
-    model.feature_cache = cache.build(model.recalibration.tokens)
+    model.feature_cache = FeatureCacheOptions.read(config.get("feature_cache") or {}, "feature_cache").build()
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")

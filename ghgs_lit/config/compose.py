@@ -34,11 +34,8 @@ def saved_text(config: dict[str, Any]) -> str:
 
 
 def resolve(cfg: DictConfig, verb: str | None = None) -> dict[str, Any]:
-    """A composed configuration as plain data; the groups are checked, and the keys of ``verb``.
-
-    Raises:
-        InputError: a value is missing, or of the wrong type or range.
-    """
+    """A composed configuration as plain data; the groups are checked, and the keys of ``verb``. InputError: a
+    value is missing, or of the wrong type or range."""
     data = own_keys(cfg, verb)
     check(data)
     return data

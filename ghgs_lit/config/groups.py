@@ -15,10 +15,8 @@ from ghgs_lit.errors import InputError
 def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
     """The values of ``<group>/<name>.yaml``, its own defaults included, as plain data.
 
-    Inside a Hydra application its search path counts, which has the user's ``--config-dir`` too.
-
-    Raises:
-        InputError: the group has no such option; names ``key``, or the group.
+    Inside a Hydra application its search path counts, which has the user's ``--config-dir`` too. InputError:
+    the group has no such option; names ``key``, or the group.
     """
     inside = GlobalHydra.instance().is_initialized()
     with nullcontext() if inside else initialize_config_dir(str(conf_dir()), version_base="1.3"):

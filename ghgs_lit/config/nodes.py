@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Side, Text
+from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Text
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]
@@ -75,24 +75,6 @@ class Timing(Options):
 
     repeats: Count = 9
     """Rounds that count; each runs all presets, and each begins with another one."""
-
-
-class Phases(Options):
-    """Numbers of people."""
-
-    train: Index = 4
-    """To train on."""
-    val: Index = 2
-    """To measure on."""
-
-
-class Miniature(Options):
-    """A small data set of built-in people."""
-
-    people: Phases = Phases()
-    """Number of people of each phase."""
-    size: Side = 256
-    """Longer side of the photographs, half that of the textures of scans; pixels."""
 
 
 class Check(Options):

@@ -72,10 +72,8 @@ class Options(BaseModel, metaclass=_Checked):
     """Base of all options: immutable, without unknown fields, without silent conversions.
 
     ``replace`` makes changed options, ``build`` what they describe (the options themselves where they do the
-    work, too). ``group`` is the dotted key under which configurations have them, for messages.
-
-    Raises:
-        InputError: "<key>: expected ...; found ...", for the first wrong value.
+    work, too). ``group`` is the dotted key under which configurations have them, for messages. InputError:
+    "<key>: expected ...; found ...", for the first wrong value.
     """
 
     model_config = ConfigDict(
@@ -100,10 +98,7 @@ class Options(BaseModel, metaclass=_Checked):
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:
         """The options in ``values``, a mapping (or options already); what is missing has its default.
-
-        Raises:
-            InputError: names the first wrong key below ``key``, what was expected and what was found.
-        """
+        InputError: names the first wrong key below ``key``, what was expected and what was found."""
         if isinstance(values, cls):
             return values
         if OmegaConf.is_config(values):
@@ -136,7 +131,6 @@ def _immutable(value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """``value`` as YAML has it."""
     if isinstance(value, tuple):
         return list(map(_plain, value))
     return {key: _plain(item) for key, item in value.items()} if isinstance(value, dict) else value

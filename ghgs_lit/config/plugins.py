@@ -20,11 +20,8 @@ VARIABLE, GROUP = "GHGS_PLUGINS", "ghgs_lit.plugins"
 
 
 def load_plugins() -> None:
-    """Import the modules that the user names, so that they register their kinds.
-
-    Raises:
-        InputError: a file is missing, or another module has its name. Errors inside a module keep their type.
-    """
+    """Import the modules that the user names, so that they register their kinds. InputError: a file is
+    missing, or another module has its name. Errors inside a module keep their type."""
     names = [_module_of(entry) for entry in os.environ.get(VARIABLE, "").split(os.pathsep) if entry.strip()]
     for name in (*names, *_installed()):
         # The command line freezes what is imported while it is off: open files would not be flushed at exit.
@@ -39,11 +36,8 @@ def _installed() -> tuple[str, ...]:
 
 
 def _module_of(entry: str) -> str:
-    """The name of the module; a file becomes importable by its stem.
-
-    Raises:
-        InputError: the file is missing, or another module has its name.
-    """
+    """The name of the module; a file becomes importable by its stem. InputError: the file is missing, or
+    another module has its name."""
     entry = entry.strip()
     if not entry.endswith(".py"):
         return entry

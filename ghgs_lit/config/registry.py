@@ -29,9 +29,15 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
     "encoder": {"vggt": "ghgs_lit.encoder.VGGTOptions"},
     "feature_cache": {None: "ghgs_lit.encoder.FeatureCacheOptions"},
-    "depth_head": {"dpt": "ghgs_lit.heads.depth.DepthHeadOptions"},
+    "depth_head": {
+        "dpt": "ghgs_lit.heads.depth.DepthHeadOptions",
+        "stereo": "ghgs_lit.heads.stereo.StereoHeadOptions",
+    },
     "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
-    "recalibration": {"semantic": "ghgs_lit.recalibration.RecalibrationOptions"},
+    "recalibration": {
+        "none": "ghgs_lit.recalibration.none.NoRecalibrationOptions",
+        "semantic": "ghgs_lit.recalibration.RecalibrationOptions",
+    },
     "gaussian_head": {"dpt": "ghgs_lit.heads.gaussian.GaussianHeadOptions"},
     "rounds": {"recurrent": "ghgs_lit.rounds.RoundsOptions"},
     "skip": {None: "ghgs_lit.skipping.SkipOptions"},
@@ -76,11 +82,8 @@ _REGISTERED: dict[tuple[str, str], type[Options]] = {}
 
 
 def register(group: str, kind: str) -> Callable[[_C], _C]:
-    """Class decorator: configurations may say ``<group>: {kind: <kind>, ...}`` for these options.
-
-    Raises:
-        InputError: there is no such group, or the kind is taken.
-    """
+    """Class decorator: configurations may say ``<group>: {kind: <kind>, ...}`` for these options. InputError:
+    there is no such group, or the kind is taken."""
     if group not in KINDS:
         raise InputError(f"register: expected one of {', '.join(KINDS)}; found {group!r}")
 
@@ -104,11 +107,7 @@ def _import_room(group: str) -> None:
 
 
 def _load(group: str) -> None:
-    """Import what may register kinds of a group.
-
-    Raises:
-        InputError: as :func:`load_plugins`.
-    """
+    """Import what may register kinds of a group. InputError: as :func:`load_plugins`."""
     load_plugins()
     if None not in KINDS[group]:
         _import_room(group)
@@ -122,10 +121,7 @@ def kinds_of(group: str) -> list[str | None]:
 
 def class_of(group: str, kind: Any, key: str) -> type[Options]:
     """The options of a kind of a group (None where its nodes have none); ``key`` is the node's, for messages.
-
-    Raises:
-        InputError: there is no such kind; names those that there are.
-    """
+    InputError: there is no such kind; names those that there are."""
     known = KINDS[group]
     if isinstance(kind, str) and kind not in known:
         _load(group)
@@ -166,11 +162,8 @@ def build(node: Any, key: str, **extra: Any) -> Any:
 
 
 def check(config: Mapping[str, Any]) -> None:
-    """Refuse wrong values of all groups; a node that lacks its kind is refused where it is built.
-
-    Raises:
-        InputError: names the key of the first wrong value, what was expected and what was found.
-    """
+    """Refuse wrong values of all groups; a node that lacks its kind is refused where it is built. InputError:
+    names the key of the first wrong value, what was expected and what was found."""
     for group, node in config.items():
         # A verb whose data is that of a checkpoint has no protocols and data of its own.
         if group not in KINDS or (node is None and group in ("data", "targets")):

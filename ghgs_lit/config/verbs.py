@@ -7,7 +7,6 @@ from pydantic import Field
 from ghgs_lit.config.describe import Words
 from ghgs_lit.config.nodes import (
     Check,
-    Miniature,
     PairedTest,
     PerScene,
     Sequence,
@@ -247,15 +246,13 @@ class Import(Options):
 class Prepare(Options):
     """Make data, or check it."""
 
-    task: Literal["render", "miniature", "check"] = "render"
+    task: Literal["render", "check"] = "render"
     """render: render what is missing. check: read every photograph and camera once, with tables and a
-    contact sheet. miniature: write built-in people as scans of THuman2.0."""
-    miniature: Miniature = Miniature()
-    """Of task=miniature, and of ``scripts/miniature.py``."""
+    contact sheet."""
     check: Check = Check()
     """What task=check expects of data."""
     seed: Seed = 0
-    """Of miniatures, and of the samples that task=check draws."""
+    """Of the samples that task=check draws."""
 
 
 class Stress(Options):
@@ -279,7 +276,7 @@ class Table(Options):
     runs: Annotated[
         Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")
     ]
-    """The directory of a sweep, or a list of directories; sweep=... is the same key."""
+    """The directory of a sweep, or a list of directories."""
     list: bool = False
     """No table, but all runs with their state, their best figure and their overrides."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"

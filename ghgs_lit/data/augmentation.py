@@ -94,12 +94,9 @@ class Augmentation(Options):
         )
 
     def imperfections(self, batch: Batch, rngs: Sequence[np.random.Generator]) -> Batch:
-        """The batch as imperfect captures show it: images in [0, 1], no mask emptied.
-
-        Args:
-            batch: with at least two views.
-            rngs: random numbers of each element. Whether one thing varies changes nothing about another.
-        """
+        """The batch as imperfect captures show it: images in [0, 1], no mask emptied. ``batch``: with at
+        least two views. ``rngs``: random numbers of each element. Whether one thing varies changes nothing
+        about another."""
         streams = [rng.spawn(4) for rng in rngs]
         images, masks, cameras, alpha = batch.images, batch.masks, batch.cameras, batch.alpha
         if self.exposure or self.white_balance:

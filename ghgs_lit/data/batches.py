@@ -18,12 +18,8 @@ from ghgs_lit.types import Batch, Cameras, Targets
 
 @dataclass(frozen=True)
 class BatchBuilder:
-    """Reads the photographs of samples into a :class:`Batch`.
-
-    Attributes:
-        inputs, targets: the photographs at the sizes of both.
-        depths: whether depth maps of the inputs are read, where the data has any.
-    """
+    """Reads the photographs of samples into a :class:`Batch`. ``inputs``, ``targets``: the photographs at the
+    sizes of both. ``depths``: whether depth maps of the inputs are read, where the data has any."""
 
     inputs: Photographs
     targets: Photographs
@@ -139,11 +135,8 @@ class StepSampler(DistributedSampler):
     """The steps of one epoch, counted from the beginning of the run.
 
     Samples are already divided among processes by step. It is a ``DistributedSampler`` because Lightning
-    replaces any other sampler by its own when there are several processes.
-
-    Args:
-        dataset: its length is the number of steps.
-        first_step: gives the first step; called when the epoch starts.
+    replaces any other sampler by its own when there are several processes. ``dataset``: its length is the
+    number of steps. ``first_step``: gives the first step; called when the epoch starts.
     """
 
     def __init__(self, dataset: Dataset, first_step: Callable[[], int]) -> None:

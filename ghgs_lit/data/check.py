@@ -73,7 +73,6 @@ class _Readings(Dataset):
         return seen if fit is not None else replace(seen, silhouette=silhouette(view))
 
     def _problem(self, view: View, seen: Seen) -> str | None:
-        """What is wrong with one photograph, if anything is."""
         if seen.iou is not None and seen.iou < self.min_iou:
             return (
                 f"expected the body in its mask (IoU of {self.min_iou:.2f} or more); found IoU {seen.iou:.2f}"
@@ -174,7 +173,6 @@ def _inspect_phase(
 
 
 def _pictured(reader: Reader) -> set[Photograph]:
-    """The photographs of the contact sheet."""
 
     def some(items: Sequence, count: int) -> list:
         return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).round().astype(int))]
@@ -205,7 +203,6 @@ def _notes(published: int | None, phase: str, reader: Reader, read: Phase) -> li
 
 
 def _cannot_sample(data: PhotographsDataModule, targets: TargetProtocol, training: bool) -> list[str]:
-    """Why the protocols cannot draw their samples from what is there, if they cannot."""
     try:
         if training:
             data.training_sampler(targets)

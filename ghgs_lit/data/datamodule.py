@@ -35,11 +35,7 @@ def trained_batches(trainer: Trainer | None, length: int) -> int:
     """Batches that each process has trained on so far, also after a restart from a checkpoint.
 
     The last step of an epoch takes the batches that are left, fewer than ``accumulate_grad_batches`` where
-    the epoch is no multiple.
-
-    Args:
-        trainer: None outside of training.
-        length: batches of an epoch.
+    the epoch is no multiple. ``trainer``: None outside of training. ``length``: batches of an epoch.
     """
     if trainer is None:
         return 0
@@ -54,16 +50,9 @@ def _protocols(targets: Targets | Sequence[Targets]) -> list[TargetProtocol]:
 
 
 class PhotographsDataModule(LightningDataModule):
-    """Batches of a data set.
-
-    Args:
-        views: :class:`ViewProtocol` or its mapping.
-        targets: :class:`TargetProtocol` or its mapping.
-        augmentation: what varies in training, :class:`Augmentation` or its mapping (None: nothing).
-
-    Raises:
-        InputError: an unknown key or an impossible value; when data is read, files that are missing or bad.
-    """
+    """Batches of a data set. InputError: an unknown key or an impossible value; when data is read, files that
+    are missing or bad. ``augmentation``: what varies in training, :class:`Augmentation` or its mapping (None:
+    nothing)."""
 
     def __init__(
         self,
@@ -152,7 +141,6 @@ class PhotographsDataModule(LightningDataModule):
             views: number of inputs (None: the view protocol's).
             targets: a protocol or its mapping, or several, whose targets a sample has one after another
                 (None: this module's).
-            split: one of the data set's.
             batch_size: samples of a batch (None: this module's).
         """
         protocols = _protocols(self.targets if targets is None else targets)

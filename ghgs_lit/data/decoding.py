@@ -169,15 +169,8 @@ def check_view(place: Path | str, view: View) -> None:
 
 
 def check_center(path: Path, intrinsics: np.ndarray, height: int, width: int) -> None:
-    """Refuse a photograph that was resized after its calibration.
-
-    Args:
-        intrinsics: [3, 3] in pixels of the calibration.
-        height, width: size of the photograph in pixels.
-
-    Raises:
-        InputError: the principal point lies far from the photograph's centre.
-    """
+    """Refuse a photograph that was resized after its calibration. ``intrinsics``: [3, 3] in pixels of the
+    calibration. InputError: the principal point lies far from the photograph's centre."""
     if np.abs(intrinsics[:2, 2] / [width, height] - 0.5).max() > _OFF_CENTRE:
         raise InputError(
             f"{path}: expected a photograph of the calibration's size, its principal point "

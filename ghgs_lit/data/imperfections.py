@@ -32,10 +32,8 @@ def color_gains(
     """What each camera multiplies stored colours by; the geometric mean over the cameras is 1.
 
     Photographs do not tell which camera is right, so that only differences between cameras can be undone.
-
-    Args:
-        exposure: greatest deviation of a camera in stops.
-        white_balance: greatest deviation of red and of blue from green in stops.
+    ``exposure``: greatest deviation of a camera in stops. ``white_balance``: greatest deviation of red and of
+    blue from green in stops.
     """
     deviation = rng.uniform(-1, 1, (views, 3))
     deviation -= deviation.mean(0)
@@ -101,14 +99,8 @@ def miscalibrated(
 
     A camera's error is drawn up to ``pixels``: what the corners of its mask's box move by at the subject's
     distance (root of the mean square). What all cameras share is taken out, as photographs do not tell where
-    a rig is: only differences between cameras can be undone.
-
-    Args:
-        masks: theirs; in place of an empty one counts the whole photograph.
-        pixels: greatest error in pixels.
-
-    Raises:
-        InputError: no point is before all cameras.
+    a rig is: only differences between cameras can be undone. ``masks``: theirs; in place of an empty one
+    counts the whole photograph. InputError: no point is before all cameras.
     """
     count = len(masks)
     directions = torch.from_numpy(rng.standard_normal((count, 6)))
@@ -159,7 +151,6 @@ def _corners(masks: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4 2"]:
 
 
 def _of_each(matrices: Float[Tensor, "V n m"]) -> Float[Tensor, "V 4 n m"]:
-    """A camera's matrix for each of its corners."""
     return matrices[:, None].expand(-1, 4, -1, -1)
 
 

@@ -70,7 +70,8 @@ class Rendered(DataOptions):
 
 
 class Layout(Reader):
-    """Subjects of one phase of a rendered data set.
+    """Subjects of one phase of a rendered data set. InputError: the root or phase is missing, empty, not
+    completely rendered, or lacks one of ``names``.
 
     Args:
         names: the subjects to read (None: all that there are). Those that the folder of the phase lacks are
@@ -78,9 +79,6 @@ class Layout(Reader):
         limit: number of subjects, the first ones (None: all).
         pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
             package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
-
-    Raises:
-        InputError: the root or phase is missing, empty, not completely rendered, or lacks one of ``names``.
     """
 
     def __init__(
@@ -203,7 +201,6 @@ def position_name(name: str, position: int) -> str:
 
 
 def _read_camera(folder: Path, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics [3, 3] and extrinsics [4, 4] in float64."""
     path = folder / f"{view}_intrinsic.npy"
     intrinsics = check_intrinsics(path, read_array(path, [(3, 3)]))
     path = folder / f"{view}_extrinsic.npy"
@@ -211,7 +208,6 @@ def _read_camera(folder: Path, view: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _positions(images: Path) -> dict[str, list[int]]:
-    """Ring positions of each subject that ``images`` has folders of."""
     positions: dict[str, list[int]] = {}
     for entry in images.iterdir() if images.is_dir() else ():
         if match := _POSITION.fullmatch(entry.name):

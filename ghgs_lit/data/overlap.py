@@ -40,13 +40,8 @@ def overlap(vertices: np.ndarray, view: View) -> Overlap | None:
     """Compare the silhouette of a body with a mask.
 
     The silhouette is taken on a coarse grid, where the vertices lie densely enough to be joined without
-    knowing the faces. Parts outside the photograph do not count.
-
-    Args:
-        vertices: [n, 3] in the world, metres.
-
-    Returns:
-        The overlap; None for a body with fewer than :data:`MIN_VERTICES` vertices.
+    knowing the faces. Parts outside the photograph do not count. ``vertices``: [n, 3] in the world, metres.
+    Returns: the overlap; None for a body with fewer than :data:`MIN_VERTICES` vertices.
     """
     if len(vertices) < MIN_VERTICES:
         return None

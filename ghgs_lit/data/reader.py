@@ -28,10 +28,8 @@ class Reader(ABC):
 
     ``subjects`` maps each subject that can be sampled (a person, or one frame of a person) to the positions
     of its cameras. A photograph is identified by (position, view); ``view`` is 0 except on rings that were
-    rendered with further views between their cameras.
-
-    Args:
-        strict: raise the first problem of the data set; if false, collect all of them in ``problems``.
+    rendered with further views between their cameras. ``strict``: raise the first problem of the data set; if
+    false, collect all of them in ``problems``.
     """
 
     def __init__(self, strict: bool = True) -> None:
@@ -41,15 +39,12 @@ class Reader(ABC):
 
     @abstractmethod
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """Read one photograph at its stored size.
+        """Read one photograph at its stored size. InputError: a file is missing or bad.
 
         Args:
             position: number of the camera, or position on the ring.
             view: number of the view at that position.
             depth: whether to read the depth map too, if there is one.
-
-        Raises:
-            InputError: a file is missing or bad.
         """
 
     @abstractmethod
@@ -116,12 +111,9 @@ class FrameReader(Reader):
 
 
 class Photographs:
-    """The photographs of a reader, resized and kept in memory.
-
-    Args:
-        size: (height, width) in pixels; None keeps the stored size.
-        cache_mb: MiB of decoded views and bodies kept in each process; the least recently used go first.
-    """
+    """The photographs of a reader, resized and kept in memory. ``size``: (height, width) in pixels; None
+    keeps the stored size. ``cache_mb``: MiB of decoded views and bodies kept in each process; the least
+    recently used go first."""
 
     def __init__(
         self,

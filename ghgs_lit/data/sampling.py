@@ -174,12 +174,8 @@ CAMERAS = TargetProtocol(name="cameras", view=RING_VIEW, per_subject="all", trai
 
 @dataclass(frozen=True)
 class TrainingSampler:
-    """The endless sequence of training samples.
-
-    Attributes:
-        batch_size: samples of one step in each process.
-        seed: together with the step and the index in the batch, it determines a sample.
-    """
+    """The endless sequence of training samples. ``batch_size``: samples of one step in each process.
+    ``seed``: together with the step and the index in the batch, it determines a sample."""
 
     subjects: Mapping[str, tuple[int, ...]]
     views: ViewProtocol

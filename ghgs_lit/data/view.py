@@ -77,12 +77,10 @@ def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, ext
 def resize_view(view: View, height: int, width: int, resampling: str = "area") -> View:
     """Resize a photograph with its mask and depth map, and scale its intrinsics.
 
-    Args:
-        height, width: the new size in pixels.
-        resampling: ``area`` keeps everything at its place; ``release``, as the authors' code, resizes
-            photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Mattes are resized
-            as photographs, and the mask is where the subject fills half of a pixel or more. Depth is that at
-            the centres of the subject's new pixels in both.
+    ``resampling``: ``area`` keeps everything at its place; ``release``, as the authors' code, resizes
+    photographs by Pillow's bicubic filter and masks by OpenCV's nearest neighbour. Mattes are resized as
+    photographs, and the mask is where the subject fills half of a pixel or more. Depth is that at the centres
+    of the subject's new pixels in both.
     """
     h, w = view.mask.shape
     if (h, w) == (height, width):

@@ -21,12 +21,9 @@ class Aggregator(nn.Module):
     """``depth`` pairs of a frame block and a global block on the patch tokens of ``patch_embed``.
 
     Each view's sequence is [camera, registers, kept patches]. The first view has its own camera and register
-    tokens, so it defines the frame of reference: another first view changes the result; any other
-    permutation of the views only permutes it.
-
-    Args:
-        patch_embed: [n, i, H, W] images and :class:`KeptPatches` to [N, width] tokens of the kept patches.
-        options: of the stage.
+    tokens, so it defines the frame of reference: another first view changes the result; any other permutation
+    of the views only permutes it. ``patch_embed``: [n, i, H, W] images and :class:`KeptPatches` to [N, width]
+    tokens of the kept patches. ``options``: of the stage.
     """
 
     def __init__(self, patch_embed: nn.Module, options: VGGTSettings):
@@ -59,17 +56,10 @@ class Aggregator(nn.Module):
         kept: KeptPatches,
         embed: Callable[[Tensor, KeptPatches], Tensor] | None = None,
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
-        """Tokens of the layers that are read out.
-
-        Args:
-            images: normalised images, [B, V, channels, H, W].
-            kept: the patches that take part; all others are as if they did not exist.
-            embed: gives the patch tokens; None: ``patch_embed``.
-
-        Returns:
-            For each layer in ``layers`` the packed tokens after its frame block and after its global block,
-            special tokens included; and the patch tokens that entered.
-        """
+        """Tokens of the layers that are read out. Returns: For each layer in ``layers`` the packed tokens
+        after its frame block and after its global block, special tokens included; and the patch tokens that
+        entered. ``kept``: the patches that take part; all others are as if they did not exist. ``embed``:
+        gives the patch tokens; None: ``patch_embed``."""
         b, v = images.shape[:2]
         patches = (embed or self.patch_embed)(images.flatten(0, 1), kept)
         special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)

@@ -18,13 +18,8 @@ _ROTATED, _GPU_ROTATED = 1 << 18, 1 << 25
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention inside each of several packed sequences.
-
-    Args:
-        width: channels of a token.
-        heads: number of heads, a divisor of the width.
-        qk_norm: normalise q and k over the channels of each head, before they are rotated.
-    """
+    """Multi-head self-attention inside each of several packed sequences. ``qk_norm``: normalise q and k over
+    the channels of each head, before they are rotated."""
 
     def __init__(self, width: int, heads: int, qk_norm: bool):
         super().__init__()

@@ -82,7 +82,6 @@ def run_block(
     """``block(x)``; no gradient is recorded where neither ``x`` nor the block needs one.
 
     Args:
-        block: the block to run.
         x: tokens of all sequences, one after another.
         lengths: tokens of each sequence; attention stays inside it.
         checkpointing: recompute the block's activations in the backward pass instead of keeping them.

@@ -6,19 +6,17 @@ input, which patches are kept, precision and device. Cameras are not among them:
 
 import dataclasses
 import json
-import pathlib
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ghgs_lit.config.options import Index, Options, Path, Positive
+from ghgs_lit.config.options import Options, Path, Positive
 from ghgs_lit.encoder.encoder import VGGTEncoder
 from ghgs_lit.encoder.feature_files import FeatureFiles, Stored, hashed
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.types import DepthBounds, Tokens
 
 #: Version of the files; raise it when older files must not be read any more.
@@ -35,54 +33,25 @@ class FeatureCacheOptions(Options):
     of: Literal["views", "photographs"] = "views"
     """views: tokens, a file for each ordered choice of views | photographs: what the patch encoder gives for
     each photograph, for any choice of views and blocks of the aggregator that learn"""
-    tokens: Literal["subject", "all"] = "subject"
-    """With of=views: subject, a fifth of the size, slightly different predictions | all: the same ones"""
-    margin: Index = 1
-    """Patches around the subject that are kept, with tokens=subject"""
     dtype: Literal["float32", "float16", "bfloat16"] = "float32"
     """Precision of the files"""
     max_gb: Positive | None = 100
     """Size of all files, 10^9 bytes; beyond it the oldest are deleted; null: no limit"""
 
-    def build(self, recalibrated: str = "subject") -> "FeatureCache | PhotographCache | None":
-        """The cache; None without a directory.
-
-        Args:
-            recalibrated: ``recalibration.tokens`` of the model; with ``all``, all tokens are kept.
-        """
+    def build(self) -> "FeatureCache | PhotographCache | None":
+        """The cache; None without a directory."""
         if self.directory is None:
             return None
-        if self.of == "photographs":
-            return PhotographCache(self.directory, self.dtype, self.max_gb)
-        tokens = "all" if recalibrated == "all" else self.tokens
-        return FeatureCache(self.directory, tokens, self.margin, self.dtype, self.max_gb)
+        kind = PhotographCache if self.of == "photographs" else FeatureCache
+        return kind(self.directory, self.dtype, self.max_gb)
 
 
 class FeatureCache(FeatureFiles):
-    """Keeps the encoder's tokens, one file for each ordered choice of views.
-
-    Args:
-        directory, dtype, max_gb: as of :class:`FeatureFiles`. The tokens come back in the encoder's dtype.
-        tokens: ``subject`` keeps patches with a pixel of the subject and ``margin`` patches around them (the
-            dense heads see zeros elsewhere: a fifth of the size, slightly different predictions);
-            ``all`` keeps every patch: the same predictions as without a cache.
-        margin: patches around the subject that are kept.
-    """
-
-    def __init__(
-        self,
-        directory: str | pathlib.Path,
-        tokens: str = "subject",
-        margin: int = 1,
-        dtype: str = "float32",
-        max_gb: float | None = None,
-    ):
-        super().__init__(directory, dtype, max_gb)
-        self.tokens, self.margin = tokens, margin
+    """Keeps the encoder's tokens, one file for each ordered choice of views; they come back in its dtype."""
 
     @property
     def content(self) -> str:
-        return "all tokens" if self.tokens == "all" else f"tokens of the subject and {self.margin} around it"
+        return "tokens"
 
     def __call__(
         self,
@@ -108,9 +77,7 @@ class FeatureCache(FeatureFiles):
     def _made(
         self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
     ) -> Stored:
-        """The tensors and the metadata of a file."""
         tokens = encoder.encode(images, masks, bounds, kept)
-        tokens = tokens if self.tokens == "all" else _around_subject(tokens, masks, self.margin)
         layers = {f"latent_{i}": layer for i, layer in enumerate(tokens.latent)}
         tensors, facts = self.in_files_dtype(layers | {"semantic": tokens.semantic})
         places = {name: getattr(tokens, name).to("cpu", torch.int32).contiguous() for name in PLACE}
@@ -123,11 +90,9 @@ class FeatureCache(FeatureFiles):
     def _key(
         self, encoder: VGGTEncoder, images: Tensor, masks: Tensor, bounds: DepthBounds | None, kept: Tensor
     ) -> str:
-        stored = [self.tokens, self.margin if self.tokens == "subject" else 0, self.dtype]
-        facts = [LAYOUT, encoder.options.facts, self.fingerprint(encoder), stored, *_precision(images)]
+        facts = [LAYOUT, encoder.options.facts, self.fingerprint(encoder), self.dtype, *_precision(images)]
         inputs = [images, kept]
-        reads_masks = encoder.mask_input or encoder.bounds_input or encoder.semantic is not None
-        if reads_masks or self.tokens == "subject":
+        if encoder.mask_input or encoder.bounds_input or encoder.semantic is not None:
             inputs.append(masks)
         if encoder.bounds_input and bounds is not None:
             inputs += [bounds.near, bounds.far]
@@ -180,15 +145,8 @@ def _require_frozen(module: nn.Module, expected: str) -> None:
 
 
 def _precision(images: Tensor) -> tuple[str, str | bool]:
-    """Device and autocast of a forward pass."""
     device = images.device.type
     return device, torch.is_autocast_enabled(device) and str(torch.get_autocast_dtype(device))
-
-
-def _around_subject(tokens: Tokens, masks: Tensor, margin: int) -> Tokens:
-    """Tokens of patches with a pixel of the subject and of ``margin`` patches around them."""
-    kept = patches_around_subject(masks, tokens.patch_size, margin).flatten(0, 1)
-    return tokens.select(kept[tokens.image, tokens.row, tokens.column])
 
 
 def _packed(parts: list[Tokens]) -> Tokens:

@@ -30,7 +30,6 @@ class VGGTEncoder(nn.Module):
     """VGGT of any size: ``vggt_1b`` takes the published weights, smaller ones train from scratch.
 
     Args:
-        options: of the stage.
         tokens: ``all``, or patches of the background leave before the first block: ``window`` keeps those of
             the smallest rectangle that holds the subject, ``subject`` those with a pixel of the subject. They
             keep their place in the photograph; a view with an empty mask keeps its special tokens only.

@@ -36,7 +36,7 @@ class FeatureFiles:
         self.limit = None if max_gb is None else int(1e9 * max_gb)
         self.hits = self.made = self.written = self.deleted = 0
         # Bytes of all files: other runs may write too, so it is counted again before anything is deleted.
-        self._bytes = 0 if self.limit is None else sum(_size(file) for file in self._files())
+        self._bytes = 0 if self.limit is None else _bytes(self._files())
         self._versions: list = []
         self._hash = ""
 
@@ -48,7 +48,7 @@ class FeatureFiles:
     def report(self) -> str:
         """One line: how much was found and made, and the size of the cache."""
         files = self._files()
-        size = sum(map(_size, files))
+        size = _bytes(files)
         return (
             f"feature cache {self.directory}: {self.hits} found, {self.made} made"
             f" ({self.written / 1e6:.1f} MB; {self.content}, {self.dtype});"
@@ -95,12 +95,12 @@ class FeatureFiles:
 
     def _delete_oldest(self, newest: Path) -> None:
         """Delete the files that were written first, until a tenth of the limit is free; keep ``newest``."""
-        files = sorted((file for file in self._files() if file != newest), key=_written)
-        self._bytes = _size(newest) + sum(map(_size, files))
+        files = sorted((file for file in self._files() if file != newest), key=_stat)
+        self._bytes = _bytes([newest, *files])
         for file in files:
             if self._bytes <= 0.9 * self.limit:
                 break
-            self._bytes -= _size(file)
+            self._bytes -= _bytes([file])
             file.unlink(missing_ok=True)
             self.deleted += 1
 
@@ -114,20 +114,17 @@ def hashed(facts: Any, tensors: Sequence[Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _size(file: Path) -> int:
-    """Bytes of a file; 0 where another run has deleted it."""
+def _stat(file: Path) -> tuple[float, int]:
+    """When a file was written, and its bytes; 0 where another run has deleted it."""
     try:
-        return file.stat().st_size
+        found = file.stat()
     except FileNotFoundError:
-        return 0
+        return 0.0, 0
+    return found.st_mtime, found.st_size
 
 
-def _written(file: Path) -> float:
-    """When a file was written; 0 where another run has deleted it."""
-    try:
-        return file.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0
+def _bytes(files: Sequence[Path]) -> int:
+    return sum(_stat(file)[1] for file in files)
 
 
 def _read(path: Path) -> Stored | None:
@@ -143,6 +140,5 @@ def _read(path: Path) -> Stored | None:
 
 
 def _write(path: Path, tensors: dict[str, Tensor], facts: dict[str, str]) -> int:
-    """Write a file; returns its bytes."""
     write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata=facts))
     return path.stat().st_size

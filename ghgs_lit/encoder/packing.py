@@ -15,11 +15,8 @@ class KeptPatches:
 
     Packed tokens [T, C] are the sequences of all images, one after another: the special tokens of an image
     (class, camera or registers), then its kept patches, row by row. An image without a kept patch has its
-    special tokens only.
-
-    Args:
-        kept: which patches take part; it may be on the CPU where the tokens are not.
-        device: of the tokens.
+    special tokens only. ``kept``: which patches take part; it may be on the CPU where the tokens are not.
+    ``device``: of the tokens.
     """
 
     def __init__(self, kept: Bool[Tensor, "b v h w"], device: torch.device):
@@ -52,15 +49,8 @@ class KeptPatches:
         return flat if len(flat) == len(self.index) else flat[self.index]
 
     def join(self, special: Tensor, patches: Tensor) -> Tensor:
-        """Packed tokens.
-
-        Args:
-            special: of every image, [B * V, s, C].
-            patches: the kept ones, [N, C].
-
-        Returns:
-            [B * V * s + N, C], in the wider precision of both.
-        """
+        """Packed tokens. ``special``: of every image, [B * V, s, C]. Returns: [B * V * s + N, C], in the
+        wider precision of both."""
         images, count, width = special.shape
         number = torch.arange(images, device=patches.device)
         before = number * count + torch.searchsorted(self.image, number)

@@ -38,13 +38,8 @@ class ConvStem(nn.Module):
     """Overlapping convolutions: with them a small encoder learns edges and the silhouette much sooner.
 
     The image is halved while the patch size is even; one strided convolution does the odd remainder; a last
-    convolution mixes neighbouring patches.
-
-    Args:
-        in_channels: channels of the image.
-        width: channels of a token.
-        patch_size: side of a patch in pixels.
-        channels: channels after the first convolution; doubled at each halving, up to ``width``.
+    convolution mixes neighbouring patches. ``channels``: channels after the first convolution; doubled at
+    each halving, up to ``width``.
     """
 
     def __init__(self, in_channels: int, width: int, patch_size: int, channels: int):

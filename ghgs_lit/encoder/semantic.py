@@ -54,13 +54,10 @@ class SemanticBranch(nn.Module):
     consistency (Eq. 4), is then the overlap of two distributions (Bhattacharyya's coefficient): 1 where they
     are equal, 0 where no part is shared.
 
-    Attention is inside a view, among a learned token and the patches with a pixel of the subject. All
-    choices of ``skip.tokens`` keep these, so features are those of the photograph and its mask, whatever
-    is kept beside them and whichever views there are.
-
-    Args:
-        options: of the branch.
-        patch_size: side of a patch in pixels.
+    Attention is inside a view, among a learned token and the patches with a pixel of the subject. All choices
+    of ``skip.tokens`` keep these, so features are those of the photograph and its mask, whatever is kept
+    beside them and whichever views there are. ``options``: of the branch. ``patch_size``: side of a patch in
+    pixels.
     """
 
     def __init__(self, options: SemanticOptions, patch_size: int):
@@ -84,12 +81,7 @@ class SemanticBranch(nn.Module):
         self, images: Float[Tensor, "b v c H W"], masks: Bool[Tensor, "b v H W"], kept: KeptPatches
     ) -> Float[Tensor, "N p"]:
         """Logarithms of the shares of the parts in ``kept``, patches of :meth:`subject`; float32 or wider.
-
-        Args:
-            images: RGB in [0, 1].
-            masks: of the subject.
-            kept: all patches of the subject, unless a caller wants fewer.
-        """
+        ``kept``: all patches of the subject, unless a caller wants fewer."""
         x = torch.cat((images, masks[:, :, None].to(images.dtype)), dim=2).flatten(0, 1)
         patches = self.stem((2 * x - 1).to(self.token.dtype), kept)
         x = kept.join(self.token.to(patches.dtype).expand(masks.shape[0] * masks.shape[1], -1, -1), patches)

@@ -18,11 +18,6 @@ class VisionTransformer(nn.Module):
     """DINOv2 ViT; tokens of an image are in the order class, registers, kept patches.
 
     Args:
-        in_channels: channels of the image.
-        width: channels of a token.
-        depth: number of blocks.
-        heads: attention heads of each block.
-        patch_size: side of a patch in pixels.
         image_size: side in pixels of the square image whose position embedding is stored, a multiple of
             ``patch_size``; for other sizes it is resampled.
         checkpointing: recompute activations in the backward pass instead of keeping them.

@@ -150,7 +150,6 @@ def measure(
     """Measure one method; the targets of all protocols come from one prediction.
 
     Args:
-        loader: batches with targets and their protocols.
         pictures: folder for pictures (None: none are written).
         picture_count: the number of subjects, the first ones, that are drawn.
         flickers: compares people in motion with the instant before (None: nothing does).

@@ -38,16 +38,13 @@ def measure_and_write(
 ) -> Path:
     """Measure methods as configured; print the means and write the results.
 
-    What :func:`ghgs_lit.evaluation.check.check_evaluation` checks is not checked again.
+    What :func:`ghgs_lit.evaluation.check.check_evaluation` checks is not checked again. Returns: the path of
+    ``metrics.json``.
 
     Args:
         config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used, and the
             model's where one is measured).
         directory: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
-        facts: further entries of the provenance.
-
-    Returns:
-        The path of ``metrics.json``.
     """
     evaluation = config["evaluation"]
     targets = target_protocols(config)

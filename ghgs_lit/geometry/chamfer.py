@@ -66,15 +66,13 @@ def chamfer(
     points: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"], limit: int | None = None
 ) -> Float[Tensor, ""]:
     """Mean squared distance from each point to its nearest reference, plus the mean the other way round.
+    Returns: 0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
 
     Args:
         points: the prediction, in metres.
         references: the surface, in metres.
         limit: points of each set that are matched at most (to all of the other set, so that the mean stays
             unbiased); None: all.
-
-    Returns:
-        0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
     """
     points, references = at_least_float32(points), at_least_float32(references)
     if not (torch.isfinite(points).all() and torch.isfinite(references).all()):

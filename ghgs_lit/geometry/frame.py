@@ -78,13 +78,8 @@ class Frame:
         return dataclasses.replace(world, intrinsics=intrinsics, extrinsics=extrinsics.to(world.extrinsics))
 
     def leave(self, prediction: Prediction, dtype: torch.dtype) -> Prediction:
-        """A prediction in the frame as one in the world.
-
-        Args:
-            prediction: of the stages.
-            dtype: of points in the world, where they may need more digits than in the frame: that of its
-                cameras.
-        """
+        """A prediction in the frame as one in the world. ``prediction``: of the stages. ``dtype``: of points
+        in the world, where they may need more digits than in the frame: that of its cameras."""
         dtype = torch.promote_types(dtype, torch.float32)
         views, points = prediction.depth.shape[1], prediction.points
         everyone = torch.arange(len(self.metre), device=points.pixels.device)[:, None, None, None]

@@ -19,12 +19,7 @@ def patches_around_subject(
     masks: Bool[Tensor, "b v H W"], patch_size: int, margin: int
 ) -> Bool[Tensor, "b v h w"]:
     """Patches with a pixel of the subject, and those at most ``margin`` rows and columns from one of them.
-
-    Args:
-        masks: of the photographs; sides are multiples of the patch size.
-        patch_size: in pixels.
-        margin: in patches.
-    """
+    ``masks``: of the photographs; sides are multiples of the patch size."""
     return _grown(F.max_pool2d(masks.float(), patch_size), margin)
 
 

@@ -15,12 +15,8 @@ from ghgs_lit.types import Batch
 
 
 def with_matte(batch: Batch, least: float | None) -> Batch:
-    """The batch whose masks hold all pixels that show more of the subject than ``least``.
-
-    Args:
-        batch: as it is where it has no matte.
-        least: a share; None: the batch without its matte.
-    """
+    """The batch whose masks hold all pixels that show more of the subject than ``least``. ``batch``: as it is
+    where it has no matte. ``least``: a share; None: the batch without its matte."""
     if batch.alpha is None:
         return batch
     if least is None:

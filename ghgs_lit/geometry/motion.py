@@ -21,11 +21,8 @@ def without_common(
     """Motions without their mean, and without what they share along the optical axes.
 
     The mean of the shifts is the one that photographs show least of once it is taken out: least squares of
-    what is across the optical axes.
-
-    Args:
-        motions: rotation vectors of points, and shifts, in the world's axes.
-        axes: optical axes of the cameras.
+    what is across the optical axes. ``motions``: rotation vectors of points, and shifts, in the world's axes.
+    ``axes``: optical axes of the cameras.
     """
     turn, shift = motions.split(3, -1)
     turn = turn - turn.mean(-2, keepdim=True)

@@ -97,14 +97,8 @@ def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> Dep
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:
     """The smallest border that makes both sides multiples; an odd pixel goes below and to the right.
 
-    512 becomes 518 with 3 pixels on each side, as in the authors' release.
-
-    Args:
-        masks: only their size is read.
-        multiple: the patch size in pixels.
-
-    Returns:
-        None where both sides are multiples already.
+    512 becomes 518 with 3 pixels on each side, as in the authors' release. Returns: None where both sides are
+    multiples already.
     """
     height, width = masks.shape[2:]
     missing = (-height % multiple, -width % multiple)

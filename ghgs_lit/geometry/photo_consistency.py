@@ -31,14 +31,12 @@ WIDEST = -0.6
 @torch.no_grad()
 def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
     """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient.
+    Returns: 0 outside the subject, and where no other view has the point inside its mask.
 
     Args:
         batch: images, masks and cameras are read.
         bounds: near and far of each pixel, in metres.
         steps: S, how many depths are compared: the middles of S equal parts of near to far.
-
-    Returns:
-        0 outside the subject, and where no other view has the point inside its mask.
     """
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     found = consistency_of(batch, batch.pixels, near, far, steps)
@@ -50,14 +48,8 @@ def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Te
 def consistency_of(
     batch: Batch, pixels: Int[Tensor, " N"], near: Float[Tensor, " N"], far: Float[Tensor, " N"], steps: int
 ) -> Float[Tensor, "N S"]:
-    """:func:`photo_consistency` of some pixels.
-
-    Args:
-        batch: as there.
-        pixels: of the subject: indices among those of all images, in ascending order.
-        near, far: of these, in metres.
-        steps: as there.
-    """
+    """:func:`photo_consistency` of some pixels. ``pixels``: of the subject: indices among those of all
+    images, in ascending order. ``near``, ``far``: of these, in metres."""
     near, far = at_least_float32(near), at_least_float32(far)
     shares = (torch.arange(steps, device=near.device, dtype=near.dtype) + 0.5) / steps
     # All of it: half a pixel in bfloat16 is a different colour.
@@ -109,9 +101,7 @@ def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tens
     """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W].
 
     Args:
-        images: colours and masks.
         image: [n, o], the o others that each pixel is compared with.
-        own: of the pixels.
         rays, shift: [n, o, 3], of the pixels in the others.
         depth: [n, S].
     """

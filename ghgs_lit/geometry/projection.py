@@ -16,12 +16,8 @@ def at_least_float32(tensor: Tensor) -> Tensor:
 
 
 def pixel_centers(height: int, width: int, like: Tensor) -> Float[Tensor, "h w 2"]:
-    """Centres ``(u, v)`` of the pixels of an image.
-
-    Args:
-        height, width: of the image in pixels.
-        like: gives device and dtype.
-    """
+    """Centres ``(u, v)`` of the pixels of an image. ``height``, ``width``: of the image in pixels. ``like``:
+    gives device and dtype."""
     rows, columns = (
         torch.arange(side, device=like.device, dtype=like.dtype) + 0.5 for side in (height, width)
     )

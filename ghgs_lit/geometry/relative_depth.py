@@ -22,16 +22,9 @@ def subject_mean(
 
 
 def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Float[Tensor, "B V 2 H W"]:
-    """The bounds as two maps: what masks and cameras say about the shape, not about the distance.
-
-    Args:
-        bounds: near and far in metres.
-        masks: of the subject.
-
-    Returns:
-        ``near`` minus the mean middle of the view's bounds, and ``far - near``, in units of :data:`UNIT`;
-        0 outside the subject.
-    """
+    """The bounds as two maps: what masks and cameras say about the shape, not about the distance. ``bounds``:
+    near and far in metres. Returns: ``near`` minus the mean middle of the view's bounds, and ``far - near``,
+    in units of :data:`UNIT`; 0 outside the subject."""
     middle = subject_mean((bounds.near + bounds.far) / 2, masks)
     maps = torch.stack((bounds.near - middle, bounds.far - bounds.near), dim=2) / UNIT
     return torch.where(masks[:, :, None], maps, 0)
@@ -40,11 +33,7 @@ def relative_bounds(bounds: DepthBounds, masks: Bool[Tensor, "B V H W"]) -> Floa
 def relative_depth(
     depth: Float[Tensor, "B V H W"], masks: Bool[Tensor, "B V H W"]
 ) -> Float[Tensor, "B V 1 H W"]:
-    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient.
-
-    Args:
-        depth: in metres.
-        masks: of the subject; the map is 0 outside.
-    """
+    """Depth minus its mean over the view's subject, in units of :data:`UNIT`, without a gradient. ``depth``:
+    in metres. ``masks``: of the subject; the map is 0 outside."""
     depth = depth.detach()
     return torch.where(masks, (depth - subject_mean(depth, masks)) / UNIT, 0)[:, :, None]

@@ -115,7 +115,6 @@ class HullSearch:
         """Whether the rays of a silhouette meet the hull of ``others`` [n] bool.
 
         Args:
-            one: the silhouette.
             cells: [n, 2] (column, row), through which the rays pass.
             others: that a point of the hull is covered by, but for a share of :attr:`wrong`.
             focus, radius: of :func:`subject_sphere`.

@@ -14,16 +14,13 @@ _STEP = 8
 def undistorting_grid(
     intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int, fisheye: bool = False
 ) -> torch.Tensor:
-    """Where each pixel of the undistorted image lies in the photograph.
+    """Where each pixel of the undistorted image lies in the photograph. Returns: [1, h, w, 2] float32 for
+    ``grid_sample`` with ``align_corners=False``.
 
     Args:
         intrinsics: [3, 3] in pixels, pixel centres at +0.5; the undistorted image keeps them.
         distortion: k1 k2 p1 p2 and up to ten more of OpenCV's model.
-        height, width: size of the photograph in pixels.
         fisheye: ``distortion`` is k1 to k4 of the model of Kannala and Brandt.
-
-    Returns:
-        [1, h, w, 2] float32 for ``grid_sample`` with ``align_corners=False``.
     """
     # Here: kornia takes longer to import than photographs without distortion take to be read.
     from kornia.geometry.calibration import distort_points
@@ -49,13 +46,8 @@ def undistorting_grid(
 
 
 def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Resample bilinearly; black and empty outside the photograph.
-
-    Args:
-        image: [h, w, 3] uint8.
-        matte: [h, w] uint8; of a mask 0 and 255.
-        grid: from :func:`undistorting_grid`.
-    """
+    """Resample bilinearly; black and empty outside the photograph. ``matte``: [h, w] uint8; of a mask 0 and
+    255."""
     layers = np.concatenate((image, matte[..., None]), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()
     sampled = F.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)

@@ -9,11 +9,9 @@ from ghgs_lit.geometry.projection import at_least_float32
 def unit(x: Float[Tensor, "*n c"], least: float = 0.0) -> Float[Tensor, "*n c"]:
     """``x`` divided by its length, float32 or wider; 0 stays 0, with a zero gradient.
 
-    Scaled by its largest component first: squares of 1e-20 vanish in float32, those of 1e20 overflow.
-
-    Args:
-        x: vectors of any length.
-        least: the gradient of a shorter vector, which grows as 1 / length, is that at this length.
+    Scaled by its largest component first: squares of 1e-20 vanish in float32, those of 1e20 overflow. ``x``:
+    vectors of any length. ``least``: the gradient of a shorter vector, which grows as 1 / length, is that at
+    this length.
     """
     x = at_least_float32(x)
     largest = x.detach().abs().amax(-1, keepdim=True)

@@ -41,8 +41,6 @@ def decode(
     another, each in a window of its own, to save memory and work.
 
     Args:
-        dpt: the dense head.
-        tokens: of all images.
         guide: of all images, for a head with a guide.
         windows: of each image; None: all of every image. An image without a window is left out; where none
             has one, a single pixel is decoded: there is always a part, through which gradients of 0 flow.

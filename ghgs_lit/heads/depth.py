@@ -87,12 +87,8 @@ class DepthHeadOptions(Options):
 
 
 class DepthHead(nn.Module):
-    """Depth and confidence of each pixel from the four layers of tokens, by a dense head.
-
-    Args:
-        options: of the head.
-        dim_latent: width of the tokens (from the encoder).
-    """
+    """Depth and confidence of each pixel from the four layers of tokens, by a dense head. ``options``: of the
+    head. ``dim_latent``: width of the tokens (from the encoder)."""
 
     def __init__(self, options: DepthHeadOptions, dim_latent: int):
         super().__init__()
@@ -112,16 +108,13 @@ class DepthHead(nn.Module):
     def forward(
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels = "all"
     ) -> DepthMaps:
-        """Depths of all pixels; those of the subject are valid.
+        """Depths of all pixels; those of the subject are valid. Returns: Values that are not finite are
+        replaced by 1 m and are not valid.
 
         Args:
-            tokens: from the encoder.
             batch: images, masks and cameras are read.
             bounds: None where :attr:`is_bounded` is false.
             pixels: ``subject``: only windows around the subject are decoded; other depths have no meaning.
-
-        Returns:
-            Values that are not finite are replaced by 1 m and are not valid.
         """
         guide = None
         if self.dpt.guide is not None:

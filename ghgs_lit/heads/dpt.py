@@ -154,7 +154,6 @@ class DPTHead(nn.Module):
     Args:
         dim_latent: width of a token of ``Tokens.latent``.
         output_dim: channels of the result; activations are the caller's.
-        rectified_skip: of the residual units.
         guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
             sharp; 0: none, as published.
         widths: in place of :func:`published_widths`.
@@ -192,12 +191,8 @@ class DPTHead(nn.Module):
         window: Window | None = None,
     ) -> Float[Tensor, "bv o h w"]:
         """Raw maps of all images, float32 or wider; under float16 autocast all of it is computed in float32.
-
-        Args:
-            tokens: of four layers.
-            guide: where ``guide_channels`` is not 0; of whole images.
-            window: the part of the maps that is computed; None: all.
-        """
+        ``guide``: where ``guide_channels`` is not 0; of whole images. ``window``: the part of the maps that
+        is computed; None: all."""
         require(len(tokens.latent) == LEVELS, "tokens.latent", "four layers", len(tokens.latent))
         with without_float16(tokens.semantic.device.type):
             return self._maps(tokens, guide, window)
@@ -260,12 +255,8 @@ class DPTHead(nn.Module):
         return [Window(Span(rows.start + p.start, rows.start + p.stop, rows.full), columns) for p in parts]
 
     def windows(self, result: Window, grid: tuple[int, int]) -> Windows:
-        """Windows of each level that a window of the result depends on, from fine to coarse.
-
-        Args:
-            result: the window.
-            grid: rows and columns of patches.
-        """
+        """Windows of each level that a window of the result depends on, from fine to coarse. ``result``: the
+        window. ``grid``: rows and columns of patches."""
         s = self.scratch
         full = result.grown(reach(s.output_conv2))
         fused = full.sources(_times(2 * CELLS[0], grid)).grown(reach(s.output_conv1))
@@ -286,7 +277,6 @@ class DPTHead(nn.Module):
         return Windows(result, full, fused, tuple(levels))
 
     def _level(self, i: int, tokens: Tokens, place: LevelWindows) -> Float[Tensor, "bv c h w"]:
-        """The level's map."""
         aspect = tokens.grid[3] / tokens.grid[2]
         if tokens.is_dense:  # then the tokens outside the window can be left out without a copy
             b, v, *grid = tokens.grid

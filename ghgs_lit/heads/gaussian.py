@@ -239,10 +239,7 @@ class GaussianHead(nn.Module):
 
     Colours are the input pixels', unless ``color_limit`` lets them change. Published names of the networks:
     ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, with linear layers 0, 2 and 4.
-
-    Args:
-        options: of the head.
-        dim_latent: width of the tokens (from the encoder).
+    ``options``: of the head. ``dim_latent``: width of the tokens (from the encoder).
     """
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):
@@ -280,10 +277,7 @@ class GaussianHead(nn.Module):
         """Raw attributes of the valid pixels in the order of element, view, row, column.
 
         Args:
-            tokens: recalibrated.
             batch: images, masks and cameras are read.
-            points: of the pixels.
-            depth_maps: of the same pixels.
             pixels: ``subject`` decodes windows around the subject and runs the networks on its pixels,
                 ``all`` computes every pixel and selects afterwards; the result is the same.
         """
@@ -316,7 +310,6 @@ class GaussianHead(nn.Module):
     def _activated(
         self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Means, quaternions, scales, opacities and colours."""
         image, pixel = raw.image, raw.pixel
         focal = (
             at_least_float32(batch.cameras.intrinsics)

@@ -33,10 +33,7 @@ class GuidePyramid(nn.Module):
     """A guide at full, half and quarter resolution, by three convolutions.
 
     The maps have ``features / 2``, ``features`` and ``features`` channels and are added to a dense head's.
-
-    Args:
-        channels: of the guide.
-        features: of the dense head.
+    ``channels``: of the guide. ``features``: of the dense head.
     """
 
     def __init__(self, channels: int, features: int):
@@ -47,11 +44,7 @@ class GuidePyramid(nn.Module):
 
     def forward(self, guide: Guide, targets: tuple[Window, Window, Window]) -> list[Float[Tensor, "n o h w"]]:
         """Maps to add to the head's: at full resolution, and at half and quarter resolution, resized.
-
-        Args:
-            guide: of whole images.
-            targets: windows of the head's maps.
-        """
+        ``guide``: of whole images. ``targets``: windows of the head's maps."""
         whole = Window.whole(tuple(guide[0].shape[2:]))
         size = whole.full
         sizes = [whole.coarser(factor).full for factor in (1, 2, 4)]

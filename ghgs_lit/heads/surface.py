@@ -26,11 +26,7 @@ def surface_axes(
     The third axis is the normal, away from the camera; the others are the camera's right and down, turned by
     the smallest rotation that brings its forward axis there. Normals come from differences of the depths of
     neighbouring valid pixels on the same surface; an axis of the image along which there is none is level.
-
-    Args:
-        maps: depths of the images.
-        cameras: of the images.
-        image, pixel: numbers of the images (``b * V + v``) and row-major indices of their pixels.
+    ``image``, ``pixel``: numbers of the images (``b * V + v``) and row-major indices of their pixels.
     """
     height, width = maps.depth.shape[-2:]
     depth = at_least_float32(maps.depth)

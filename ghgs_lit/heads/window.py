@@ -126,12 +126,8 @@ def _sources(
 
 
 def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Window | None]:
-    """The smallest window that holds the mask of each image; None for an empty one.
-
-    Args:
-        extents: of the masks.
-        size: height and width of the images.
-    """
+    """The smallest window that holds the mask of each image; None for an empty one. ``extents``: of the
+    masks. ``size``: height and width of the images."""
     height, width = size
     return [
         Window(Span(top, bottom, height), Span(left, right, width)) if count else None

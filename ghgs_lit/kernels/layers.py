@@ -38,11 +38,8 @@ def parameters(layers: Sequence[nn.Module]) -> list[nn.Parameter]:
 def packed(numbers: Sequence[Tensor], transposed: bool = False) -> np.ndarray:
     """Layers one after another, as one flat array.
 
-    Of each the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases.
-
-    Args:
-        numbers: weight and bias of each.
-        transposed: pack the transposed weights; their biases are zeros.
+    Of each the weights in tiles of ``ROWS`` outputs, each [inputs, ROWS], then the biases. ``numbers``:
+    weight and bias of each. ``transposed``: pack the transposed weights; their biases are zeros.
     """
     found = []
     for weight, bias in _pairs(numbers):
@@ -60,16 +57,9 @@ def _pairs(numbers: Sequence) -> list[tuple]:
 
 
 class Sums:
-    """Sums of the gradients of layers, of each task of a kernel.
-
-    Args:
-        numbers: weight and bias of each layer.
-        tasks: how many add them up.
-
-    Attributes:
-        places: of each layer, where its packed weights begin, its transposed ones, and its sums.
-        of_task: the sums of each task, as :func:`learn` adds them up.
-    """
+    """Sums of the gradients of layers, of each task of a kernel. ``places``: of each layer, where its packed
+    weights begin, its transposed ones, and its sums. ``of_task``: the sums of each task, as :func:`learn`
+    adds them up."""
 
     def __init__(self, numbers: Sequence[Tensor], tasks: int):
         self._shapes = [tuple(weight.shape) for weight, _ in _pairs(numbers)]

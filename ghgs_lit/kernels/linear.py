@@ -39,16 +39,7 @@ def prefers_onednn(x: Tensor, weight: Tensor) -> bool:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``x @ weight.T + bias``.
-
-    Args:
-        x: [..., k].
-        weight: [n, k].
-        bias: [n], or None for no bias.
-
-    Returns:
-        [..., n].
-    """
+    """``x @ weight.T + bias``. Returns: [..., n]."""
     if not prefers_onednn(x, weight):
         return F.linear(x, weight, bias)
     k, product = x.shape[-1], _convolve if torch.is_grad_enabled() else _multiply

@@ -4,12 +4,8 @@ import torch
 
 
 def at_once(device: torch.device, cpu: int, gpu: int) -> int:
-    """How much is worked on at once: a CPU wants parts as large as its cache, a GPU few calls.
-
-    Args:
-        device: where the work is done.
-        cpu, gpu: the limits.
-    """
+    """How much is worked on at once: a CPU wants parts as large as its cache, a GPU few calls. ``device``:
+    where the work is done. ``cpu``, ``gpu``: the limits."""
     return cpu if device.type == "cpu" else gpu
 
 

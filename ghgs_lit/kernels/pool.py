@@ -62,12 +62,9 @@ def multiplies(*tensors: Tensor) -> bool:
 
 
 def run(tasks: list, work: int) -> None:
-    """Call every task, on at most ``torch.get_num_threads()`` threads including the caller's.
-
-    Args:
-        tasks: functions without arguments.
-        work: number of splats or entries that all tasks process; small work uses no extra thread.
-    """
+    """Call every task, on at most ``torch.get_num_threads()`` threads including the caller's. ``tasks``:
+    functions without arguments. ``work``: number of splats or entries that all tasks process; small work uses
+    no extra thread."""
     helpers = min(torch.get_num_threads(), len(tasks), 1 + work // GRAIN) - 1
     queue = deque(tasks)
 

@@ -22,10 +22,7 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
     """In what weights are computed with: float32 in place of a half precision that the processor lacks.
 
     Products and convolutions in float16 take four times as long as in float32 on a CPU, and lose digits.
-
-    Args:
-        stored: of the weights in their file.
-        device: where they are used.
+    ``stored``: of the weights in their file. ``device``: where they are used.
     """
     if device.type == "cpu" and (
         stored == torch.float16 or (stored == torch.bfloat16 and not has_bfloat16(device))
@@ -35,16 +32,9 @@ def fast_precision(stored: torch.dtype, device: torch.device) -> torch.dtype:
 
 
 def precision_of(name: str, device: torch.device) -> AbstractContextManager:
-    """The autocast context of a forward pass.
-
-    Args:
-        name: one of :data:`PRECISIONS`. ``inherit`` keeps the caller's; ``auto`` is bfloat16 where the device
-            has it, else float16 on CUDA and float32 on a CPU.
-        device: where the pass runs.
-
-    Raises:
-        InputError: float16 on a CPU, or bfloat16 where the device has none.
-    """
+    """The autocast context of a forward pass. InputError: float16 on a CPU, or bfloat16 where the device has
+    none. ``name``: one of :data:`PRECISIONS`. ``inherit`` keeps the caller's; ``auto`` is bfloat16 where the
+    device has it, else float16 on CUDA and float32 on a CPU."""
     choice("precision", name, PRECISIONS)
     if name == "inherit":
         return nullcontext()
@@ -83,9 +73,6 @@ def exact(device: str) -> Iterator[None]:
 
 def without_float16(device: str) -> AbstractContextManager:
     """No autocast where it is float16, whose largest number a dense head's maps and gradients exceed.
-
-    Args:
-        device: its type.
-    """
+    ``device``: its type."""
     low = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
     return torch.autocast(device, enabled=False) if low else nullcontext()

@@ -31,14 +31,8 @@ class Watcher:
 
 @contextmanager
 def watched(model: nn.Module, stages: Mapping[str, str], watcher: Watcher) -> Iterator[None]:
-    """Let ``watcher`` see the calls of stages while the context lasts.
-
-    Args:
-        model: what is run.
-        stages: dotted paths of the stages in ``model`` by the name that ``watcher`` is told; a stage that is
-            None or missing is left out.
-        watcher: what sees them.
-    """
+    """Let ``watcher`` see the calls of stages while the context lasts. ``stages``: dotted paths of the stages
+    in ``model`` by the name that ``watcher`` is told; a stage that is None or missing is left out."""
     with ExitStack() as stack:
         for name, path in stages.items():
             parent, _, attribute = path.rpartition(".")

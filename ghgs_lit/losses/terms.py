@@ -40,16 +40,8 @@ def render_ssim(prediction: Prediction, rendering: Rendering, batch: Batch) -> S
 
 def chamfer(prediction: Prediction, rendering: Rendering, batch: Batch, points: int | None = None) -> Scalar:
     """Chamfer distance of the subject's unprojected pixels to the body vertices (L_geom), batch mean.
-
-    Args:
-        prediction: its points are those before the Gaussian head's offset.
-        rendering: not used.
-        batch: with body vertices.
-        points: how many points of each set are matched; None for all.
-
-    Raises:
-        InputError: the data has no body vertices.
-    """
+    InputError: the data has no body vertices. ``prediction``: its points are those before the Gaussian head's
+    offset. ``points``: how many points of each set are matched; None for all."""
     if batch.body_vertices is None:
         raise InputError("loss.weights.chamfer: expected 0 for data without body vertices; found more")
     used = prediction.points.valid & batch.masks
@@ -64,15 +56,7 @@ def depth(prediction: Prediction, rendering: Rendering, batch: Batch) -> Scalar:
     """Mean |z - true z| in metres over the subject's pixels with a true depth; 0 where there are none.
 
     Of a model with rounds the sum over the depths before the first round and after each, as the sequence loss
-    of RAFT (Teed and Deng, ECCV 2020) without its weights.
-
-    Args:
-        prediction: its depth, where valid.
-        rendering: not used.
-        batch: with depth maps.
-
-    Raises:
-        InputError: the data has no depth maps.
+    of RAFT (Teed and Deng, ECCV 2020) without its weights. InputError: the data has no depth maps.
     """
     if batch.depths is None:
         raise InputError("loss.weights.depth: expected 0 for data without depth maps; found more")

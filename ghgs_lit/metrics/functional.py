@@ -14,10 +14,13 @@ from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.precision import exact
 
-REGIONS = ("image", "box", "subject")
+REGIONS = ("image", "box", "subject", "crop")
 PADDINGS = ("valid", "reflect", "zeros")
 PSNR_CAP = 100.0
 """PSNR in dB of equal images, and the largest value reported: float32 resolves no smaller errors."""
+CROP = (1000 / 1024, 500 / 1024)
+"""Height and width of the region ``crop`` as shares of the image's: 1000 x 500 of 1024 x 1024, as published
+scripts of GHG and LIFe-GoM crop."""
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 """Side and standard deviation, in pixels, of SSIM's Gaussian window."""
 
@@ -56,13 +59,29 @@ def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n 
     return span(mask.any(-1))[:, :, None] & span(mask.any(-2))[:, None, :]
 
 
+def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
+    """A window of :data:`CROP` around the middle of each mask's box, inside the image; empty where it is."""
+
+    def span(hit: Bool[Tensor, "n k"], share: float) -> Bool[Tensor, "n k"]:
+        count = hit.shape[1]
+        side, index = round(share * count), torch.arange(count, device=hit.device)
+        first, last = first_and_last(hit)
+        start = (first - (side - (last - first + 1)) // 2).clamp(0, count - side)[:, None]
+        return (index >= start) & (index < start + side) & hit.any(-1, keepdim=True)
+
+    height, width = CROP
+    return span(mask.any(-1), height)[:, :, None] & span(mask.any(-2), width)[:, None, :]
+
+
 def region_of(
     mask: Bool[Tensor, "n h w"], name: str, box_margin: float = 0.0
 ) -> Bool[Tensor, "n h w"] | None:
-    """The pixels of region ``image`` (None: all), ``box`` or ``subject``, from the subject's mask."""
+    """The pixels of one of :data:`REGIONS` (None: all), from the subject's mask."""
     choice("region", name, REGIONS)
     if name == "image":
         return None
+    if name == "crop":
+        return crop_of(mask)
     return box_of(mask, box_margin) if name == "box" else mask
 
 

@@ -11,7 +11,6 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
     PSNR_CAP,
-    REGIONS,
     decibels,
     mean_inside,
     mean_over,
@@ -26,11 +25,13 @@ class MetricsOptions(Options):
     """What is measured, and how."""
 
     group = "metrics"
-    protocol: Literal["correct", "release"] = "correct"
+    protocol: Literal["correct", "release", "files"] = "correct"
     """correct: renders clamped to [0, 1], SSIM as in torchmetrics, LPIPS on [-1, 1], for which it was
-    calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. Reported with every number."""
-    regions: tuple[Literal["image", "box", "subject"], ...] = REGIONS
-    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP)."""
+    calibrated. release: no clamp, SSIM padded with zeros, LPIPS on [0, 1]. files: as correct, of renders and
+    targets rounded to 8 bits, SSIM without padding. Reported with every number."""
+    regions: tuple[Literal["image", "box", "subject", "crop"], ...] = ("image", "box", "subject")
+    """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP), the
+    window around the box that GHG and LIFe-GoM crop (1000 x 500 of 1024 x 1024)."""
     box_margin: Amount = 0.0
     """Part of the box's height and width that is added to it on each side."""
     lpips: Literal["auto", "require", "off"] = "auto"
@@ -44,7 +45,7 @@ class MetricsOptions(Options):
     @property
     def ssim_padding(self) -> str:
         """Border of SSIM."""
-        return "zeros" if self.is_release else "reflect"
+        return {"release": "zeros", "files": "valid"}.get(self.protocol, "reflect")
 
     def build(self) -> "ImageMetrics":
         return ImageMetrics(self)
@@ -55,10 +56,8 @@ class ImageMetrics:
 
     The names are ``psnr``, ``ssim``, ``flip`` and ``lpips`` for the whole image, with ``_box`` and
     ``_subject`` added for the other regions (no FLIP for the subject's pixels alone, since it blurs).
-
-    Attributes:
-        protocol: the name that is reported with every number.
-        left_out: why metrics are left out, by name.
+    ``protocol``: the name that is reported with every number. ``left_out``: why metrics are left out, by
+    name.
     """
 
     def __init__(self, options: MetricsOptions):
@@ -91,7 +90,8 @@ class ImageMetrics:
     def definitions(self) -> dict[str, str]:
         """How each metric and region is defined, to be stored beside the numbers."""
         options = self.options
-        renders = "as they are" if options.is_release else "clamped to [0, 1]"
+        renders = {"release": "as they are", "files": "and targets in 8 bits"}
+        renders = renders.get(options.protocol, "clamped to [0, 1]")
         said = {
             "image": f"renders {renders}, RGB, data range 1",
             "psnr": f"-10 log10(MSE) of each image, at most {PSNR_CAP:g} dB (equal images)",
@@ -100,13 +100,15 @@ class ImageMetrics:
         }
         if options.regions:
             said["ssim"] = f"11x11 Gaussian window, sigma 1.5, padding {options.ssim_padding}"
-        if {"image", "box"} & set(options.regions):
+        if set(options.regions) - {"subject"}:
             said["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
         if "box" in options.regions:
             wider = f", {options.box_margin:g} of its sides wider on each side" * (options.box_margin > 0)
             said["box"] = f"the smallest upright box of the subject's mask in the target{wider}"
         if "subject" in options.regions:
             said["subject"] = "the pixels of the subject's mask in the target"
+        if "crop" in options.regions:
+            said["crop"] = "1000/1024 of the height and 500/1024 of the width, around the mask's box"
         if self.lpips is not None:
             said["lpips"] = f"{NETWORK} on {'[0, 1]' if options.is_release else '[-1, 1]'}, whole image"
         return said
@@ -118,9 +120,11 @@ class ImageMetrics:
         """One value per image for each metric; nan where a region is empty."""
         options = self.options
         image = image if options.is_release else image.clamp(0, 1)
+        if options.protocol == "files":
+            image, target = ((255 * values).round() / 255 for values in (image, target))
         errors = squared_error(image, target)
         similarity = ssim_map(image, target, options.ssim_padding).mean(1)
-        difference = flip_map(image, target) if {"image", "box"} & set(options.regions) else None
+        difference = flip_map(image, target) if set(options.regions) - {"subject"} else None
         values = {}
         for name in options.regions:
             suffix = "" if name == "image" else f"_{name}"

@@ -81,21 +81,20 @@ class SemanticAttention(nn.Module):
         return results[0] if len(results) == 1 else torch.cat(results)
 
     def attention_weights(
-        self, x: Float[Tensor, "n C"], query: int, neighbors: Neighbors, cosines: Tensor | None
-    ) -> Float[Tensor, "a k"]:
-        """Softmax weights of each head from one token to its neighbours, to look at.
+        self, x: Float[Tensor, "n C"], rows: slice, neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
+    ) -> Float[Tensor, "m k a"]:
+        """Softmax weights of each head from some tokens to their neighbours, to look at.
 
         Args:
             x: the tokens of one batch element.
-            query: index of the token that attends.
+            rows: the ``m`` tokens that attend.
             neighbors: of all ``n`` tokens.
-            cosines: ``[n, k]``; None where ``similarity`` is ``none``.
+            cosines: None where ``similarity`` is ``none``.
         """
-        row, near = slice(query, query + 1), neighbors.index[query]
-        normed = self.norm1(x)
-        q, k = (at_least_float32(y)[None] for y in (self.q_proj(normed[query]), self.k_proj(normed[near])))
-        changes = self._factor_and_bias(None if cosines is None else cosines[row])
-        return self._weights(q, k, neighbors.valid[row], *(y.expand(1, len(near)) for y in changes))[0].T
+        near, normed = neighbors.index[rows], self.norm1(x)
+        q, k = at_least_float32(self.q_proj(normed[rows])), at_least_float32(self.k_proj(normed))
+        changes = self._factor_and_bias(None if cosines is None else cosines[rows])
+        return self._weights(q, k[near], neighbors.valid[rows], *(y.expand(near.shape) for y in changes))
 
     def apply_similarity(
         self, logits: Float[Tensor, "a m k"], cosines: Float[Tensor, "m k"]

@@ -1,4 +1,4 @@
-"""Attention weights of one token, for pictures; training does not use them."""
+"""Attention weights, to look at; training does not use them."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ghgs_lit.recalibration.neighbors import nearest_neighbors
+from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors
 from ghgs_lit.recalibration.recalibration import Recalibration, neighbor_cosines
 from ghgs_lit.types import Points, Tokens
 
@@ -43,15 +43,48 @@ def attention_of(
     element = tokens.image // tokens.grid[1]
     chosen = (takes_part & (element == element[query])).nonzero()[:, 0]
     row = int((chosen == query).nonzero())
-    positions = recalibration.positions(tokens, points)[chosen]
+    near, weights = _weights(recalibration, tokens, points, chosen, slice(row, row + 1))
+    valid = near.valid[row]
+    return TokenAttention(query, chosen[near.index[row][valid]], weights[:, 0, valid].mT)
+
+
+@torch.no_grad()
+def attention_on_other_parts(
+    recalibration: Recalibration, tokens: Tokens, points: Points, part: Int[Tensor, " N"]
+) -> Float[Tensor, "m L"]:
+    """Share of each token's attention, mean over heads, on tokens that show another part of the body.
+
+    Args:
+        recalibration: the stage.
+        tokens, points: as in the stage's forward.
+        part: number of the part that a token shows; -1: unknown. Such tokens are no queries, and what they
+            get is no part of the share.
+
+    Returns:
+        In each layer, of the tokens that take part and whose part is known.
+    """
+    takes_part, element, found = recalibration.takes_part(points), tokens.image // tokens.grid[1], []
+    for number in range(tokens.grid[0]):
+        chosen = (takes_part & (element == number)).nonzero()[:, 0]
+        near, weights = _weights(recalibration, tokens, points, chosen, slice(None))
+        own, others = part[chosen, None], part[chosen][near.index]
+        differs = near.valid & (own != others) & (others >= 0)
+        found.append((weights.mean(-1) * differs).sum(-1).T[own[:, 0] >= 0])
+    return torch.cat(found)
+
+
+def _weights(
+    recalibration: Recalibration, tokens: Tokens, points: Points, chosen: Int[Tensor, " n"], rows: slice
+) -> tuple[Neighbors, Float[Tensor, "L m k a"]]:
+    """Neighbours of the ``chosen`` tokens of one element, as indices among them, and the weights of rows."""
     places = recalibration.places(tokens)
     near = nearest_neighbors(
-        positions,
+        recalibration.positions(tokens, points)[chosen],
         tokens.image[chosen],
         recalibration.k,
         None if places is None else places[chosen],
     )
-    block, valid = recalibration.block, near.valid[row]
+    block = recalibration.block
     cosines = neighbor_cosines(tokens.semantic[chosen], near) if block.similarity != "none" else None
-    weights = [block.attention_weights(layer[chosen], row, near, cosines) for layer in tokens.latent]
-    return TokenAttention(query, chosen[near.index[row][valid]], torch.stack(weights)[..., valid])
+    each = [block.attention_weights(layer[chosen], rows, near, cosines) for layer in tokens.latent]
+    return near, torch.stack(each)

@@ -44,7 +44,6 @@ def render(
     Args:
         gaussians: a zero quaternion is the identity; a Gaussian with NaN in its geometry or opacity is not
             drawn.
-        cameras: [B, T].
         backend: ``gsplat`` (CUDA), ``cpu`` (float32), ``reference`` (plain PyTorch in the dtype of the
             means, slow; also differentiable in the cameras) or ``auto``: gsplat on CUDA, else cpu.
         background: one number, one per channel, or a tensor that broadcasts with [B, T, C, h, w].
@@ -86,12 +85,8 @@ def made_for(gaussians: Gaussians, **settings) -> RasterSettings:
 
 
 def resolve_backend(backend: str, device: torch.device) -> str:
-    """The backend for tensors on ``device``, with ``auto`` resolved.
-
-    Raises:
-        InputError: a backend that does not run on ``device``.
-        BackendUnavailable: gsplat cannot run on this machine.
-    """
+    """The backend for tensors on ``device``, with ``auto`` resolved. InputError: a backend that does not run
+    on ``device``. BackendUnavailable: gsplat cannot run on this machine."""
     choice("renderer.backend", backend, BACKENDS)
     is_cuda = device.type == "cuda"
     if backend == "auto":

@@ -41,11 +41,8 @@ class Exchange(nn.Module):
     """Adds to what each Gaussian knows what those of the pixels around it tell; untrained, nothing.
 
     Where several depths explain a colour, neighbours decide, as in recurrent networks of optical flow (RAFT,
-    Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap.
-
-    Args:
-        width: of what a Gaussian knows.
-        channels: of what it tells.
+    Teed and Deng, ECCV 2020). Few channels and one convolution keep it cheap. ``width``: of what a Gaussian
+    knows. ``channels``: of what it tells.
     """
 
     def __init__(self, width: int, channels: int):

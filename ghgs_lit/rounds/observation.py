@@ -26,11 +26,8 @@ def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
     """:data:`CHANNELS` values of each input view at each Gaussian of its element.
 
     The first view is that of the Gaussian's own image; the others follow in their order, from the last to the
-    first again.
-
-    Args:
-        gaussians: with the images that they come from.
-        batch: photographs, masks and cameras.
+    first again. ``gaussians``: with the images that they come from. ``batch``: photographs, masks and
+    cameras.
     """
     with exact(gaussians.means.device.type):
         return _compare(gaussians, batch, render(gaussians, batch.cameras))

@@ -79,12 +79,8 @@ class State:
 
 
 def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
-    """What the last of several states predicts.
-
-    Args:
-        states: before the first round and after each.
-        keeps_drafts: whether the prediction has the Gaussians before each round.
-    """
+    """What the last of several states predicts. ``states``: before the first round and after each.
+    ``keeps_drafts``: whether the prediction has the Gaussians before each round."""
     last = states[-1]
     return Prediction(
         last.gaussians,
@@ -131,14 +127,9 @@ class Rounds(nn.Module):
     """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
 
     Each round can change half as much as the one before, depths stay between near and far and attributes
-    within the bounds of their activations: more rounds than were trained do not diverge.
-
-    Args:
-        options: of the rounds.
-        channels: width of the Gaussian head's descriptors.
-
-    Attributes:
-        count: number of rounds outside of training; it may be changed at any time.
+    within the bounds of their activations: more rounds than were trained do not diverge. ``channels``: width
+    of the Gaussian head's descriptors. ``count``: number of rounds outside of training; it may be changed at
+    any time.
     """
 
     def __init__(self, options: RoundsOptions, channels: int):
@@ -166,13 +157,8 @@ class Rounds(nn.Module):
         nn.init.zeros_(self.change[-1].bias)
 
     def forward(self, state: State, activate: Activate, batch: Batch) -> tuple[State, ...]:
-        """The state before the first round and after each.
-
-        Args:
-            state: the prediction of the stages before; its depths have bounds.
-            activate: of the Gaussian head.
-            batch: photographs, masks and cameras are read.
-        """
+        """The state before the first round and after each. ``state``: the prediction of the stages before;
+        its depths have bounds. ``batch``: photographs, masks and cameras are read."""
         if self.options.gains:
             gaussians, batch = equalized(state.gaussians, batch)
             state = dataclasses.replace(state, gaussians=gaussians)

@@ -26,11 +26,8 @@ PHOTOGRAPHS_CHANGE = ("exposure", "white_balance", "mask_offset", "mask_ragged",
 
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Refuse a run that cannot give what it is started for.
-
-    Raises:
-        InputError: ``skip=auto``, a frozen encoder without weights, or a feature cache that cannot pay.
-    """
+    """Refuse a run that cannot give what it is started for. InputError: ``skip=auto``, a frozen encoder
+    without weights, or a feature cache that cannot pay."""
     one_preset = not lookup(config, "skip.choices")
     require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     _require_weights(config)
@@ -81,11 +78,8 @@ def _require_useful_cache(config: Mapping[str, Any]) -> None:
 
 
 def check_directory(directory: Path, config: Mapping[str, Any]) -> None:
-    """Refuse to train where an earlier run would be lost; with ``overwrite`` remove it.
-
-    Raises:
-        InputError: there is a run, and this one does not go on from it.
-    """
+    """Refuse to train where an earlier run would be lost; with ``overwrite`` remove it. InputError: there is
+    a run, and this one does not go on from it."""
     kept = [*(directory / "checkpoints").glob("*.ckpt"), directory / "csv" / "metrics.csv"]
     earlier = next((path for path in [*kept, directory / "metrics.json"] if path.exists()), None)
     resume = config.get("resume")

@@ -32,10 +32,7 @@ Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
 def sweep(sweeper: BasicSweeper, arguments: Sequence[str]) -> list[Sequence[JobReturn]]:
     """Run, or with ``dry_run`` only print, the grid of ``arguments`` and the sweeper's parameters.
-
-    Raises:
-        Interrupted: on Ctrl-C and SIGTERM; no further run is started.
-    """
+    Interrupted: on Ctrl-C and SIGTERM; no further run is started."""
     directory = Path(str(sweeper.config.hydra.sweep.dir)).resolve()
     with interruptible():
         try:
@@ -87,10 +84,7 @@ def combinations(
 
 def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:
     """The different runs among the jobs, in order; ``compose`` makes a configuration of a job's overrides.
-
-    Raises:
-        InputError: a job's configuration is bad or lacks a value.
-    """
+    InputError: a job's configuration is bad or lacks a value."""
     planned: dict[str, PlannedRun] = {}
     for overrides in combos:
         cfg = compose(list(overrides))

@@ -11,11 +11,8 @@ from ghgs_lit.runs.run import RunDirectory, State
 
 
 def files_below(folders: Sequence[Path], name: str) -> list[Path]:
-    """The files of a name below folders, sorted in each; without those of Hydra.
-
-    Raises:
-        FileNotFoundError: a folder is missing.
-    """
+    """The files of a name below folders, sorted in each; without those of Hydra. FileNotFoundError: a folder
+    is missing."""
     for folder in folders:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
@@ -27,11 +24,8 @@ def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
     """A line for each training and each evaluation: ``run``, ``state``, ``best`` and ``overrides``.
 
     ``best`` is the highest mean PSNR of a method, number of views and kind of targets; of a run without
-    results, of a validation so far.
-
-    Raises:
-        FileNotFoundError: a folder is missing.
-        InputError: there is no run below the folders.
+    results, of a validation so far. FileNotFoundError: a folder is missing. InputError: there is no run below
+    the folders.
     """
     runs = []
     for path in files_below(folders, "config.yaml"):
@@ -63,7 +57,6 @@ def _best(run: RunDirectory) -> str:
 
 
 def _overrides(path: Path) -> str:
-    """What the command line said; nothing where the run was not started by Hydra."""
     file = path / ".hydra" / "overrides.yaml"
     said = read_yaml(file) if file.is_file() else []
     return " ".join(map(str, said)) if isinstance(said, list) else ""

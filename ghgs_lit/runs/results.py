@@ -141,12 +141,8 @@ def validated(model: type[Model], content: Any, where: str) -> Model:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read a ``metrics.json``.
-
-    Raises:
-        InputError: the file is not a whole ``metrics.json`` of today's format, or its configuration is not
-            the one that was measured; the message names it.
-    """
+    """Read a ``metrics.json``. InputError: the file is not a whole ``metrics.json`` of today's format, or its
+    configuration is not the one that was measured; the message names it."""
     content = read_json(path, "a metrics.json")
     found = content.get("format_version") if isinstance(content, dict) else type(content).__name__
     if found != FORMAT_VERSION:

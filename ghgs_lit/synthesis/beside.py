@@ -18,13 +18,7 @@ _running: dict[Path, multiprocessing.process.BaseProcess] = {}
 
 
 class Joining(dict[str, tuple[int, ...]]):
-    """``subjects`` of a layout of training, among whom each look finds those who became whole since the last.
-
-    Args:
-        layout: with those who are whole now.
-        made: who is whole.
-        names: of all who are awaited.
-    """
+    """``subjects`` of a layout of training: each look finds those who became whole since the last."""
 
     def __init__(self, layout: Layout, made: Completeness, names: Sequence[str]) -> None:
         super().__init__(layout.subjects)

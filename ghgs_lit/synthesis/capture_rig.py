@@ -66,12 +66,8 @@ class CaptureRig:
 
     @classmethod
     def of(cls, cameras: Sequence[RigCamera], fill: tuple[float, float]) -> "CaptureRig":
-        """The rig of two or more cameras.
-
-        Raises:
-            InputError: there are fewer, they look in one direction, or the place that they look at is behind
-                one of them.
-        """
+        """The rig of two or more cameras. InputError: there are fewer, they look in one direction, or the
+        place that they look at is behind one of them."""
         require(len(cameras) > 1, "data.cameras", "two or more cameras", len(cameras))
         columns = ([getattr(c, n) for c in cameras] for n in ("intrinsics", "extrinsics", "height"))
         rig = cls(*map(tuple, columns), fill)
@@ -168,7 +164,6 @@ class PlacedRig:
     """A rig around one subject.
 
     Attributes:
-        rig: the cameras.
         scale: metres of their unit.
         middle: the point [3] that the cameras look at, in the subject's world.
         vertices: [n, 3] of the subject.

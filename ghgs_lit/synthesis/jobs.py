@@ -155,7 +155,6 @@ def render_subject(job: _Job) -> _Job:
 
 
 def _photograph(job: _Job, name: str, studio: Studio, rig: Rig, yaws: np.ndarray, poses: Poses) -> None:
-    """Write all photographs of a subject."""
     numbers, (height, width) = job.settings.views, job.settings.size
     # Losses of compression would count as flicker.
     quality = None if job.instants else job.settings.quality
@@ -193,7 +192,6 @@ def render_people(
     Args:
         names: names of the subjects of each phase: of people, or of their instants if they are in motion.
         workers: number of processes (None: one for each core; 0: this one).
-        shown: whether there is a progress bar.
 
     Returns:
         How many people were rendered now.
@@ -234,7 +232,6 @@ def render_people(
 
 
 def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
-    """Finished jobs, in the order in which they finish."""
     workers = min(len(jobs), allowed_cores() if workers is None else workers)
     if workers < 2:
         yield from map(render_subject, jobs)

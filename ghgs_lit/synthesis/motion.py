@@ -4,20 +4,16 @@ A person in motion is the still one of the same number, in its pose at the first
 faces, texture coordinates and textures (with the shadows of the first instant) are those of all instants.
 """
 
-from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ghgs_lit.synthesis.people.ambient_occlusion import Spheres, occluding_spheres
-from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, bone_transforms, load_body, skin
-from ghgs_lit.synthesis.people.complexion import sample_complexion
+from ghgs_lit.synthesis.people.ambient_occlusion import occluding_spheres
+from ghgs_lit.synthesis.people.body import BODY_VERTICES, BodyModel, bone_transforms, skin
 from ghgs_lit.synthesis.people.garments import Figure
-from ghgs_lit.synthesis.people.generate import MAX_POSES, MAX_YAW, arm_depth, dress, pose_figure, skin_part
-from ghgs_lit.synthesis.people.hair import make_beanie, make_hair, sample_haircut, under_hat
-from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh
-from ghgs_lit.synthesis.people.outfit import sample_outfit
+from ghgs_lit.synthesis.people.generate import MAX_POSES, Character, arm_depth, pose_figure
+from ghgs_lit.synthesis.people.mesh import Person
 
 #: Part of the keys of caches: increase it when people of the same number would move differently.
 VERSION = 1
@@ -77,37 +73,17 @@ class Motion:
 def generate_moving(seed: int, index: int, instants: int, active: bool = False) -> Person:
     """Person ``index`` of the family ``seed`` at all instants: parts and bodies one instant after another.
     Arguments and frame as for :func:`.people.generate`; the frame is that of the first instant."""
-    # The streams of a still person, and one for the second pose.
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(5)]
-    shape_rng, pose_rng, cloth_rng, look_rng, motion_rng = streams
-    body = load_body()
-    coefficients, female, age = body.sample_shape(shape_rng)
-    first = pose_figure(body, coefficients, pose_rng, active)
-    outfit, look = sample_outfit(cloth_rng, female), sample_complexion(look_rng, female, age)
-    cut = sample_haircut(look_rng, female)
-    cut = under_hat(cut) if outfit.beanie else cut
-
-    def dressed(figure: Figure, spheres: Spheres) -> list[TexturedMesh]:
-        scalp = 0.25 if cut.style == "bald" else 1.0
-        parts = [skin_part(figure, outfit, look, spheres, scalp)]
-        parts += dress(figure, outfit, spheres, deepcopy(cloth_rng))
-        parts += make_hair(figure, cut, look, deepcopy(look_rng))
-        parts += [make_beanie(figure, outfit.beanie)] if outfit.beanie else []
-        return [part for part in parts if len(part.faces)]
-
+    person = Character(seed, index, active)
+    first = person.first
     for _ in range(MAX_POSES):  # until the arms are clear of the trunk on the way
-        motion = Motion(body, first, pose_figure(body, coefficients, motion_rng, active))
+        second = pose_figure(person.body, person.coefficients, person.motion_rng, active)
+        motion = Motion(person.body, first, second)
         if max(arm_depth(motion.at(share).posed, first.faces) for share in (0.25, 0.5, 0.75)) < 0.012:
             break
     figures = [first, *(motion.at(share) for share in shares(instants)[1:])]
-    parts = dressed(first, occluding_spheres(first))
+    parts = person.dressed(first, occluding_spheres(first))
     unshaded, count = (np.empty((0, 3)), np.empty(0)), len(parts)
     for figure in figures[1:]:
-        moved = zip(parts[:count], dressed(figure, unshaded), strict=True)
+        moved = zip(parts[:count], person.dressed(figure, unshaded), strict=True)
         parts += [replace(part, vertices=like.vertices) for part, like in moved]
-    turn = Rotation.from_euler("y", pose_rng.uniform(-MAX_YAW, MAX_YAW), degrees=True).as_matrix()
-    origin = 0.5 * (first.posed.min(0) + first.posed.max(0))
-    origin[1] = min(float(part.vertices[:, 1].min()) for part in parts[:count])
-    name = f"{'active' if active else 'person'}_{seed}_{index:04d}"
-    person = Person(name, tuple(parts), np.concatenate([figure.posed for figure in figures]))
-    return person.mapped(lambda vertices: (vertices - origin) @ turn.T)
+    return person.placed(parts, np.concatenate([figure.posed for figure in figures]), count)

@@ -79,7 +79,6 @@ class LightRig:
         directions: [l, 3] unit vectors towards the lights.
         strengths: [l].
         ambient: brightness without any light.
-        softness: see :class:`Lights`.
     """
 
     directions: np.ndarray
@@ -126,13 +125,8 @@ class Studio:
     """A person under fixed lights, photographed from any number of cameras.
 
     Surfaces are double-sided: normals are flipped towards the camera. Rays pass through a surface where the
-    alpha of its texture is below the part's ``alpha_cutoff``.
-
-    Args:
-        samples: ``samples`` x ``samples`` rays per pixel, 1 to 16.
-
-    Raises:
-        InputError: no faces, values that are not finite, or a texture that is not uint8.
+    alpha of its texture is below the part's ``alpha_cutoff``. ``samples``: ``samples`` x ``samples`` rays per
+    pixel, 1 to 16. InputError: no faces, values that are not finite, or a texture that is not uint8.
     """
 
     def __init__(self, person: Person, lights: LightRig, samples: int = 3) -> None:

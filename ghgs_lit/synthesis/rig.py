@@ -77,12 +77,8 @@ class RigOptions(Options):
 
 @dataclass(frozen=True)
 class Poses:
-    """How cameras [...] deviate from their ring.
-
-    Attributes:
-        pitch, roll: degrees [...].
-        shift: metres [..., 3].
-    """
+    """How cameras [...] deviate from their ring. ``pitch``, ``roll``: degrees [...]. ``shift``: metres [...,
+    3]."""
 
     pitch: np.ndarray | float = 0.0
     roll: np.ndarray | float = 0.0
@@ -97,7 +93,6 @@ class Rig:
     """A ring of cameras; the numbers are those of the published scripts.
 
     Attributes:
-        positions: number of cameras.
         radius: distance of the cameras from ``look_at``, metres.
         look_at: the point that all cameras look at, metres.
         pitch: degrees; below 0 the cameras look down.
@@ -106,7 +101,6 @@ class Rig:
         yaw_jitter: the ring of each subject is turned by up to this angle, degrees.
         height: height that subjects are scaled to, metres (null: they keep their own).
         height_jitter: greatest deviation from ``height``, metres.
-        variation: :meth:`drawn` applies it.
     """
 
     positions: int = 16
@@ -129,13 +123,7 @@ class Rig:
         return start[:, None] + step * offsets
 
     def cameras(self, yaws: np.ndarray, height: int, width: int, poses: Poses | None = None) -> Cameras:
-        """Cameras of the ring, float32.
-
-        Args:
-            yaws: degrees, any shape.
-            height, width: image size in pixels.
-            poses: deviations of the cameras (None: none).
-        """
+        """Cameras of the ring, float32. ``yaws``: degrees, any shape."""
         poses = poses or Poses()
         yaw, pitch, roll = (
             np.broadcast_to(np.radians(angle), np.shape(yaws))[..., None]

@@ -28,12 +28,9 @@ _FIT_SIZES = {"global_orient": (3,), "scale": (1,), "translation": (3,), "transl
 
 @dataclass(frozen=True)
 class SmplxFit:
-    """The content of ``smplx_param.pkl``.
-
-    Attributes:
-        parameters: of the male SMPL-X model, by name, [1, n].
-        scale, translation: from the model's frame to the scan's: ``v * scale + translation``, scale first.
-    """
+    """The content of ``smplx_param.pkl``. ``parameters``: of the male SMPL-X model, by name, [1, n].
+    ``scale``, ``translation``: from the model's frame to the scan's: ``v * scale + translation``, scale
+    first."""
 
     parameters: Mapping[str, np.ndarray]
     scale: float
@@ -151,7 +148,6 @@ class THuman2Source:
 
 
 def _obj_vertices(path: Path) -> np.ndarray:
-    """All ``v`` lines [n, 3], in order, with nothing merged."""
     try:
         with path.open() as lines:
             vertices = [line.split()[1:4] for line in lines if line.startswith("v ")]
@@ -199,15 +195,8 @@ def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.nda
 
 
 def ghg_body(path: Path, vertices: np.ndarray) -> np.ndarray:
-    """Move the body of a scan as GHG's renderer moved the scan.
-
-    Args:
-        path: ``<id>_transform.npy``.
-        vertices: [n, 3] in the scan's frame.
-
-    Raises:
-        InputError: the file is missing, or lacks a number.
-    """
+    """Move the body of a scan as GHG's renderer moved the scan. ``vertices``: [n, 3] in the scan's frame.
+    InputError: the file is missing, or lacks a number."""
     content = load_npy(path)
     names = ("vy_max", "vy_min", "human_height", "offset", "move_delta_axis_0", "move_delta_axis_2")
     for name in names:

@@ -12,10 +12,8 @@ def write_view(phase: Path, folder: str, number: int, view: View, quality: int |
     """Write one view; the JPEG keeps the full resolution of colours.
 
     The mask has three equal channels: the authors' loader takes channel 0 of an image that has several.
-
-    Args:
-        folder: name of the subject's position, ``<id>_<position>``.
-        quality: of the JPEG, 1 to 100; None: a PNG, without loss.
+    ``folder``: name of the subject's position, ``<id>_<position>``. ``quality``: of the JPEG, 1 to 100; None:
+    a PNG, without loss.
     """
     folders = {kind: phase / kind / folder for kind in ("img", "mask", "alpha", "depth", "parm")}
     for path in folders.values():

@@ -27,7 +27,6 @@ class BudgetedModule(L.LightningModule):
 
     Args:
         model: whose parameters learn; checkpoints hold its tensors.
-        optimization: optimizer, schedule and gradient clipping.
         config: the run's full configuration as plain data, of which ``seed`` is read; every checkpoint has
             it, beside the nodes of a model that was built of them. None: these alone.
 
@@ -51,10 +50,7 @@ class BudgetedModule(L.LightningModule):
     def on_train_start(self) -> None:
         # After a restart the scheduler asks for the first time when a step has been taken.
         self.used_budget = self.progress()
-        self._apply_options()
-
-    def _apply_options(self) -> None:
-        """Put this run's options of the optimizer in place of those of the checkpoint that it resumes."""
+        # This run's options of the optimizer take the place of those of the checkpoint that it resumes.
         optimizer, schedule = self.optimizers(), self.lr_schedulers()
         for number, (group, option) in enumerate(zip(optimizer.param_groups, self._options, strict=True)):
             # The rate itself has the schedule's factor of the step that comes next.

@@ -73,7 +73,6 @@ class RunProgress(ProgressBar):
             self._say(trainer, pl_module)
 
     def _numbers(self, trainer: L.Trainer, pl_module: L.LightningModule) -> str:
-        """Losses, and the results of the last validation."""
         shown = {k: v for k, v in self.get_metrics(trainer, pl_module).items() if k != "v_num"}
         return "  ".join(f"{name} {value:.4g}" for name, value in shown.items())
 

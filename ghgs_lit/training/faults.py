@@ -25,7 +25,7 @@ _STAGES = (*STAGES, "renderer", "losses")
 class Step:
     """A forward and a backward pass, with all that it depends on beside the weights.
 
-    ``budget`` is that of :func:`~ghgs_lit.training.budgets.drawn_budget`, ``scale`` the factor of the loss.
+    ``budget`` is that of :func:`~ghgs_lit.training.module.drawn_budget`, ``scale`` the factor of the loss.
     """
 
     batch: Batch
@@ -155,7 +155,6 @@ def _watch(module: "GHGSModule", faults: _Faults, stack: ExitStack) -> None:
 
 
 def _one_subject(batch: Batch, element: int) -> Batch:
-    """A batch of one of its subjects."""
     one = slice(element, element + 1)
     bodies, targets = batch.body_vertices, batch.targets
     part = map_tensors(dataclasses.replace(batch, body_vertices=None), lambda t: t[one])

@@ -52,10 +52,7 @@ class Guard:
 
     def refuse(self, module: L.LightningModule, scale: float) -> None:
         """Name and save the fault, and drop the gradients, so that the optimizer changes nothing.
-
-        Raises:
-            DivergedError: more than ``limit`` steps in a row were not finite.
-        """
+        DivergedError: more than ``limit`` steps in a row were not finite."""
         trainer, line = module.trainer, self._explain(module, scale)
         self._steps.clear()
         lines = [line]
@@ -91,7 +88,6 @@ class Guard:
 
 
 def _write(path: Path, module: L.LightningModule, step: Step, fault: Fault) -> None:
-    """A step with all that it depends on, as plain data and tensors (``weights_only=True`` reads it)."""
     content = {
         "fault": str(fault),
         "global_step": module.global_step,

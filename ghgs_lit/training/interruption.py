@@ -21,9 +21,7 @@ class StopAtStep(Checkpoint):
 
     A second signal stops at once. Several processes stop after the same step. Lightning calls it after all
     other callbacks, because it is a ``Checkpoint`` and the last one: the checkpoint has their state.
-
-    Attributes:
-        received: number of the signal; 0 without one.
+    ``received``: number of the signal; 0 without one.
     """
 
     def __init__(self) -> None:

@@ -33,19 +33,14 @@ class CsvLog(_StepsTaken, CSVLogger):
     def resume(self, step: int) -> None:
         """Keep the rows up to ``step``; later steps are trained and written again."""
         path = Path(self.log_dir) / "metrics.csv"
-        rows = []
-        if path.is_file():
-            rows = [row for row in read_rows(path) if _is_kept(row.get("step"), step)]
+        rows = read_rows(path) if path.is_file() else []
+        # A killed run may have left an incomplete last line.
+        rows = [row for row in rows if (row.get("step") or "").isdecimal() and int(row["step"]) <= step]
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*will be deleted")  # what is kept is written again
             writer = self.experiment  # begins with an empty file
         writer.metrics = [{name: value for name, value in row.items() if value} for row in rows]
         writer.save()
-
-
-def _is_kept(written: str | None, step: int) -> bool:
-    """False for the incomplete last line of a killed run, too."""
-    return written is not None and written.isdecimal() and int(written) <= step
 
 
 class TensorBoardLog(_StepsTaken, TensorBoardLogger):

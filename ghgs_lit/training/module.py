@@ -1,9 +1,11 @@
 """The LightningModule of training: steps and logging calls around the model."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,13 +15,32 @@ from ghgs_lit.losses import Losses
 from ghgs_lit.metrics import depth_error_mm
 from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
+from ghgs_lit.skipping import View, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.budgets import drawn_budget, token_budget
 from ghgs_lit.training.faults import Step
 from ghgs_lit.training.guard import Guard
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint
+
+
+def drawn_budget(budgets: Sequence[str | int], numbers: Sequence[int]) -> str | int:
+    """How much of the background the encoder sees in a training step.
+
+    Args:
+        budgets: ``all``: all patches (``skip=none``, ``exact``); ``window``: those of the smallest rectangle
+            that holds the subject (``balanced``); a number: the subject's patches and those at most this many
+            patches away (``fast``). What is listed twice is drawn twice as often.
+        numbers: that the step stands for; equal numbers give the same budget.
+    """
+    # A key of its own: the same numbers seed the other draws of the step.
+    generator = np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(1,)))
+    return budgets[int(generator.integers(len(budgets)))]
+
+
+def token_budget(model: GHGS, budget: str | int | None) -> AbstractContextManager[None]:
+    """``model`` with one of the budgets of :func:`drawn_budget` while the context lasts; None: as it is."""
+    return nullcontext() if budget is None else seeing(model.encoder, View.of_budget(budget))
 
 
 def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
@@ -29,18 +50,9 @@ def _depth_error(batch: Batch, maps: DepthMaps) -> Tensor:
 
 
 class GHGSModule(BudgetedModule):
-    """Trains a model through a renderer.
-
-    Args:
-        model: gives the Gaussians and depths of a batch.
-        renderer: draws Gaussians from cameras.
-        losses: the terms that are trained on.
-        optimization, config: as of :class:`BudgetedModule`.
-        token_budgets: drawn from in each training step; None: the model stays as it is configured.
-
-    Attributes:
-        guard: looks for steps whose loss or gradient is not finite.
-    """
+    """Trains a model through a renderer. ``guard``: looks for steps whose loss or gradient is not finite.
+    ``optimization``, ``config``: as of :class:`BudgetedModule`. ``token_budgets``: drawn from in each
+    training step; None: the model stays as it is configured."""
 
     def __init__(
         self,
@@ -156,10 +168,8 @@ class GHGSModule(BudgetedModule):
         """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
 
         A scaler of the loss is undone before. Where it overflowed it skips the step and halves its factor;
-        only a gradient that overflows without any factor is the guard's.
-
-        Raises:
-            DivergedError: a loss or the norm is not finite, and the guard does not skip the step.
+        only a gradient that overflows without any factor is the guard's. DivergedError: a loss or the norm is
+        not finite, and the guard does not skip the step.
         """
         self.optimization.drop_frozen_gradients(self.model, self.used_budget)
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)

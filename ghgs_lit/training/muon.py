@@ -32,11 +32,9 @@ def is_matrix(parameter: nn.Parameter) -> bool:
 def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     """The matrices with singular values of about 1 (0.7 to 1.2) in place of their own.
 
-    The polynomials are found from the smaller Gram matrices, for all of one size at once.
-
-    Args:
-        matrices: of any sizes, float32 or wider. Singular values below 1e-3 of the largest end below 1; a
-            matrix of zeros stays one.
+    The polynomials are found from the smaller Gram matrices, for all of one size at once. ``matrices``: of
+    any sizes, float32 or wider. Singular values below 1e-3 of the largest end below 1; a matrix of zeros
+    stays one.
     """
     wide = [m.mT if m.shape[0] > m.shape[1] else m for m in matrices]
     largest = torch._foreach_norm(wide, torch.inf)
@@ -74,7 +72,6 @@ class Muon(torch.optim.AdamW):
     """Muon for the matrices among ``parameters``, AdamW for all others.
 
     Args:
-        parameters: of the model.
         matrix_lr: learning rate of matrices, in units of AdamW's: steps are as long as AdamW's of this rate.
         **options: of AdamW, for the other parameters; weight decay is for both.
     """

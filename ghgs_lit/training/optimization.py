@@ -48,10 +48,7 @@ class Optimization(Options):
         """The optimizer of the parameters of ``model`` that are trained.
 
         ``fused`` is PyTorch's fastest AdamW. It undoes the scaling of a loss (``16-mixed``) inside its step,
-        where gradients cannot be clipped any more.
-
-        Raises:
-            InputError: ``freeze_until`` names no parameter.
+        where gradients cannot be clipped any more. InputError: ``freeze_until`` names no parameter.
         """
         names = [name for name, _ in model.named_parameters()]
         for prefix in self.freeze_until:

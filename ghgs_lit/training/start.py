@@ -26,15 +26,9 @@ def check_start(config: Mapping[str, Any], directory: Path) -> None:
 
 
 def check_resume(path: str | Path, model: nn.Module, config: Mapping[str, Any]) -> tuple[int, list[str]]:
-    """Check that a run can resume from a checkpoint, whose weights ``model`` gets.
-
-    Returns:
-        The step of the checkpoint, and one line for each setting that ``config`` changes.
-
-    Raises:
-        InputError: not a checkpoint of a training run, of another model (names the tensor), or changed
-            since it was written.
-    """
+    """Check that a run can resume from a checkpoint, whose weights ``model`` gets. Returns: the step of the
+    checkpoint, and one line for each setting that ``config`` changes. InputError: not a checkpoint of a
+    training run, of another model (names the tensor), or changed since it was written."""
     checkpoint = read_checkpoint(path, whole=True)
     for key in ("global_step", "optimizer_states"):
         if key not in checkpoint:

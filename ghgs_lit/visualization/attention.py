@@ -38,11 +38,8 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     """Draw the query (outlined) and its neighbours on the views of its subject.
 
     The first row shows the neighbours, the nearest brightest; captions give their number in each view. One
-    row for each layer follows with the weights, averaged over heads, the largest brightest; captions give
-    the share of each view.
-
-    Args:
-        batch: gives the photographs, padded to whole patches.
+    row for each layer follows with the weights, averaged over heads, the largest brightest; captions give the
+    share of each view. ``batch``: gives the photographs, padded to whole patches.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views
@@ -63,7 +60,6 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
 def _tiles(
     images: list[np.ndarray], tokens: Tokens, attention: TokenAttention, strengths: Tensor
 ) -> list[np.ndarray]:
-    """Each view, darker, with its neighbours in the colours of their ``strengths`` in [0, 1]."""
     scale = max(1, -(-_SIDE // images[0].shape[0]))
     side, views = tokens.patch_size * scale, tokens.grid[1]
 

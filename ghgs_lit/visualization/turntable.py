@@ -69,9 +69,7 @@ def turntable(cameras: Cameras, frames: int, points: Tensor | None = None) -> Ca
 
     They begin at the side of the first camera and have its lens. With ``points`` they turn about the middle
     of their box, look straight at it, and have a wider lens where the first camera's would cut them off.
-
-    Args:
-        points: of the subject [n, 3], n may be 0; None: they turn about where the optical axes meet.
+    ``points``: of the subject [n, 3], n may be 0; None: they turn about where the optical axes meet.
     """
     angles = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / max(frames, 1))
     return orbit(cameras, angles, points)

@@ -113,16 +113,8 @@ def model_state(checkpoint: Mapping[str, Any], prefix: str = STATE_PREFIX) -> di
 
 
 def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path) -> None:
-    """Refuse tensors that are not exactly those of ``module``.
-
-    Args:
-        module: its tensors may be on the meta device.
-        state: tensors by name.
-        source: where they come from, for messages.
-
-    Raises:
-        InputError: a key is missing, unknown or has another shape; names source, key and both shapes.
-    """
+    """Refuse tensors that are not exactly those of ``module``. InputError: a key is missing, unknown or has
+    another shape; names source, key and both shapes. ``module``: its tensors may be on the meta device."""
     own = module.state_dict()
     for key in own:
         require(key in state, f"{source}: {key}", f"a tensor of shape {tuple(own[key].shape)}", "nothing")
@@ -133,11 +125,7 @@ def require_fit(module: nn.Module, state: Mapping[str, Any], source: str | Path)
 
 def require_finite(state: Mapping[str, Tensor], source: str | Path) -> None:
     """Refuse weights with NaN or infinity, of which every prediction would be empty; names the first tensor.
-
-    Args:
-        state: tensors by name.
-        source: where they come from, for messages.
-    """
+    ``state``: tensors by name. ``source``: where they come from, for messages."""
     for key, value in state.items():
         # A sum is not finite where a term is not, and needs no second tensor. Half precision would overflow.
         total = value.sum(dtype=torch.promote_types(value.dtype, torch.float32))
@@ -166,14 +154,7 @@ def shape_of(value: Any) -> tuple[int, ...] | str:
 def write_checkpoint(
     path: str | Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **facts: Any
 ) -> None:
-    """Write a checkpoint.
-
-    Args:
-        path: the file to write.
-        state: the model's tensors by name.
-        config: the configuration that builds the model.
-        facts: further plain data to store.
-    """
+    """Write a checkpoint."""
     content = {
         "state_dict": {f"{STATE_PREFIX}{key}": value for key, value in state.items()},
         "config": dict(config),

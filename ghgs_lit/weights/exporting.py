@@ -1,8 +1,6 @@
 """Writes a checkpoint's tensors under their published names, for the authors' code or VGGT's."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -17,15 +15,9 @@ from ghgs_lit.weights.switches import differences
 
 def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str | Path | None) -> list[str]:
     """Write the tensors of ``checkpoint``, bit for bit, under their published names; returns a report.
-
-    Args:
-        checkpoint: a checkpoint of this package.
-        vggt: the file for the encoder (safetensors or PyTorch, by its suffix); None to leave it out.
-        release: the PyTorch file for everything else; None to leave it out.
-
-    Raises:
-        InputError: both files are None, or a tensor has no published name; then nothing is written.
-    """
+    InputError: both files are None, or a tensor has no published name; then nothing is written. ``vggt``: the
+    file for the encoder (safetensors or PyTorch, by its suffix); None to leave it out. ``release``: the
+    PyTorch file for everything else; None to leave it out."""
     require(vggt is not None or release is not None, "vggt", "vggt=<file>, release=<file> or both", None)
     content = read_checkpoint(checkpoint, whole=True)
     state = model_state(content)
@@ -39,33 +31,21 @@ def export_weights(checkpoint: str | Path, vggt: str | Path | None, release: str
         if path is not None:
             named = {names.to_published(name, table): name for name in own}
             if None in named:
-                raise _unpublished(checkpoint, named[None], content["config"])
+                differing = ", ".join(differences(content["config"]))
+                raise InputError(
+                    f"{checkpoint}: expected a model of the release's form for release=<file>; found one"
+                    f" without a published form, with {named[None]} (it differs in {differing})"
+                )
             files.append((path, {published: own[name] for published, name in named.items()}, entry))
     for file in files:
         write_tensors(*file)
     return [f"{path}: {len(tensors)} tensors" for path, tensors, _ in files]
 
 
-def _unpublished(checkpoint: str | Path, name: str, config: Mapping[str, Any]) -> InputError:
-    """Why a model has no published form: a tensor, and the settings that differ from the release's."""
-    differing = ", ".join(differences(config))
-    return InputError(
-        f"{checkpoint}: expected a model of the release's form for release=<file>; found one without a"
-        f" published form, with {name} (it differs in {differing})"
-    )
-
-
 def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | None = None) -> None:
-    """Write tensors by name as safetensors or a PyTorch file, by the suffix of ``path``.
-
-    Args:
-        path: the file to write.
-        tensors: tensors by name.
-        entry: the key of the PyTorch file under which they are stored; None for no such level.
-
-    Raises:
-        InputError: ``entry`` is given for safetensors, which have no levels.
-    """
+    """Write tensors by name as safetensors or a PyTorch file, by the suffix of ``path``. InputError:
+    ``entry`` is given for safetensors, which have no levels. ``entry``: the key of the PyTorch file under
+    which they are stored; None for no such level."""
     if Path(path).suffix == ".safetensors":
         require(entry is None, "release", f"a PyTorch file (.pth), which holds {entry!r}", ".safetensors")
         write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata={"format": "pt"}))

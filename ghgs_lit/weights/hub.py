@@ -28,13 +28,8 @@ def fetch(repository: str, filename: str = FILE) -> tuple[Path, str]:
     """The path of a repository's file and its SHA-256, from the local cache or the hub.
 
     Shows progress, resumes an earlier download, and compares the checksum with the published one.
-
-    Args:
-        repository: ``owner/repository``.
-        filename: the file in it.
-
-    Raises:
-        InputError: the package, the network or the repository is missing, or the checksum differs.
+    ``repository``: ``owner/repository``. InputError: the package, the network or the repository is missing,
+    or the checksum differs.
     """
     try:
         import huggingface_hub

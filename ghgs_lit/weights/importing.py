@@ -117,10 +117,7 @@ def import_weights(
     Args:
         state: the model's tensors. Those on the meta device must come from the files, others may keep
             their values.
-        config: the configuration that builds the model.
-        out: the checkpoint to write.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
-        release: the authors' checkpoint; None without it.
         dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
         depth_head: what the depth head starts from without ``release``, ``fresh`` or ``vggt``.
 
@@ -154,14 +151,9 @@ def import_weights(
 
 
 def match_files(state: Mapping[str, Tensor], files: Sequence[Source]) -> list[str]:
-    """Find the file of each tensor of ``state`` (``Source.used``), by names and shapes alone.
-
-    Returns:
-        The names of tensors that are in no file and keep their values.
-
-    Raises:
-        InputError: a tensor on the meta device is in no file, or a file does not fit.
-    """
+    """Find the file of each tensor of ``state`` (``Source.used``), by names and shapes alone. Returns: the
+    names of tensors that are in no file and keep their values. InputError: a tensor on the meta device is in
+    no file, or a file does not fit."""
     for source in files:
         source.match(state)
     missing = [name for name in state if not any(name in source.used for source in files)]

@@ -13,16 +13,9 @@ _FACTS = ("imported",)  # what loading reads beside weights and configuration
 
 
 def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
-    """Write the model of ``checkpoint`` without optimizer, losses and progress.
-
-    Args:
-        checkpoint: a checkpoint of this package.
-        path: the file to write, a checkpoint too.
-        dtype: of all weights: ``float16``, ``bfloat16`` or ``float32``.
-
-    Raises:
-        InputError: a weight is too large for ``dtype``, or both are one file.
-    """
+    """Write the model of ``checkpoint`` without optimizer, losses and progress. InputError: a weight is too
+    large for ``dtype``, or both are one file. ``dtype``: of all weights: ``float16``, ``bfloat16`` or
+    ``float32``."""
     if Path(checkpoint).resolve() == Path(path).resolve():
         raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
     content = read_checkpoint(checkpoint, whole=True)

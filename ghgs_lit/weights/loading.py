@@ -20,7 +20,6 @@ def load_weights(
 
     Args:
         model: a :class:`ghgs_lit.model.GHGS`; its own weights may be on the meta device.
-        path: of the checkpoint.
         dtype: of the encoder (None: as in the file, on a CPU float32 in place of a half precision that it
             lacks); the heads are float32 or wider.
         device: where the weights will be moved to.

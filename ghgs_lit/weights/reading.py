@@ -44,10 +44,7 @@ def open_file(path: str | Path) -> Any:
     """The content of a safetensors or PyTorch file; its format is read from its first bytes.
 
     Nothing in the file is ever executed (``weights_only=True``). ``path``: the file, or :data:`SHIPPED`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: it has another format, is truncated, or holds code.
+    FileNotFoundError: there is no such file. InputError: it has another format, is truncated, or holds code.
     """
     path = file_of(path)
     start = require_weights(path)
@@ -125,10 +122,8 @@ def cast(
 
     Tensors that have it already stay mapped. Pages of a mapping count as memory once they were read, so the
     file is closed and opened again after every 256 MB: never more than the result and one chunk is held.
-
-    Args:
-        open_tensors: opens the file; gives its tensors by name.
-        dtype_of: the precision of a tensor, given its name and its stored precision.
+    ``open_tensors``: opens the file; gives its tensors by name. ``dtype_of``: the precision of a tensor,
+    given its name and its stored precision.
     """
     tensors = open_tensors()
     names = list(tensors)

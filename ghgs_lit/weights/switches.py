@@ -37,13 +37,9 @@ def release_switches() -> dict[tuple[str, ...], Any]:
 
 
 def differences(config: Mapping[str, Any], other: Mapping[str, Any] | None = None) -> list[str]:
-    """The switches in which two models differ, as ``<key>=<value> for <other value>``.
-
-    Args:
-        config: the configuration of a model.
-        other: that of another model; None for the release. What it has no stage of (a checkpoint of
-            ``ghgs pretext`` is an encoder alone) does not differ.
-    """
+    """The switches in which two models differ, as ``<key>=<value> for <other value>``. ``other``: that of
+    another model; None for the release. What it has no stage of (a checkpoint of ``ghgs pretext`` is an
+    encoder alone) does not differ."""
     found = []
     for (group, key), value in release_switches().items():
         if other is not None and group not in other:

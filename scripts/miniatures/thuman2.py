@@ -1,7 +1,7 @@
 """A small THuman2.0 of built-in people, rendered as the published scripts do.
 
 Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.data.layout`); people are those of
-``ghgs prepare task=miniature`` (:mod:`ghgs_lit.synthesis.miniature`).
+:mod:`scripts.miniatures.scans`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,12 +14,12 @@ from PIL import Image
 
 from ghgs_lit.data.layout import position_name
 from ghgs_lit.data.sampling import ViewNumber, subject_rng
-from ghgs_lit.synthesis.miniature import names, scan_of
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.types import Cameras
 from scripts.miniatures.capture import save_image
+from scripts.miniatures.scans import names, scan_of
 
 
 def make(

@@ -44,7 +44,7 @@ def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
     images, masks = views(b=2)
     expected = [encoder(images[b : b + 1], masks[b : b + 1]) for b in range(2)]
     stored = {torch.float64: "float32"}.get(dtype, str(dtype).removeprefix("torch."))
-    cache = FeatureCache(tmp_path, tokens="all", dtype=stored)
+    cache = FeatureCache(tmp_path, dtype=stored)
     first, second = (encoder(images, masks, cache=cache) for _ in range(2))
     same(first, second)
     assert (cache.hits, cache.made) == (2, 2)
@@ -55,22 +55,7 @@ def test_all_tokens_come_back_bit_for_bit(tmp_path, dtype):
     assert first.latent[0].dtype == dtype
 
 
-def test_the_subject_and_a_margin_are_kept(tmp_path):
-    """The kept tokens must be those at and around the subject, unchanged."""
-    encoder = make()
-    images, masks = views()
-    everything = encoder(images, masks)
-    # The subject lies in rows and columns 2 of 5 x 6 patches.
-    for margin, rows in ((0, {2}), (1, {1, 2, 3})):
-        found = encoder(images, masks, cache=FeatureCache(tmp_path, margin=margin))
-        assert set(found.row.tolist()) == set(found.column.tolist()) == rows
-        assert found.grid == everything.grid
-        flat = (found.image * 5 + found.row) * 6 + found.column
-        assert torch.equal(found.latent[1], everything.latent[1][flat])
-        assert torch.equal(found.semantic, everything.semantic[flat])
-
-
-@pytest.mark.parametrize("change", ["weight", "image", "mask", "bounds", "option", "margin", "autocast"])
+@pytest.mark.parametrize("change", ["weight", "image", "mask", "bounds", "option", "autocast"])
 def test_whatever_changes_the_tokens_misses(tmp_path, change):
     """A hit for other weights or photographs would be a silent wrong result."""
     encoder = make(bounds_input=change == "bounds", mask_input=True)
@@ -90,8 +75,6 @@ def test_whatever_changes_the_tokens_misses(tmp_path, change):
         bounds.far[0, 1, 2, 3] += 1e-3
     elif change == "option":
         cache, encoder.options = FeatureCache(tmp_path), encoder.options.replace(heads=4)
-    elif change == "margin":
-        cache = FeatureCache(tmp_path, margin=2)
     made = cache.made
     with torch.autocast("cpu", torch.bfloat16, enabled=change == "autocast"):
         encoder(images, masks, bounds, cache)
@@ -102,7 +85,7 @@ def test_masks_that_nothing_reads_do_not_miss(tmp_path):
     """A mask that has no influence must not make the cache encode again."""
     encoder = make()
     images, masks = views()
-    cache = FeatureCache(tmp_path, tokens="all")
+    cache = FeatureCache(tmp_path)
     encoder(images, masks, cache=cache)
     encoder(images, ~masks, cache=cache)
     assert (cache.hits, cache.made) == (1, 1)
@@ -112,7 +95,7 @@ def test_few_tokens_are_cached_as_they_are(tmp_path):
     """Tokens without a background depend on the mask and on what is kept, and come back as they were."""
     images, masks = views()
     for margin, made in ((0, 1), (1, 2)):
-        encoder, cache = make(tokens="subject", margin=margin), FeatureCache(tmp_path, tokens="all")
+        encoder, cache = make(tokens="subject", margin=margin), FeatureCache(tmp_path)
         expected = encoder(images, masks)
         assert not expected.is_dense
         same(encoder(images, masks, cache=cache), expected)
@@ -145,7 +128,7 @@ def test_half_precision_files_give_the_same_twice(tmp_path):
     encoder = make()
     images, masks = views()
     exact = encoder(images, masks)
-    cache = FeatureCache(tmp_path, tokens="all", dtype="bfloat16")
+    cache = FeatureCache(tmp_path, dtype="bfloat16")
     first, second = (encoder(images, masks, cache=cache) for _ in range(2))
     same(first, second)
     assert first.latent[0].dtype == torch.float32
@@ -188,13 +171,13 @@ def test_an_encoder_that_learns_is_refused(tmp_path):
 
 def test_the_report_says_how_much_there_is(tmp_path):
     """The user must see whether the cache worked and what it takes on disk."""
-    encoder, cache = make(), FeatureCache(tmp_path / "new", tokens="all")
+    encoder, cache = make(), FeatureCache(tmp_path / "new")
     images, masks = views()
     encoder(images, masks, cache=cache)
     encoder(images, masks, cache=cache)
     size = sum(path.stat().st_size for path in tmp_path.glob("new/*/*"))
     assert cache.report() == (
-        f"feature cache {tmp_path / 'new'}: 1 found, 1 made ({size / 1e6:.1f} MB; all tokens, float32);"
+        f"feature cache {tmp_path / 'new'}: 1 found, 1 made ({size / 1e6:.1f} MB; tokens, float32);"
         f" 1 files, {size / 1e6:.1f} MB in all"
     )
 
@@ -202,12 +185,12 @@ def test_the_report_says_how_much_there_is(tmp_path):
 def test_the_oldest_files_make_room(tmp_path):
     """A training of days must not fill the disk: the size is bounded and the newest samples stay."""
     encoder = make()
-    first = FeatureCache(tmp_path, tokens="all")
+    first = FeatureCache(tmp_path)
     encoder(*views(seed=1), cache=first)
     one = first.written
     for place, file in enumerate(tmp_path.glob("*/*")):
         os.utime(file, (place, place))
-    cache = FeatureCache(tmp_path, tokens="all", max_gb=2.5 * one / 1e9)
+    cache = FeatureCache(tmp_path, max_gb=2.5 * one / 1e9)
     for seed in (2, 3, 4):
         encoder(*views(seed=seed), cache=cache)
         assert sum(file.stat().st_size for file in tmp_path.glob("*/*")) <= 2.5 * one
@@ -218,9 +201,7 @@ def test_the_oldest_files_make_room(tmp_path):
     assert (cache.hits, cache.made) == (1, 4)
 
 
-@pytest.mark.parametrize(
-    "option", [{"tokens": "most"}, {"margin": -1}, {"dtype": "int8"}, {"max_gb": 0}, {"max_gb": -1.5}]
-)
+@pytest.mark.parametrize("option", [{"of": "most"}, {"dtype": "int8"}, {"max_gb": 0}, {"max_gb": -1.5}])
 def test_impossible_options_are_refused(tmp_path, option):
     """A bad value is found when the configuration is read, by its key."""
     with pytest.raises(InputError, match=f"feature_cache.{next(iter(option))}"):
@@ -238,26 +219,22 @@ def test_tokens_of_a_hit_need_no_encoder(tmp_path, monkeypatch):
     assert dataclasses.asdict(expected)["grid"] == (1, 2, 5, 6)
 
 
-@pytest.mark.parametrize(("recalibrated", "kept"), [("subject", "subject"), ("all", "all")])
-def test_all_tokens_are_kept_where_all_are_recalibrated(tmp_path, recalibrated, kept):
-    """Recalibration of all tokens must not see a subset of them."""
+@pytest.mark.parametrize("recalibrated", ["subject", "all"])
+def test_predictions_are_those_without_a_cache(tmp_path, recalibrated):
+    """Recalibration and heads must not see other tokens."""
     model = make_model("model=paper", f"recalibration.tokens={recalibrated}").eval()
     batch = make_batch(height=140, width=112, views=3)
-    options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "float32"}
     with torch.no_grad():
         expected = model(batch)
-        model.feature_cache = cache = FeatureCacheOptions(**options).build(model.recalibration.tokens)
+        model.feature_cache = cache = FeatureCacheOptions(directory=str(tmp_path)).build()
         first, second = model(batch), model(batch)
-    assert cache.tokens == kept
     assert (cache.hits, cache.made) == (1, 1)
     close(second.gaussians, first.gaussians, 0.0)
-    assert torch.equal(first.gaussians.means, expected.gaussians.means) == (kept == "all")
+    assert torch.equal(first.gaussians.means, expected.gaussians.means)
 
 
 def test_no_directory_is_no_cache():
     """Without a directory nothing is written, and a model has no cache of its own."""
-    options = {"directory": None, "tokens": "subject", "margin": 1, "dtype": "float32"}
-    assert FeatureCacheOptions(**options).build() is None
     assert FeatureCacheOptions().build() is None
     assert make_model("model=paper").feature_cache is None
 
@@ -321,7 +298,7 @@ def test_a_patch_encoder_that_learns_is_refused(tmp_path):
 
 def test_a_cache_is_of_views_or_of_photographs(tmp_path):
     """A typing error must not choose another cache."""
-    options = {"directory": str(tmp_path), "tokens": "subject", "margin": 1, "dtype": "bfloat16", "max_gb": 2}
+    options = {"directory": str(tmp_path), "dtype": "bfloat16", "max_gb": 2}
     assert isinstance(FeatureCacheOptions(**options, of="views").build(), FeatureCache)
     cache = FeatureCacheOptions(**options, of="photographs").build()
     assert (type(cache), cache.dtype, cache.limit) == (PhotographCache, "bfloat16", 2_000_000_000)

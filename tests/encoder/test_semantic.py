@@ -117,7 +117,7 @@ def test_the_branch_does_not_learn_and_the_rest_does():
 def test_a_cached_feature_is_not_that_of_another_mask(tmp_path):
     """The branch reads masks, also in an encoder that does not."""
     encoder, (images, masks) = make(trainable="none").float(), views()
-    cache = FeatureCache(tmp_path, tokens="all")
+    cache = FeatureCache(tmp_path)
     first, again, other = (
         encoder(images.float(), mask, cache=cache).semantic for mask in (masks, masks, ~masks)
     )

@@ -274,8 +274,8 @@ def test_a_sweep_becomes_a_table(boxes, tmp_path):
     assert text.count("missing") == 2 * 9 + 2 * 6
     assert r"\begin{tabular}" in (tmp_path / "table" / "table.tex").read_text()
     assert (tmp_path / "table" / "table.csv").read_text().count(",full,") == 9
-    # The directory under the name that is a group of `train`, too; the paper's layout; a bad one.
-    again = ["table", f"sweep=[{tmp_path / 'sweep'}]", f"hydra.run.dir={tmp_path / 'second'}"]
+    # The paper's layout; a bad one.
+    again = ["table", f"runs=[{tmp_path / 'sweep'}]", f"hydra.run.dir={tmp_path / 'second'}"]
     assert ghgs(*again, "layout=table2", "columns=psnr_box") == 1
     assert ghgs(*again, "layout=table2", "columns=psnr", "test.against=best", r'test.unit="(.+)"') == 0
     assert "RoGSplat" in (tmp_path / "second" / "table.md").read_text()

@@ -8,6 +8,7 @@ import kornia
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 from scipy.signal import convolve2d
 from torchmetrics.functional.image import (
@@ -17,7 +18,7 @@ from torchmetrics.functional.image import (
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import PSNR_CAP, MetricsOptions, depth_error_mm, flip_map, psnr, ssim
-from ghgs_lit.metrics.functional import box_of, ssim_map
+from ghgs_lit.metrics.functional import box_of, crop_of, ssim_map
 from ghgs_lit.training.base import image_mean
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
@@ -123,6 +124,47 @@ def test_psnr_of_known_errors_by_region():
     assert psnr(image, target).item() == pytest.approx(20 + 10 * np.log10(120), abs=1e-4)
     assert psnr(image, target, box).item() == pytest.approx(20 + 10 * np.log10(24), abs=1e-4)
     assert psnr(image, target, mask).item() == pytest.approx(20 + 10 * np.log10(2), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("box", "expected"),
+    [
+        (
+            (100, 900, 300, 500),
+            (0, 1000, 150, 650),
+        ),  # (1000 - 800) // 2 above, the rest below
+        ((110, 901, 301, 500), (6, 1006, 151, 651)),  # an odd side
+        ((200, 1020, 10, 120), (24, 1024, 0, 500)),  # at the lower and at the left border
+        ((2, 800, 900, 1000), (0, 1000, 524, 1024)),  # at the upper and at the right border
+    ],
+)
+def test_the_crop_is_that_of_published_scripts(box, expected):
+    """Sides of 1000 x 500 of 1024 x 1024, centred on the box, moved inside the image."""
+    mask = torch.zeros(2, 1024, 1024, dtype=torch.bool)
+    mask[0, box[0] : box[1], box[2] : box[3]] = True
+    crop, (top, bottom, left, right) = crop_of(mask), expected
+    assert crop[0].sum() == 1000 * 500
+    assert crop[0, top:bottom, left:right].all()
+    assert not crop[1].any()
+
+
+def test_files_are_measured_as_written(tmp_path):
+    """``metrics=files``: PSNR and SSIM inside a window of what PNG files hold."""
+    image, target = (0.3 * i + 0.35 for i in _images(1, 64, 48))
+    mask = torch.zeros(1, 64, 48, dtype=torch.bool)
+    mask[:, 20:50, 20:31] = True
+    found = MetricsOptions(protocol="files", regions=("crop",), lpips="off").build()(image, target, mask)
+    read = []
+    for name, values in (("image", image), ("target", target)):
+        eighths = (255 * values[0].clamp(0, 1)).round().permute(1, 2, 0).numpy().astype(np.uint8)
+        Image.fromarray(eighths).save(tmp_path / f"{name}.png")
+        read.append(np.asarray(Image.open(tmp_path / f"{name}.png")) / 255)
+    rows, columns = slice(2, 64), slice(14, 37)  # 62 x 23 pixels, moved inside the image
+    expected = -10 * np.log10(np.mean((read[0] - read[1])[rows, columns] ** 2))
+    assert found["psnr_crop"].item() == pytest.approx(expected, abs=1e-4)
+    assert found["psnr_crop"] != psnr(image, target, crop_of(mask))
+    image, target = (torch.from_numpy(values).float().permute(2, 0, 1)[None] for values in read)
+    assert torch.allclose(found["ssim_crop"], ssim(image, target, "valid", crop_of(mask)), atol=1e-5)
 
 
 def test_equal_images_and_empty_regions_are_defined():

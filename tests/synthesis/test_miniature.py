@@ -5,25 +5,23 @@ import functools
 import pytest
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.synthesis import miniature
 from scripts import miniature as layouts
-from scripts.miniatures import humman, thuman2, zju_mocap
+from scripts.miniatures import humman, scans, thuman2, zju_mocap
 from tests.helpers.captures import refused
 
-# For each data set: the key of the folder, a file of the real data in it, the function that writes, and what
-# checks the folder first.
+# For each data set: the key of the folder, a file of the real data in it, and the function that writes.
 CASES = {
-    "zju_mocap": ("root", "CoreView_386/annots.npy", zju_mocap, "make", layouts),
-    "humman": ("root", "p000455_a000986/cameras.json", humman, "make", layouts),
-    "thuman2": ("root", "train/img/0000_000/0.jpg", thuman2, "make", layouts),
-    "thuman2 raw": ("source", "0000/0000.obj", miniature, "make_scans", miniature),
+    "zju_mocap": ("root", "CoreView_386/annots.npy", zju_mocap, "make"),
+    "humman": ("root", "p000455_a000986/cameras.json", humman, "make"),
+    "thuman2": ("root", "train/img/0000_000/0.jpg", thuman2, "make"),
+    "thuman2 raw": ("source", "0000/0000.obj", scans, "make_scans"),
 }
 
 
 @pytest.fixture(params=CASES)
 def case(request, tmp_path, monkeypatch):
     """(make, folder, file of the real data): ``make`` writes that file in place of people."""
-    key, file, module, function, checking = CASES[request.param]
+    key, file, module, function = CASES[request.param]
     folder = tmp_path / "data"
 
     def write(target, *arguments, **options):
@@ -35,7 +33,7 @@ def case(request, tmp_path, monkeypatch):
     cfg = compose("prepare", [f"data={request.param.split()[0]}", f"data.{key}={folder}"])
     data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
     return (
-        lambda: checking.make_miniature(data.dataset, {"train": 1, "val": 1}, 64, 0),
+        lambda: layouts.make_miniature(data.dataset, {"train": 1, "val": 1}, 64, 0),
         folder,
         folder / file,
     )
@@ -51,7 +49,7 @@ def test_real_data_is_not_overwritten(case):
         make,
     )
     assert file.read_text() == "real"
-    assert not (folder / miniature.MARKER).exists()
+    assert not (folder / scans.MARKER).exists()
 
 
 def test_a_miniature_can_be_written_again(case):
@@ -60,7 +58,7 @@ def test_a_miniature_can_be_written_again(case):
     make()
     make()
     assert file.read_text() == "miniature"
-    (folder / miniature.MARKER).write_text('{"files": null}')  # as a killed run leaves it
+    (folder / scans.MARKER).write_text('{"files": null}')  # as a killed run leaves it
     make()
     (folder / "mine.txt").write_text("mine")
     refused(r"found 1 other files such as mine\.txt", make)
@@ -68,9 +66,9 @@ def test_a_miniature_can_be_written_again(case):
 
 def test_what_lies_beside_is_not_overwritten(tmp_path):
     """The body model beside HuMMan and the fits beside raw scans are checked like the data itself."""
-    for name, key, beside, checking in (
-        ("humman", "root", "data_body_models/smpl/SMPL_NEUTRAL.pkl", layouts),
-        ("thuman2", "source", "THuman2.0_smplx/0000/smplx_param.pkl", miniature),
+    for name, key, beside in (
+        ("humman", "root", "data_body_models/smpl/SMPL_NEUTRAL.pkl"),
+        ("thuman2", "source", "THuman2.0_smplx/0000/smplx_param.pkl"),
     ):
         path = tmp_path / name / beside
         path.parent.mkdir(parents=True)
@@ -79,17 +77,6 @@ def test_what_lies_beside_is_not_overwritten(tmp_path):
         data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
         refused(
             "expected an empty folder",
-            functools.partial(checking.make_miniature, data.dataset, {"train": 1, "val": 0}, 64, 0),
+            functools.partial(layouts.make_miniature, data.dataset, {"train": 1, "val": 0}, 64, 0),
         )
         assert path.read_text() == "licensed"
-
-
-@pytest.mark.parametrize("choice", ["data=humman", "data=thuman2"])
-def test_the_verb_writes_scans_alone(choice):
-    """Other layouts are written by a script; the message says what the verb takes."""
-    cfg = compose("prepare", [choice, "data.root=data"])
-    data = build(cfg.data, "data", views=cfg.views, targets=cfg.targets, seed=0)
-    refused(
-        "expected data=thuman2 data.source=<folder>; found",
-        lambda: miniature.make_miniature(data.dataset, {"train": 1, "val": 0}, 64, 0),
-    )

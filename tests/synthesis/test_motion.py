@@ -11,6 +11,7 @@ from ghgs_lit.evaluation.measure import Estimate, measure_all
 from ghgs_lit.metrics import MetricsOptions
 from ghgs_lit.synthesis import motion, people
 from ghgs_lit.synthesis.datasets import Synthetic
+from ghgs_lit.synthesis.people.body import load_body
 from ghgs_lit.synthesis.people.mesh import Person
 from tests.helpers.people import V4, box_person
 
@@ -85,7 +86,7 @@ def test_the_way_there_and_back_is_even_but_at_the_poses():
 
 @pytest.mark.parametrize("index", [INDEX, 2_000_002])
 def test_one_foot_stays_and_the_lower_one_is_on_the_ground(index):
-    body = motion.load_body()
+    body = load_body()
     rng = np.random.default_rng(index)
     coefficients, _, _ = body.sample_shape(rng)
     first, second = (motion.pose_figure(body, coefficients, rng) for _ in range(2))

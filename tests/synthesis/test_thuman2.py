@@ -15,7 +15,6 @@ from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.synthesis import people
-from ghgs_lit.synthesis.miniature import POSE_SIZES, make_scans, scan_of
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
@@ -23,6 +22,7 @@ from ghgs_lit.synthesis.thuman2 import THuman2
 from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
 from ghgs_lit.types import Cameras
 from scripts.miniatures import thuman2 as miniature
+from scripts.miniatures.scans import POSE_SIZES, make_scans, scan_of
 from tests.helpers.captures import stored
 from tests.helpers.people import V4
 

@@ -13,9 +13,9 @@ from PIL import Image
 
 from ghgs_lit.data.check import inspect, show, split_line, write
 from ghgs_lit.errors import InputError
-from ghgs_lit.synthesis.miniature import make_scans
 from ghgs_lit.synthesis.thuman2 import THuman2
 from scripts.miniatures import thuman2 as miniature
+from scripts.miniatures.scans import make_scans
 from tests.data.test_pickles import Call
 from tests.helpers.people import V4
 

@@ -11,7 +11,7 @@ from ghgs_lit.config.verbs import Train
 from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
-from ghgs_lit.training.budgets import drawn_budget, token_budget
+from ghgs_lit.training.module import drawn_budget, token_budget
 from tests.helpers.losses import losses_of
 from tests.helpers.models import close, make_model
 from tests.helpers.scenes import make_batch
@@ -43,7 +43,7 @@ def test_budgets_need_features_of_their_own(tmp_path):
     encoder = make_model("encoder.trainable=none", "encoder.bounds_input=false").encoder
     batch = make_batch(views=2, height=112, width=84)
     model = SimpleNamespace(encoder=encoder)
-    cache = FeatureCache(tmp_path, tokens="all")
+    cache = FeatureCache(tmp_path)
     for made, budget in enumerate([1, 0, "all"], start=1):
         with token_budget(model, budget):
             tokens = encoder(batch.images, batch.masks, None, cache)

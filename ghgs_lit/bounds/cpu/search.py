@@ -19,14 +19,8 @@ def carve(
     position: Float[Tensor, "B 3 n"],
     tolerance: int,
 ) -> Bool[Tensor, "B n n n"]:
-    """Which cells of a grid at most ``tolerance`` views place outside; see :func:`subject_box`.
-
-    Args:
-        outside: 1 where a view says "outside".
-        matrices: world points to pixels.
-        position: of the cells along each axis.
-        tolerance: votes that a kept cell may have.
-    """
+    """Which cells of a grid at most ``tolerance`` views place outside; see :func:`subject_box`. ``outside``:
+    1 where a view says "outside". ``tolerance``: votes that a kept cell may have."""
     from ghgs_lit.bounds.cpu.kernel import carve_slices  # here: it loads a compiler
 
     elements, cells = position.shape[0], position.shape[2]
@@ -59,9 +53,7 @@ def march(
     Args:
         outside: 1 where a view says "outside".
         masks: rays of their pixels are searched.
-        matrices: world points to pixels.
         directions: of the rays, per metre of depth.
-        centers: of the cameras.
         near, far: contiguous; rays that miss the hull keep theirs.
         steps: shares of the way from near to far that are tried.
         tolerance: votes that an allowed depth may have.

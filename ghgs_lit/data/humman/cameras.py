@@ -21,12 +21,8 @@ _NEAREST, _FURTHEST = 0.1, 100.0
 
 @dataclass(frozen=True)
 class Calibration:
-    """Ten cameras.
-
-    Attributes:
-        intrinsics: [10, 3, 3] in pixels, pixel centres at integers.
-        extrinsics: [10, 4, 4], world to camera, metres.
-    """
+    """Ten cameras. ``intrinsics``: [10, 3, 3] in pixels, pixel centres at integers. ``extrinsics``: [10, 4,
+    4], world to camera, metres."""
 
     intrinsics: np.ndarray
     extrinsics: np.ndarray

@@ -35,7 +35,6 @@ def _path(sequence: Path, kinect: int, frame: int) -> Path:
 
 
 def _points(path: Path, cameras: Calibration, kinect: int) -> np.ndarray:
-    """World points [n, 3] of all pixels of a depth map that have a depth."""
     depth = np.asarray(read_image(path))
     if depth.ndim != 2 or depth.dtype == np.uint8:
         raise InputError(

@@ -34,17 +34,14 @@ class _Frame:
 
 class HuMManReader(FrameReader):
     """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
+    InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
 
     Args:
         sequences: names of folders; missing ones are left out.
         frames: numbers of frames; those that a sequence lacks are left out, and of a frame the cameras.
-        masks: folder of masks, ``kinect_mask`` or ``kinect_mask_manual``.
         body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
             cameras inside all masks; ``none``.
         limit: number of frames in all, the first ones (None: all).
-
-    Raises:
-        InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
     """
 
     def __init__(
@@ -113,7 +110,6 @@ class HuMManReader(FrameReader):
         return str(_file(frame.folder, self.masks, position, frame.number))
 
     def _mask(self, frame: _Frame, position: int, size: tuple[int, int] | None = None) -> np.ndarray:
-        """Where the matting has any value."""
         path = _file(frame.folder, self.masks, position, frame.number)
         if size is None:
             image = read_image(path)

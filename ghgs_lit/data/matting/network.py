@@ -41,11 +41,8 @@ class MattingNetwork(nn.Module):
         self, images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
     ) -> tuple[Float[Tensor, "B h w"], Float[Tensor, "B 3 h w"]]:
         """The mattes, in [0, 1] in evaluation alone, and the subject's colours multiplied by them.
-
-        Args:
-            images: photographs with what is behind the subject, in [0, 1].
-            mattes: what is known of it, such as masks of 0 and 1.
-        """
+        ``images``: photographs with what is behind the subject, in [0, 1]. ``mattes``: what is known of it,
+        such as masks of 0 and 1."""
         height, width = images.shape[2:]
         whole = 2 ** (len(_WIDTHS) - 1)
         x = F.pad(_features(images, mattes), (0, -width % whole, 0, -height % whole), mode="replicate")

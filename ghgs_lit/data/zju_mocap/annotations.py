@@ -97,7 +97,6 @@ def _entry(place: Path | str, content: Any, key: str) -> Any:
 
 
 def _extrinsics(place: str, rotation: Any, translation: Any) -> np.ndarray:
-    """[4, 4] in metres."""
     rotation = check_array(f"{place}: R", rotation, [(3, 3)])
     translation = check_array(f"{place}: T", translation, [(3, 1), (3,), (1, 3)]).reshape(3, 1) / MILLIMETRES
     return check_extrinsics(place, np.concatenate((rotation, translation), 1))

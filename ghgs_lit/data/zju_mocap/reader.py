@@ -60,16 +60,8 @@ class _Frame:
 class ZJUMoCapReader(FrameReader):
     """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
 
-    Missing sequences are left out (``ghgs prepare task=check`` counts them).
-
-    Args:
-        cameras: number of cameras used of each sequence, the first ones (None: all 21 or 23).
-        undistorted: remove the lens distortion of photographs and masks.
-        masks: folders of label maps; those that a sequence has are united.
-        limit: number of frames in all, the first ones (None: all).
-
-    Raises:
-        InputError: all sequences are missing, or annotations are bad.
+    Missing sequences are left out (``ghgs prepare task=check`` counts them). InputError: all sequences are
+    missing, or annotations are bad. ``limit``: number of frames in all, the first ones (None: all).
     """
 
     def __init__(
@@ -145,7 +137,6 @@ class ZJUMoCapReader(FrameReader):
         return folders
 
     def _mask(self, folder: Path, photograph: PurePosixPath, size: tuple[int, int]) -> np.ndarray:
-        """Where any of the label maps has a label."""
         paths = [_find(masks, photograph, ".png") for masks in self._mask_folders(folder)]
         return functools.reduce(np.logical_or, [read_map(path, size) != 0 for path in paths])
 

@@ -1,13 +1,13 @@
 """The measurement: what a case computes and predicts, and how long each stage takes."""
 
-import statistics
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 
 from ghgs_lit.diagnostics.benchmark.error import differences
@@ -52,13 +52,10 @@ class Work:
     @classmethod
     def of(cls, works: Sequence["Work"]) -> "Work":
         """Of several batches: the mean, and the largest peak."""
-        flops = _merged([work.flops for work in works], statistics.fmean)
-        peaks = _merged([work.peaks for work in works], max)
-        return cls(flops, peaks, _merged([work.counts for work in works], statistics.fmean))
-
-
-def _merged(numbers: Sequence[dict[str, float]], merge: Callable[..., float]) -> dict[str, float]:
-    return {name: merge(one[name] for one in numbers) for name in numbers[0]}
+        flops, peaks, counts = (
+            pd.DataFrame([getattr(work, name) for work in works]) for name in ("flops", "peaks", "counts")
+        )
+        return cls(flops.mean().to_dict(), peaks.max().to_dict(), counts.mean().to_dict())
 
 
 @dataclass
@@ -81,12 +78,8 @@ def order(turn: int, count: int) -> list[int]:
 def time_cases(
     cases: Sequence[Case], batches: Sequence[Batch], warmup: int, repeats: int, device: torch.device
 ) -> list[dict[str, Times]]:
-    """The seconds of each stage of each case, means over the batches, in interleaved rounds.
-
-    Args:
-        warmup: rounds that do not count.
-        repeats: rounds that count, at least 1.
-    """
+    """The seconds of each stage of each case, means over the batches, in interleaved rounds. ``warmup``:
+    rounds that do not count. ``repeats``: rounds that count, at least 1."""
     seconds: list[dict[str, list[float]]] = [{} for _ in cases]
     for turn in track(range(-warmup, repeats), "rounds"):
         for number in order(turn, len(cases)):
@@ -140,12 +133,8 @@ def record_cases(
     device: torch.device,
     repeats: int,
 ) -> list[Record]:
-    """Measure work and error of cases on batches, then their times.
-
-    Args:
-        cases: of each source the yardstick first.
-        batches: on the device, with targets.
-    """
+    """Measure work and error of cases on batches, then their times. ``cases``: of each source the yardstick
+    first. ``batches``: on the device, with targets."""
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):

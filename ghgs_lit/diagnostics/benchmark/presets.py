@@ -130,14 +130,12 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """The cases of one source; they share one copy of the weights.
+    """The cases of one source; they share one copy of the weights. InputError: a preset or knob that the
+    model refuses, or to which the weights do not fit.
 
     Args:
         presets: of :func:`presets_of`; the yardstick comes first, without knobs, where it is among them.
         knobs: values of each knob, by key; every preset is measured with every combination.
-
-    Raises:
-        InputError: a preset or knob that the model refuses, or to which the weights do not fit.
     """
     choices = [(name, change) for name in presets for change in combinations(knobs)]
     if YARDSTICK in presets:

@@ -117,7 +117,6 @@ def _weights(name: str, value: Tensor) -> Tensor:
 
 
 def _comparison(stage: Stage, family: str, cases: Values) -> Callable[[str], Outcome]:
-    """What compares the cases in a dtype with the reference in float64."""
     # What all dtypes can represent: the rounding of the inputs is not the stage's error.
     exact = _inputs(_inputs(cases, "float32"), "float64")
     run = partial(evaluate, stage.reference or stage.run, gradients=stage.gradients, dtype="float64")

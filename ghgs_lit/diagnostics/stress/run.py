@@ -59,12 +59,8 @@ def _chosen(key: str, names: Sequence[str] | None, known: tuple[str, ...]) -> tu
 
 
 def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
-    """The rows of all tasks; those that ``journal`` has already are read from it.
-
-    Args:
-        journal: a file of one line for each task, which is written as the tasks end.
-        workers: processes; 0: this one.
-    """
+    """The rows of all tasks; those that ``journal`` has already are read from it. ``journal``: a file of one
+    line for each task, which is written as the tasks end. ``workers``: processes; 0: this one."""
     done = Journal(journal)
     done.say_done([task.key for task in tasks], "families")
     left = [task for task in tasks if task.key not in done]

@@ -18,12 +18,8 @@ _FEATURES = {torch.float32: {"avx2", "fma"}, torch.bfloat16: {"avx512f", "avx512
 
 
 def is_supported(q: Tensor, v: Tensor) -> bool:
-    """Whether :func:`attend` can compute this attention, and faster than PyTorch.
-
-    Args:
-        q: queries [n, a, t, d].
-        v: values [n, a, s, d].
-    """
+    """Whether :func:`attend` can compute this attention, and faster than PyTorch. ``q``: queries [n, a, t,
+    d]. ``v``: values [n, a, s, d]."""
     if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURES:
         return False
     n, a, t, d = q.shape

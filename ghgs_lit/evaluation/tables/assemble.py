@@ -25,6 +25,8 @@ BASELINES = {
     "true_depth": "Discs at the true depth",
     "untrained": "Untrained model",
 }
+#: Models that are built after other methods, by name.
+PEERS = {"gps": "After GPS-Gaussian", "pixel": "Pixel-aligned"}
 
 
 def build_tables(sweep: Sweep, others: Sequence[pd.DataFrame], options: TableOptions) -> list[Table]:
@@ -90,7 +92,6 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
 
 
 def _planned_here(rows: pd.DataFrame, sweep: Sweep, layout: Layout) -> list[Planned]:
-    """Training runs of the sweep that belong to the models and data of this table."""
     models, data = {variant.trained for variant in rows["variant"]}, set(rows["data"])
     return [
         p
@@ -154,7 +155,7 @@ def _measured_lines(variants: list[Variant], planned: list[Planned], layout: Lay
 
 
 def _label(variant: Variant, models: list[Variant]) -> str:
-    """``Ours``, with the differences between our variants where there are several."""
+    """``Ours`` or a peer's name, with the differences between variants where there are several."""
     if variant.kind == "baseline":
         return BASELINES.get(variant.name, variant.name)
     if variant.kind != "model":
@@ -164,5 +165,5 @@ def _label(variant: Variant, models: list[Variant]) -> str:
         return [v.model, v.encoder, v.ablation, *(f"{key}={value}" for key, value in v.extra)]
 
     different = [len(set(values)) > 1 for values in zip(*map(parts, models), strict=True)]
-    told = [part for part, differs in zip(parts(variant), different, strict=True) if differs]
-    return "Ours" + (f" ({', '.join(told)})" if told else "")
+    told = [p for p, differs in zip(parts(variant), different, strict=True) if differs and p not in PEERS]
+    return PEERS.get(variant.model, "Ours") + (f" ({', '.join(told)})" if told else "")

@@ -108,7 +108,6 @@ def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
 
 
 def _competing(table: Table, column: tuple) -> pd.Series:
-    """Means of a column by the numbers of the lines that compete."""
     means = table.cells["mean"].xs(column, level=CELL[1:]).dropna()
     return means[[table.lines[i].competes for i in means.index]]
 

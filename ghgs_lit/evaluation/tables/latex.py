@@ -58,7 +58,6 @@ def _column_spec(table: Table) -> str:
 
 
 def _frame(table: Table) -> pd.DataFrame:
-    """The texts of the table below the headings of groups (where the layout has any) and of metrics."""
     numbers = texts(table, _number)
     named = table.layout.heading != "none"
     stub = [

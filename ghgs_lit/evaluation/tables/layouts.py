@@ -136,19 +136,14 @@ class Table:
     """One table: everything that a writer of a format needs.
 
     Args:
-        options: what is shown.
         rows: what was measured, as in :class:`Sweep`.
         planned: the training runs of the sweep, finished or not, that belong to it.
         configs: the configuration of our model by ``source``.
-        stub: headings of the first columns.
-        groups, metrics: the columns.
         cells: by ``CELL``, every line and column in order: ``mean`` over subjects and seeds (nan: no number),
             ``deviation`` over seeds, ``seeds`` and ``lacking`` (seeds of planned runs without results) as
             tuples, ``count`` of subjects, ``runs`` (hashes or files), ``best``: whether it is the best of its
             column as printed, ``test`` (a :class:`Comparison` or None), and ``marked``.
-        caption, notes: the texts around it.
         reported_on: data of the reported figures, where it has any.
-        comparisons: number of tests that were made.
     """
 
     options: TableOptions

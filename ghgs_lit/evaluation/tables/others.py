@@ -54,10 +54,8 @@ def read_others(path: Path) -> pd.DataFrame:
     """The lines of another method's results file, as :class:`Sweep` has them of ours.
 
     ``said`` is the file's ``source``; lines that are means have no ``subject`` and may have a ``count``.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: it is not as the head of this module describes; the message names the key.
+    FileNotFoundError: there is no such file. InputError: it is not as the head of this module describes; the
+    message names the key.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected another method's results; found no such file")

@@ -81,7 +81,6 @@ class Sweep:
         rows: a line for each subject of each method of a run, number of views and kind of targets:
             ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's
             hash), ``git`` (in words), ``subject``, and the metrics, averaged over the subject's targets.
-        planned: the training runs, finished or not.
         configs: the configuration of our model by ``source``.
     """
 
@@ -108,15 +107,8 @@ def encoder_name(config: Mapping[str, Any]) -> str:
 
 
 def model_variant(config: Mapping[str, Any], source: str, by: Sequence[str] = ()) -> Variant:
-    """The row of a model.
-
-    Args:
-        config: the configuration that it was trained with.
-        by: keys that tell rows apart beside model, encoder and ablation.
-
-    Raises:
-        InputError: the configuration has no recalibration, by which the ablation is told.
-    """
+    """The row of a model. ``by``: keys that tell rows apart beside model, encoder and ablation. InputError:
+    the configuration has no recalibration, by which the ablation is told."""
     recalibration = config.get("recalibration")
     require(isinstance(recalibration, Mapping), f"{source}: recalibration", "a mapping", recalibration)
     compat = lookup(config, "compat.name")

@@ -38,12 +38,8 @@ class Comparison:
 
 
 def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> Comparison:
-    """Compare two rows; equal ones have p = 1.
-
-    Args:
-        row, reference: values by seed (index) and subject (columns).
-        alpha: one minus the probability of the interval.
-    """
+    """Compare two rows; equal ones have p = 1. ``row``, ``reference``: values by seed (index) and subject
+    (columns). ``alpha``: one minus the probability of the interval."""
     row, reference = row.align(reference, join="inner")
     differences = (row - reference).dropna(axis="columns")
     seeds, subjects = differences.shape
@@ -62,13 +58,9 @@ def compare(row: pd.DataFrame, reference: pd.DataFrame, alpha: float = 0.05) -> 
 
 
 def needed_errors(alpha: float, count: int, comparisons: int = 1) -> float:
-    """Standard errors by which rows must differ to be marked first among ``comparisons``.
-
-    Args:
-        alpha: level of significance of all comparisons together.
-        count: number of seeds, or of subjects where they are fewer; 2 or more.
-        comparisons: tests in the table.
-    """
+    """Standard errors by which rows must differ to be marked first among ``comparisons``. ``alpha``: level of
+    significance of all comparisons together. ``count``: number of seeds, or of subjects where they are fewer;
+    2 or more."""
     return float(stats.t.isf(alpha / 2 / comparisons, count - 1))
 
 

@@ -57,7 +57,6 @@ def sweep(
         colors: of all views, :func:`padded`.
         pixels: indices among those of all images, in ascending order.
         near, far: of the depths that are compared.
-        size: height and width of the images.
         turn, shift: from pixels of a view (second axis) to those of another (third axis).
         compared: which pairs of views are compared.
         shares: of the way from near to far.

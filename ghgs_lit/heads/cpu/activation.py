@@ -42,7 +42,6 @@ def activate(
         image, pixel: that they belong to, in ascending order.
         maps, points: of all pixels.
         photo, share: colours of pixels, and what opacities are multiplied by; None: by nothing.
-        cameras: [B, V].
         constants: limit of offsets, distance inwards, least scale, logarithm of the largest over it, what is
             added to raw scales across and along the normal, least opacity, what is added to raw opacities,
             limit of changes of colours.

@@ -18,11 +18,8 @@ def attributes(
     networks: list[nn.Sequential], descriptors: Float[Tensor, "*n c"]
 ) -> tuple[Float[Tensor, "*n _"], ...]:
     """What each of the networks makes of the descriptors; see :func:`ghgs_lit.kernels.pool.multiplies`.
-
-    Args:
-        networks: of three layers, of equal widths but for the last, with ``nn.Tanh`` or ``nn.ReLU`` between.
-        descriptors: of pixels.
-    """
+    ``networks``: of three layers, of equal widths but for the last, with ``nn.Tanh`` or ``nn.ReLU`` between.
+    ``descriptors``: of pixels."""
     from ghgs_lit.heads.cpu.networks_kernel import attributes as compiled  # here: it loads a compiler
     from ghgs_lit.kernels.layers import packed, parameters
 

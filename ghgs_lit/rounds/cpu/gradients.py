@@ -47,7 +47,6 @@ def _of(view, views, buffer):
 
 @helper
 def _layer(layers, place, outputs, inputs, before, after):
-    """Outputs of a layer, and the row of ones behind them by which biases of the next one learn."""
     linear(layers, place, outputs, inputs, before, after)
     rectify(layers, place, outputs, inputs, after)
     put_ones(outputs, after)

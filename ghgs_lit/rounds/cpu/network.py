@@ -30,10 +30,8 @@ def remembered(
     Args:
         view, update: of two layers each; ``seen`` is ``view`` of the own view, and of the others the mean and
             the largest.
-        memory: the last layer.
         each: what each view shows, the own one first.
         known: what is known beside it.
-        before: what was remembered.
     """
     from ghgs_lit.kernels.layers import parameters  # here, like the kernels: it loads a compiler
 

@@ -23,16 +23,8 @@ def compare(
     near: float,
     out: Float[Tensor, "N V 11"],
 ) -> None:
-    """Write the values of :func:`ghgs_lit.rounds.observation.observe`.
-
-    Args:
-        gaussians: with the images that they come from.
-        cameras: of the views.
-        photo, mask: of the views.
-        rendering: of the Gaussians, by ``cameras``.
-        near: metres behind the rendered surface at which a Gaussian counts as hidden.
-        out: contiguous.
-    """
+    """Write the values of :func:`ghgs_lit.rounds.observation.observe`. ``rendering``: of the Gaussians, by
+    ``cameras``. ``near``: metres behind the rendered surface at which a Gaussian counts as hidden."""
     from ghgs_lit.rounds.cpu.kernel import observe  # here: it loads a compiler
 
     inputs = (

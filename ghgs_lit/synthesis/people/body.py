@@ -112,16 +112,13 @@ def load_body() -> BodyModel:
 def bone_transforms(
     parents: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
 ) -> np.ndarray:
-    """Transforms of the bones from rest to pose.
+    """Transforms of the bones from rest to pose. Returns: [b, 3, 4] rotations and translations.
 
     Args:
         parents: [b], -1 for the root; parents come before children.
         joints: [b, 3] at rest, metres.
         rotations: [b, 3, 3] of each bone in world axes (not relative to its parent).
         root: [3], position of the root joint in the pose, metres.
-
-    Returns:
-        [b, 3, 4] rotations and translations.
     """
     posed = np.empty_like(joints)
     for bone, parent in enumerate(parents):

@@ -26,8 +26,6 @@ class Complexion:
         skin, lips, hair, iris: [3] in [0, 1].
         beard, brows, makeup, freckles: strengths, about 0 to 1.
         beard_style: none, stubble, full, goatee or moustache.
-        noise: coarse noise.
-        fine: fine noise.
     """
 
     skin: np.ndarray
@@ -95,7 +93,6 @@ def _blob(
 
 
 def _grain(look: Complexion, point: np.ndarray) -> np.ndarray:
-    """Irregular tone of the skin as a factor [k]."""
     u, v = point[:, 0] + 0.5 * point[:, 2], point[:, 1] + 0.3 * point[:, 2]
     return 1 + 0.030 * look.noise(u / 0.45, v / 0.45) + 0.018 * look.fine(u / 0.12, v / 0.12)
 
@@ -136,12 +133,10 @@ def head_texture(look: Complexion, scalp: float) -> np.ndarray:
 
 
 def _masks(piece: Chart) -> np.ndarray:
-    """Lips, eyelids and ears [k, 3] at the covered texels of the head."""
     return load_body().head_masks.reshape(-1, 4)[piece.texels, :3] / 255.0
 
 
 def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lids: np.ndarray) -> np.ndarray:
-    """Lashes along the eyelids, shadow on them, and brows of short strokes."""
     x, y, z = np.abs(point[:, 0]), point[:, 1], point[:, 2]
     dark = look.hair * 0.45
     distance = np.linalg.norm(np.stack([x, y, z], 1) - EYE, axis=1)
@@ -162,7 +157,6 @@ def _eyes_and_brows(colour: np.ndarray, look: Complexion, point: np.ndarray, lid
 
 
 def _beard(colour: np.ndarray, look: Complexion, point: np.ndarray, lips: np.ndarray) -> np.ndarray:
-    """Stubble, beard, goatee or moustache as a layer of short hair."""
     if look.beard_style == "none":
         return colour
     x, y, z = np.abs(point[:, 0]), point[:, 1], point[:, 2]

@@ -32,13 +32,10 @@ class Fabric:
     """A pattern in up to three colours.
 
     Attributes:
-        pattern: one of `PATTERNS`.
         colours: [3, 3] in [0, 1].
         scale: period of the pattern in metres.
         tilt: rotation of the pattern in radians.
         grain: strength of the fine noise.
-        noise: coarse noise.
-        fine: fine noise.
     """
 
     pattern: str

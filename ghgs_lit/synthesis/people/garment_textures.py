@@ -109,7 +109,6 @@ def bottom_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
 
 
 def _belt(colour: np.ndarray, band: np.ndarray, bottom: Bottom, place: Place) -> np.ndarray:
-    """A belt with a buckle, or a waistband."""
     if bottom.belt is None:
         return darken(colour, _line(place.y - bottom.waist + 0.038, 0.003), 0.3)
     colour = mix(colour, band, bottom.belt)
@@ -134,7 +133,6 @@ def _denim(fabric: Fabric, across: np.ndarray, place: Place, noise: Noise) -> np
 
 
 def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
-    """Front pockets, patch pockets behind and the fly; jeans have stitches in a contrasting colour."""
     thread = np.array([0.72, 0.50, 0.25]) if bottom.kind == "jeans" else None
 
     def stitch(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -154,7 +152,6 @@ def _pockets(colour: np.ndarray, place: Place, bottom: Bottom) -> np.ndarray:
 
 
 def _skirt_texture(bottom: Bottom, noise: Noise) -> np.ndarray:
-    """Texture [h, w, 3] of a skirt."""
     piece = chart("skirt")
     place = piece.texel_place
     across = place.trunk_angle * 0.17

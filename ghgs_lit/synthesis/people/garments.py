@@ -202,7 +202,8 @@ def _widen_legs(
     figure: Figure, points: np.ndarray, place: Place, bottom: Bottom, folds: np.ndarray
 ) -> np.ndarray:
     """Widen each leg to the radius of its cut: a straight tube from the thigh to the hem."""
-    joints = [figure.joints[i] for i in _leg_bones()]
+    body = load_body()
+    joints = [figure.joints[body.bone(f"{name}.L")] for name in ("upperleg01", "lowerleg01", "foot")]
     moved = points.copy()
     for side in (1.0, -1.0):
         own = np.flatnonzero((place.side == side) & (place.y < CROTCH))
@@ -217,11 +218,6 @@ def _widen_legs(
         moved[own[:, None], [0, 2]] = centre + offset * (wanted / np.maximum(radius, 1e-6))[:, None]
         moved[own, 0] = side * np.maximum(side * moved[own, 0], 0.006)
     return moved
-
-
-def _leg_bones() -> list[int]:
-    body = load_body()
-    return [body.bone(name) for name in ("upperleg01.L", "lowerleg01.L", "foot.L")]
 
 
 def drape_skirt(figure: Figure, bottom: Bottom, noise: Noise, rng: np.random.Generator) -> np.ndarray:

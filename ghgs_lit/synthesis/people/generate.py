@@ -1,5 +1,6 @@
 """Generate a person from two numbers: shape, pose, clothes, colours."""
 
+from copy import deepcopy
 from functools import lru_cache
 
 import numpy as np
@@ -33,47 +34,56 @@ MAX_YAW = 30.0  # degrees to either side
 MAX_POSES = 6  # drawn until the arms are clear of the trunk, each with the arms further apart
 
 
-def generate(seed: int, index: int, active: bool = False) -> Person:
-    """Generate person `index` of the family `seed`: the same person on every machine, up to rounding.
+class Character:
+    """A person apart from the pose: shape, clothes, colours and hair; ``index`` is its number in a family.
 
-    Args:
-        seed: number of the family, at least 0.
-        index: number of the person, at least 0.
-        active: in a pose of sport or dance in place of standing or walking (:func:`.pose.sample_pose`).
-
-    Returns:
-        An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of
-        the body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin; clothes, hair
-        and a cap follow.
-
-    Raises:
-        InputError: a number is negative.
+    ``first`` is the pose that it stands in, of sport or dance where ``active``; ``motion_rng`` draws others.
+    InputError: a number is negative.
     """
-    require(seed >= 0, "seed", "a number of at least 0", seed)
-    require(index >= 0, "index", "a number of at least 0", index)
-    streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(4)]
-    shape_rng, pose_rng, cloth_rng, look_rng = streams
-    body = load_body()
-    coefficients, female, age = body.sample_shape(shape_rng)
-    figure = pose_figure(body, coefficients, pose_rng, active)
-    outfit = sample_outfit(cloth_rng, female)
-    look = sample_complexion(look_rng, female, age)
-    cut = sample_haircut(look_rng, female)
-    if outfit.beanie:
-        cut = under_hat(cut)
-    spheres = occluding_spheres(figure)
-    parts = [skin_part(figure, outfit, look, spheres, scalp=0.25 if cut.style == "bald" else 1.0)]
-    parts += dress(figure, outfit, spheres, cloth_rng)
-    parts += make_hair(figure, cut, look, look_rng)
-    if outfit.beanie:
-        parts.append(make_beanie(figure, outfit.beanie))
-    parts = [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
-    turn = Rotation.from_euler("y", pose_rng.uniform(-MAX_YAW, MAX_YAW), degrees=True).as_matrix()
-    ground = min(float(part.vertices[:, 1].min()) for part in parts)
-    middle = 0.5 * (figure.posed.min(0) + figure.posed.max(0))
-    origin = np.array([middle[0], ground, middle[2]])
-    person = Person(f"{'active' if active else 'person'}_{seed}_{index:04d}", tuple(parts), figure.posed)
-    return person.mapped(lambda vertices: (vertices - origin) @ turn.T)
+
+    def __init__(self, seed: int, index: int, active: bool = False) -> None:
+        require(seed >= 0, "seed", "a number of at least 0", seed)
+        require(index >= 0, "index", "a number of at least 0", index)
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence([seed, index]).spawn(5)]
+        shape_rng, self.pose_rng, self.cloth_rng, self.look_rng, self.motion_rng = streams
+        self.name = f"{'active' if active else 'person'}_{seed}_{index:04d}"
+        self.body = load_body()
+        self.coefficients, female, age = self.body.sample_shape(shape_rng)
+        self.first = pose_figure(self.body, self.coefficients, self.pose_rng, active)
+        self.outfit = sample_outfit(self.cloth_rng, female)
+        self.look = sample_complexion(self.look_rng, female, age)
+        cut = sample_haircut(self.look_rng, female)
+        self.cut = under_hat(cut) if self.outfit.beanie else cut
+
+    def dressed(self, figure: Figure, spheres: Spheres) -> list[TexturedMesh]:
+        """Skin, clothes, hair and cap over a figure of this shape, the same ones each time."""
+        scalp = 0.25 if self.cut.style == "bald" else 1.0
+        parts = [skin_part(figure, self.outfit, self.look, spheres, scalp)]
+        parts += dress(figure, self.outfit, spheres, deepcopy(self.cloth_rng))
+        parts += make_hair(figure, self.cut, self.look, deepcopy(self.look_rng))
+        parts += [make_beanie(figure, self.outfit.beanie)] if self.outfit.beanie else []
+        return [part for part in parts if len(part.faces)]  # a jacket may hide all of a collar
+
+    def placed(self, parts: list[TexturedMesh], bodies: np.ndarray, first: int) -> Person:
+        """The person of ``parts``, of which the ``first`` ones are in the first pose and stand on y = 0."""
+        turn = Rotation.from_euler("y", self.pose_rng.uniform(-MAX_YAW, MAX_YAW), degrees=True).as_matrix()
+        origin = 0.5 * (self.first.posed.min(0) + self.first.posed.max(0))
+        origin[1] = min(float(part.vertices[:, 1].min()) for part in parts[:first])
+        person = Person(self.name, tuple(parts), bodies)
+        return person.mapped(lambda vertices: (vertices - origin) @ turn.T)
+
+
+def generate(seed: int, index: int, active: bool = False) -> Person:
+    """Person `index` of the family `seed`, the same on every machine, up to rounding; arguments and errors as
+    for :class:`Character`.
+
+    An adult of 1.52 to 1.87 m (barefoot and upright), in metres, with feet on y = 0, the bounding box of the
+    body centred over the origin, facing +z up to 30 degrees of yaw. Part 0 is the skin; clothes, hair and a
+    cap follow.
+    """
+    person = Character(seed, index, active)
+    parts = person.dressed(person.first, occluding_spheres(person.first))
+    return person.placed(parts, person.first.posed, len(parts))
 
 
 def pose_figure(

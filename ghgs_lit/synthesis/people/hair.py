@@ -29,7 +29,6 @@ class Haircut:
     """A haircut.
 
     Attributes:
-        style: one of `STYLES`.
         thickness: of the shell in metres.
         end: height on the average body where a curtain ends, metres.
         wave: how wavy the strands are, 0 to 1.
@@ -115,7 +114,6 @@ def _shell(figure: Figure, cut: Haircut, look: Complexion) -> TexturedMesh:
 
 
 def _grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Triangles of a grid of points, row by row."""
     index = np.arange(rows * columns).reshape(rows, columns)
     quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], -1).reshape(-1, 4)
     return triangles(quads)
@@ -147,7 +145,6 @@ def _hanging_weights(heights: np.ndarray, neck: float) -> np.ndarray:
 
 
 def _texture(look: Complexion, wave: float, length: float) -> np.ndarray:
-    """Texture [512, 512, 3] of hair that falls down the image."""
     v, u = np.meshgrid((np.arange(512) + 0.5) / 512, (np.arange(512) + 0.5) / 512, indexing="ij")
     swing = 0.012 * wave * np.sin(2 * np.pi * (3.0 * v + 0.25 * look.noise(2 * u, 0.5 * v)))
     colour = _strands(look, (0.5 * u + swing).ravel(), (length * v).ravel(), 0.1)
@@ -231,7 +228,6 @@ def under_hat(cut: Haircut) -> Haircut:
 
 
 def _tail(figure: Figure, cut: Haircut, look: Complexion, rng: np.random.Generator) -> TexturedMesh:
-    """A ponytail or a bun: a tube of rings behind the crown."""
     body = load_body()
     skull = body.mean[:BODY_VERTICES]
     anchor = int(np.argmin(np.linalg.norm(skull - [0.0, rng.uniform(1.57, 1.64), 0.0], axis=1)))

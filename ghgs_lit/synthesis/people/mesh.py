@@ -13,7 +13,8 @@ from ghgs_lit.errors import InputError
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """One part of a person: triangles with one texture.
+    """One part of a person: triangles with one texture. InputError: an array has another shape, or the faces
+    name vertices that do not exist.
 
     Attributes:
         vertices: [n, 3] float32, metres.
@@ -21,9 +22,6 @@ class TexturedMesh:
         uv: [n, 2] float32, origin at the bottom left of the texture, v upwards (as trimesh has them).
         texture: [h, w, 3 or 4] uint8, row 0 at the top.
         alpha_cutoff: faces are cut away where the texture's alpha is below this value (0 to 1); None: opaque.
-
-    Raises:
-        InputError: an array has another shape, or the faces name vertices that do not exist.
     """
 
     vertices: np.ndarray
@@ -49,13 +47,8 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class Person:
-    """A dressed, posed person.
-
-    Attributes:
-        name: in files and tables.
-        parts: body, hair, clothes.
-        body_vertices: [k, 3] float32, the body under the clothes in the frame of the parts; None: unknown.
-    """
+    """A dressed, posed person. ``body_vertices``: [k, 3] float32, the body under the clothes in the frame of
+    the parts; None: unknown."""
 
     name: str
     parts: tuple[TexturedMesh, ...]

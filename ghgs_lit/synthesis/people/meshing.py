@@ -24,15 +24,8 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def subdivide(quads: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Split each quad in four.
-
-    Args:
-        quads: [m, 4] indices of vertices.
-        count: number of vertices.
-
-    Returns:
-        The operator [count + edges + m, count] that gives the new vertices, and the new quads [4 m, 4].
-    """
+    """Split each quad in four. Returns: the operator [count + edges + m, count] that gives the new vertices,
+    and the new quads [4 m, 4]."""
     edges = np.sort(np.stack([quads, np.roll(quads, -1, 1)], -1).reshape(-1, 2), 1)
     unique, inverse = np.unique(edges, axis=0, return_inverse=True)
     mid = count + inverse.reshape(-1, 4)
@@ -104,18 +97,9 @@ def clip(faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def rasterise(uv: np.ndarray, faces: np.ndarray, height: int, width: int) -> tuple[np.ndarray, ...]:
-    """Find the face that each texel of a texture shows.
-
-    Args:
-        uv: [n, 2] in [0, 1], origin at the bottom left.
-        faces: [m, 3].
-        height: of the texture in texels.
-        width: of the texture in texels.
-
-    Returns:
-        Flat indices [k] of the covered texels, their face [k] and barycentric coordinates [k, 3], and
-        `nearest` [height * width]: for each texel the position among the k of the nearest covered one.
-    """
+    """Find the face that each texel of a texture shows. Returns: Flat indices [k] of the covered texels,
+    their face [k] and barycentric coordinates [k, 3], and `nearest` [height * width]: for each texel the
+    position among the k of the nearest covered one. ``uv``: [n, 2] in [0, 1], origin at the bottom left."""
     corners = np.stack([uv[faces][..., 0] * width, (1 - uv[faces][..., 1]) * height], -1) - 0.5
     low = np.maximum(np.ceil(corners.min(1) - 1e-6).astype(np.int64), 0)
     high = np.minimum(np.floor(corners.max(1) + 1e-6).astype(np.int64), [width - 1, height - 1])

@@ -4,14 +4,8 @@ import numpy as np
 
 
 class Noise:
-    """A periodic field with zero mean, unit variance and a power spectrum of 1 / f^(2 slope).
-
-    Args:
-        rng: random numbers.
-        slope: the larger, the smoother.
-        fineness: lowest number of waves per period.
-        size: side of the square grid.
-    """
+    """A periodic field with zero mean, unit variance and a power spectrum of 1 / f^(2 slope). ``slope``: the
+    larger, the smoother. ``fineness``: lowest number of waves per period."""
 
     def __init__(self, rng: np.random.Generator, slope: float = 1.2, fineness: float = 2.0, size: int = 256):
         frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None]) * size

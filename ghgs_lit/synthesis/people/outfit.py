@@ -31,7 +31,6 @@ class Top:
         ease: air between cloth and body in metres.
         hang: 0 to 1, how straight it falls from the chest.
         tucked: into trousers or skirt.
-        fabric: its cloth.
         emblem: printed on the front, the back or both; None: nowhere.
         opening: half width in metres of the gap of an open jacket.
     """
@@ -58,7 +57,6 @@ class Bottom:
         hem: height in metres.
         width: radius of a leg at the hem in metres; of shorts, how much wider than the thigh; of a skirt, its
             flare.
-        fabric: its cloth.
         belt: colour [3]; None: no belt.
     """
 

@@ -63,17 +63,12 @@ class _Skeleton:
 def sample_pose(
     body: BodyModel, joints: np.ndarray, rng: np.random.Generator, widen: float = 0.0, active: bool = False
 ) -> np.ndarray:
-    """Draw a pose.
+    """Draw a pose. Returns: Transforms [b, 3, 4] of the bones from rest to pose.
 
     Args:
-        body: the body model.
         joints: [b, 3] at rest, of one shape.
-        rng: random numbers.
         widen: 0 to 1, how far the arms move away from the body.
         active: as in sport and dance, with legs far apart, bent or crossed, in place of standing or walking.
-
-    Returns:
-        Transforms [b, 3, 4] of the bones from rest to pose.
     """
     if active:
         stance = str(rng.choice(list(BENT), p=(0.4, 0.3, 0.2, 0.1)))
@@ -122,7 +117,6 @@ def _bend_trunk(body: BodyModel, local: np.ndarray, stance: str, rng: np.random.
 
 
 def _compose(parents: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """World-axis rotations [b, 3, 3] from rotations relative to the parent."""
     rotations = local.copy()
     for bone, parent in enumerate(parents):
         if parent >= 0:

@@ -2,13 +2,32 @@
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import unproject_maps
+from ghgs_lit.synthesis.people.body import BODY_VERTICES
 from ghgs_lit.training.pretext.parts import PARTS, parts_of_points
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, Tokens
+
+
+def has_parts(batch: Batch) -> bool:
+    """Whether the bodies of a batch are built-in ones, whose parts are known."""
+    bodies = batch.body_vertices or ()
+    return len(bodies) > 0 and all(len(body) == BODY_VERTICES for body in bodies)
+
+
+def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:
+    """The part with the largest share in the patch of each token; -1 where it shows none.
+
+    Args:
+        shares: of all patches, from :func:`part_shares`.
+        tokens: of the same photographs.
+    """
+    _, _, h, w = tokens.grid
+    own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
+    return torch.where(own.any(1), own.argmax(1), -1)
 
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:

@@ -67,11 +67,8 @@ class PretextModule(BudgetedModule):
         self.log("val/parts", cross_entropy(log_shares, shares), on_epoch=True, batch_size=size)
 
     def configure_gradient_clipping(self, optimizer, gradient_clip_val=None, gradient_clip_algorithm=None):
-        """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used.
-
-        Raises:
-            DivergedError: the norm is not finite.
-        """
+        """Clip to ``optimizer.clip`` and log the norm before it; the arguments are not used. DivergedError:
+        the norm is not finite."""
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optimization.clip, foreach=True)
         if not norm.isfinite():
             raise DivergedError(

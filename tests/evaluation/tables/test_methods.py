@@ -72,6 +72,16 @@ def test_our_variants_are_told_apart_by_what_differs(tmp_path):
     }
 
 
+def test_peers_have_names_of_their_own(tmp_path):
+    """What is built after another method is not ours; it competes like ours."""
+    for number, name in enumerate(("gps", "pixel", "hull")):
+        write_run(tmp_path / str(number), "full", 20.0 + number, model={"name": name})
+    (table,) = tables_of(tmp_path, "table3", reported=False)
+    rows, _ = body(to_markdown(table))
+    found = {name: row[0] for name, row in rows.items()}
+    assert found == {"After GPS-Gaussian": "24.00", "Pixel-aligned": "25.00", "Ours (hull)": "**26.00**"}
+
+
 def test_baselines_are_rows_that_do_not_compete(tmp_path):
     """A baseline that knows the truth is never the best."""
     write_run(tmp_path / "0", "full", 20.0)

@@ -1,4 +1,4 @@
-"""``ghgs prepare task=miniature``: built-in people as a few scans of THuman2.0, with their fits.
+"""Built-in people as a few scans of THuman2.0, with their fits.
 
 Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2_scans`). Bodies
 are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and place the
@@ -19,7 +19,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from trimesh.caching import TrackedArray
 
-from ghgs_lit.data.dataset import DataSet
 from ghgs_lit.data.sampling import subject_rng
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
@@ -27,7 +26,6 @@ from ghgs_lit.readers import read_json
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.generate import join
 from ghgs_lit.synthesis.people.mesh import TexturedMesh
-from ghgs_lit.synthesis.thuman2 import THuman2
 from ghgs_lit.synthesis.thuman2_scans import FIT_FOLDERS
 
 #: In each folder that a miniature was written to: which files are its own.
@@ -36,27 +34,6 @@ MARKER = "miniature.json"
 _FIRST = {"train": 0, "val": 426}
 POSE_SIZES = {"betas": 10, "body_pose": 63, "left_hand_pose": 12, "right_hand_pose": 12, "jaw_pose": 3}
 POSE_SIZES |= {"leye_pose": 3, "reye_pose": 3, "expression": 10}
-
-
-def make_miniature(dataset: DataSet, people_of: Mapping[str, int], size: int, seed: int) -> Path:
-    """Write scans below ``data.source``, their fits into a folder beside it, and the split files.
-
-    Args:
-        people_of: how many, ``{train: n, val: n}``.
-        size: textures are scaled down to at most twice as many pixels a side.
-
-    Returns:
-        The folder of the scans.
-
-    Raises:
-        InputError: the data set has no scans, or files lie there that are not a miniature's.
-    """
-    if not isinstance(dataset, THuman2) or dataset.source is None:
-        found = dataset.name if not isinstance(dataset, THuman2) else "no data.source"
-        raise InputError(f"task=miniature: expected data=thuman2 data.source=<folder>; found {found}")
-    source = dataset.source_folder
-    with writing(source, fit_folder(source)):
-        return make_scans(source, people_of, size, seed)
 
 
 @contextlib.contextmanager
@@ -108,7 +85,7 @@ def names(people_of: Mapping[str, int]) -> dict[str, list[str]]:
     """Ids of each phase: ``0000`` on for training, ``0426`` on for validation."""
     for phase, count in people_of.items():
         limit = 426 if phase == "train" else 100
-        require(0 <= count <= limit, f"miniature.people.{phase}", f"between 0 and {limit}", count)
+        require(0 <= count <= limit, f"--{phase}", f"between 0 and {limit}", count)
     return {phase: [f"{_FIRST[phase] + i:04d}" for i in range(count)] for phase, count in people_of.items()}
 
 
@@ -141,7 +118,12 @@ def scan_of(name: str, seed: int) -> Scan:
 
 
 def make_scans(source: Path, people_of: Mapping[str, int], size: int, seed: int) -> Path:
-    """What :func:`make_miniature` writes; returns ``source``."""
+    """Write scans into ``source``, their fits into a folder beside it, and split files; returns ``source``.
+
+    Args:
+        people_of: how many, ``{train: n, val: n}``.
+        size: textures are scaled down to at most twice as many pixels a side.
+    """
     listed = names(people_of)
     for name in (name for phase in listed.values() for name in phase):
         scan = scan_of(name, seed)

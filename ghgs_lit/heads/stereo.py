@@ -1,0 +1,250 @@
+"""Depth by recurrent stereo between neighbouring views: a peer of the paper's method, no part of it.
+
+After the published description of GPS-Gaussian (Zheng et al., CVPR 2024): features of the photographs by one
+small network for all views, their correlations along epipolar lines, a few updates by a GRU that looks the
+correlations up around the present estimate (RAFT-Stereo, Lipson et al., 3DV 2021), convex upsampling (RAFT,
+Teed and Deng, ECCV 2020). Other than there, photographs are not rectified: equal steps of inverse depth are
+the equal steps of disparity of a rectified pair. The two pairs that a view of a ring belongs to give one
+depth, and the loss sees the last update alone, so its gradient passes through all of them.
+"""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from pydantic import Field
+from torch import Tensor, nn
+
+from ghgs_lit.config.options import Count, Options
+from ghgs_lit.geometry.mattes import coverage, surface_colors
+from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, project, unproject
+from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.heads.activations import bounded_sigmoid
+from ghgs_lit.heads.depth import BOUNDED
+from ghgs_lit.heads.dpt import ResidualUnit
+from ghgs_lit.kernels.precision import exact, without_float16
+from ghgs_lit.types import Batch, Cameras, DecodedPixels, DepthBounds, DepthMaps, Tokens, true_places
+
+#: Pixels along the side of a cell, and channels of a cell's features and of the GRU's memory.
+CELL, CHANNELS = 4, 32
+#: Other views that each view is paired with: its neighbours on either side.
+PAIRS = 2
+#: Resolutions at which correlations are looked up, each half of the one before, and steps to either side.
+LEVELS, RADIUS = 3, 4
+
+_inverse = BOUNDED["bounded_inverse"]
+
+
+class StereoHeadOptions(Options):
+    """Photographs to one depth for each pixel, by stereo between neighbouring views."""
+
+    group = "depth_head"
+    consistency_depths: int = Field(48, ge=2 ** (LEVELS - 1), le=4096)
+    """Inverse depths from near to far at which neighbouring views are correlated."""
+    updates: Count = 3
+    """Updates of the inverse depth by the GRU; 3 as published."""
+
+    def build(self, dim_latent: int) -> "StereoHead":
+        """The stage; it reads no tokens."""
+        return StereoHead(self)
+
+
+class StereoHead(nn.Module):
+    """Depths from correlations of neighbouring views.
+
+    Args:
+        options: of the head.
+    """
+
+    is_bounded = True
+
+    def __init__(self, options: StereoHeadOptions):
+        super().__init__()
+        self.options = options
+        self.features = nn.Sequential(
+            nn.Conv2d(4, CHANNELS // 2, 4, stride=2, padding=1),
+            ResidualUnit(CHANNELS // 2, rectified_skip=False),
+            nn.Conv2d(CHANNELS // 2, CHANNELS, 4, stride=2, padding=1),
+            ResidualUnit(CHANNELS, rectified_skip=False),
+            ResidualUnit(CHANNELS, rectified_skip=False),
+            nn.Conv2d(CHANNELS, 3 * CHANNELS, 1),
+        )
+        self.update = Update(CHANNELS)
+        self.weights = _two_layers(CHANNELS, 9 * CELL**2)
+
+    def forward(
+        self, tokens: Tokens, batch: Batch, bounds: DepthBounds, pixels: DecodedPixels = "all"
+    ) -> DepthMaps:
+        """Depths of all pixels between the nearest and the farthest bound of their view; those of the subject
+        are valid.
+
+        Args:
+            tokens: not read.
+            batch: images, masks and cameras are read.
+            bounds: of the pixels.
+            pixels: not read: the network sees whole images.
+        """
+        height, width = batch.masks.shape[2:]
+        near, far = subject_range(bounds, batch)
+        with without_float16(batch.masks.device.type):
+            fraction = self._fraction(batch, near, far)[..., :height, :width]
+        depth = _inverse(fraction.view(batch.masks.shape), near, far)
+        finite = depth.isfinite()
+        return DepthMaps(
+            depth=torch.where(finite, depth, 1.0),
+            valid=batch.masks & finite,
+            confidence=torch.ones_like(depth),
+            bounds=bounds,
+        )
+
+    def _fraction(self, batch: Batch, near: Tensor, far: Tensor) -> Float[Tensor, "n h w"]:
+        """Share of the way from near to far of each pixel, with those that fill the last cells."""
+        images = whole_cells(torch.cat((surface_colors(batch), coverage(batch)[:, :, None]), 2))
+        maps = self.features(images.flatten(0, 1).nan_to_num().to(self.features[0].weight.dtype))
+        features, memory, context = maps.chunk(3, 1)
+        features = at_least_float32(features).unflatten(0, batch.masks.shape[:2])
+        cameras = batch.cameras.cropped(0, 0, *images.shape[-2:]).resized(*features.shape[-2:])
+        inside = F.max_pool2d(images[:, :, 3], CELL) > 0
+        cells = true_places(inside, int(inside.sum()))
+        found = correlations(features, cameras, cells, near, far, self.options.consistency_depths)
+        volume = found.new_zeros(inside.numel(), found.shape[1]).index_copy(0, cells, found)
+        volume = volume.view(-1, *inside.shape[2:], found.shape[1]).movedim(-1, 1)
+        levels = [volume] + [F.avg_pool3d(volume[:, None], (2**i, 1, 1))[:, 0] for i in range(1, LEVELS)]
+        memory, context = memory.tanh(), context.relu()
+        raw = volume.new_zeros(len(volume), 1, *inside.shape[2:])
+        for _ in range(self.options.updates):
+            memory, change = self.update(memory, context, levels, bounded_sigmoid(raw))
+            raw = raw + change
+        return upsampled(bounded_sigmoid(raw), at_least_float32(self.weights(memory)))
+
+
+def _two_layers(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(inputs, inputs, 3, padding=1), nn.ReLU(), nn.Conv2d(inputs, outputs, 1))
+
+
+class Update(nn.Module):
+    """One update: what is looked up around the estimate, a convolutional GRU, a change of the estimate.
+
+    Args:
+        channels: of the memory and of the context.
+    """
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.seen = nn.Conv2d(LEVELS * (2 * RADIUS + 1) + 1, channels, 3, padding=1)
+        self.gates = nn.Conv2d(3 * channels, 2 * channels, 3, padding=1)
+        self.candidate = nn.Conv2d(3 * channels, channels, 3, padding=1)
+        self.change = _two_layers(channels, 1)
+        nn.init.zeros_(self.change[-1].weight)
+        nn.init.zeros_(self.change[-1].bias)
+
+    def forward(
+        self,
+        memory: Float[Tensor, "n c h w"],
+        context: Float[Tensor, "n c h w"],
+        levels: list[Float[Tensor, "n _ h w"]],
+        fraction: Float[Tensor, "n 1 h w"],
+    ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n 1 h w"]]:
+        """The next memory, and what is added to the raw estimate.
+
+        Args:
+            memory, context: of the cells.
+            levels: correlations from near to far, from fine to coarse.
+            fraction: the estimate, as a share of the way from near to far.
+        """
+        seen = torch.cat([*(look_up(level, fraction) for level in levels), 2 * fraction - 1], 1)
+        x = torch.cat((self.seen(seen.to(memory.dtype)).relu(), context), 1)
+        forget, reset = self.gates(torch.cat((memory, x), 1)).sigmoid().chunk(2, 1)
+        candidate = self.candidate(torch.cat((reset * memory, x), 1)).tanh()
+        memory = torch.lerp(memory, candidate.to(memory.dtype), forget.to(memory.dtype))
+        hidden = self.change[:-1](memory)
+        last = self.change[-1]
+        # The last projection stays in float32 under autocast: a step of inverse depth is centimetres.
+        with exact(hidden.device.type):
+            return memory, at_least_float32(last(hidden.to(last.weight.dtype)))
+
+
+def whole_cells(maps: Float[Tensor, "*n h w"]) -> Float[Tensor, "*n h2 w2"]:
+    """Maps with zeros below and to the right, up to the next multiple of a cell's side."""
+    height, width = maps.shape[-2:]
+    return F.pad(maps, (0, -width % CELL, 0, -height % CELL))
+
+
+def subject_range(
+    bounds: DepthBounds, batch: Batch
+) -> tuple[Float[Tensor, "B V 1 1"], Float[Tensor, "B V 1 1"]]:
+    """The nearest and the farthest bound of the subject's pixels in each view, of all where it has none."""
+    masks = batch.masks
+    used = masks | ~masks.any(-1, keepdim=True).any(-2, keepdim=True)
+    near = torch.where(used, at_least_float32(bounds.near), torch.inf).amin((-2, -1), keepdim=True)
+    far = torch.where(used, at_least_float32(bounds.far), -torch.inf).amax((-2, -1), keepdim=True)
+    return near, far
+
+
+def neighboring_views(cameras: Cameras) -> Int[Tensor, "n p"]:
+    """For each image ``b * V + v`` the images whose optical axes have the least angles to its own."""
+    count, views = cameras.shape
+    forward = at_least_float32(cameras.extrinsics)[..., 2, :3]
+    facing = (forward[:, :, None] * forward[:, None]).sum(-1)
+    itself = torch.eye(views, dtype=torch.bool, device=facing.device)
+    nearest = facing.masked_fill(itself, -torch.inf).topk(min(PAIRS, views - 1)).indices
+    return (nearest + views * torch.arange(count, device=nearest.device)[:, None, None]).flatten(0, 1)
+
+
+def correlations(
+    features: Float[Tensor, "B V c h w"],
+    cameras: Cameras,
+    cells: Int[Tensor, " N"],
+    near: Float[Tensor, "B V 1 1"],
+    far: Float[Tensor, "B V 1 1"],
+    steps: int,
+) -> Float[Tensor, "N S"]:
+    """Products of the features of cells with those at their places in neighbouring views, over ``sqrt(c)``.
+
+    Of the pairs that a view belongs to, the larger: a surface is often hidden from one neighbour. 0 where no
+    neighbour has the place before it and inside its image.
+
+    Args:
+        features: of all cells.
+        cameras: [B, V], of images whose pixels are the cells.
+        cells: indices among those of all images.
+        near, far: of the views, in metres.
+        steps: S, how many depths, with equal steps of inverse depth from near to far.
+    """
+    height, width = features.shape[-2:]
+    flat = features.flatten(0, 1)
+    image, place = cells // (height * width), cells % (height * width)
+    with torch.no_grad(), exact(features.device.type):
+        share = torch.linspace(0, 1, steps, device=features.device, dtype=features.dtype)
+        depth = _inverse(share, *(bound.flatten()[image, None].to(features) for bound in (near, far)))
+        matrices = [m.to(features).flatten(0, 1) for m in (cameras.intrinsics, cameras.extrinsics)]
+        centers = pixel_centers(height, width, features).flatten(0, 1)[place, None]
+        points = unproject(centers.expand(*depth.shape, 2), depth, *(m[image, None] for m in matrices))
+        other = neighboring_views(cameras)[image]
+        points = points[:, None].expand(-1, other.shape[1], -1, -1)
+        pixels, z = project(points, *(m[other][:, :, None] for m in matrices))
+    there = sample(flat, other[..., None].expand(z.shape), pixels)
+    found = (there * flat.flatten(2)[image, :, place][:, None, None]).sum(-1) / flat.shape[1] ** 0.5
+    return torch.where(z > 0, found, 0).amax(1)
+
+
+def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n r h w"]:
+    """Values at the estimate and at :data:`RADIUS` steps to either side of it, linear between steps.
+
+    Args:
+        level: a value for each of equal parts of the way from near to far.
+        fraction: where, as a share of this way; beyond its ends lie the values at the ends.
+    """
+    last = level.shape[1] - 1
+    around = torch.arange(-RADIUS, RADIUS + 1, device=level.device).view(-1, 1, 1)
+    at = (fraction * last + around).clamp(0, last)
+    low = at.detach().long().clamp(max=last - 1)
+    return torch.lerp(level.gather(1, low), level.gather(1, low + 1), at - low)
+
+
+def upsampled(maps: Float[Tensor, "n 1 h w"], weights: Float[Tensor, "n _ h w"]) -> Float[Tensor, "n h2 w2"]:
+    """Maps at :data:`CELL` times the resolution: each pixel is a convex combination of the 3 x 3 cells around
+    its own, with the softmax of ``weights``; the border is repeated."""
+    n, _, height, width = maps.shape
+    shares = weights.view(n, 9, CELL, CELL, height, width).softmax(1)
+    around = F.unfold(F.pad(maps, (1, 1, 1, 1), mode="replicate"), 3).view(n, 9, 1, 1, height, width)
+    return (shares * around).sum(1).permute(0, 3, 1, 4, 2).reshape(n, CELL * height, CELL * width)
