@@ -4,9 +4,10 @@
 
 Renders eight frozen sequences first (minutes), of people that no training reaches; the target is half-way
 between two of four inputs. Prints for each person, and on average, PSNR (whole and in the box), flicker along
-the motion of the surface and at fixed pixels of the box (in thousandths of white), and seconds of an instant
-with its render. A black render has the flicker of the photographs themselves: what shading and sampling
-change by.
+the motion of the surface and at fixed pixels of the box (in thousandths of white), tOF (by how many pixels of
+the box optical flow differs from that of the photographs; Chu et al. 2020, TecoGAN; OpenCV's Farneback), and
+seconds of an instant with its render. A black render has the flicker and the flow of the photographs
+themselves.
 """
 
 import argparse
@@ -14,7 +15,10 @@ from collections.abc import Callable
 from itertools import pairwise
 from statistics import mean
 
+import cv2
+import numpy as np
 import torch
+from torch import Tensor
 
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
@@ -28,6 +32,7 @@ from ghgs_lit.evaluation.flicker import Flickers
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.flicker import flicker_in_place
+from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs import results
 from ghgs_lit.synthesis.motion import instant_names
@@ -42,7 +47,14 @@ _DATA = (
     "targets.positions=[2]", "metrics.lpips=off",
 )  # fmt: skip
 #: Factor and decimals of what is printed.
-_COLUMNS = {"psnr": (1, 2), "psnr_box": (1, 2), "flicker": (1e3, 2), "in_place": (1e3, 2), "seconds": (1, 3)}
+_COLUMNS = {
+    "psnr": (1, 2),
+    "psnr_box": (1, 2),
+    "flicker": (1e3, 2),
+    "in_place": (1e3, 2),
+    "tof": (1, 3),
+    "seconds": (1, 3),
+}
 
 
 def black(batch: Batch) -> Estimate:
@@ -75,11 +87,13 @@ def measured(
     device: torch.device,
 ) -> dict[str, float | None]:
     """Means over the instants of a person."""
-    errors, masks = [], []
+    errors, masks, images, photographs = [], [], [], []
 
     def recorded(batch: Batch) -> Estimate:
         estimate = method(batch)
-        errors.append(estimate.image[0].clamp(0, 1) - batch.targets.images[0])
+        images.append(estimate.image[0].clamp(0, 1))
+        photographs.append(batch.targets.images[0])
+        errors.append(images[-1] - photographs[-1])
         masks.append(batch.targets.masks[0])
         return estimate
 
@@ -90,7 +104,19 @@ def measured(
         for pair, seen in zip(pairwise(errors), pairwise(masks), strict=True)
     ]
     found = {column: results.mean(row.get(column) for row in rows) for column in _COLUMNS}
-    return found | {"in_place": results.mean(in_place)}
+    flows = [[flow(*pair) for pair in pairwise(each)] for each in (images, photographs)]
+    boxes = [box_of(first | second)[0].cpu().numpy() for first, second in pairwise(masks)]
+    off = [
+        np.linalg.norm(one - other, axis=-1)[box].mean()
+        for one, other, box in zip(*flows, boxes, strict=True)
+    ]
+    return found | {"in_place": results.mean(in_place), "tof": results.mean(map(float, off))}
+
+
+def flow(*pair: Tensor) -> np.ndarray:
+    """Pixels [h, w, 2] by which the first of targets [t, 3, h, w] moves between two instants."""
+    grey = [(255 * image[0].mean(0)).round().byte().cpu().numpy() for image in pair]
+    return cv2.calcOpticalFlowFarneback(*grey, None, 0.5, 3, 15, 3, 5, 1.2, 0)
 
 
 def main() -> None:

@@ -27,6 +27,7 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
+from ghgs_lit.prediction.capture.backgrounds import Backgrounds
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
@@ -121,12 +122,13 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     temporal = Temporal(partial(in_frame, model), model.skip.every, renderer)
     totals: dict[str, float] = {}
     count, begin = 0, time.perf_counter()
-    rig = None
-    if together and refining["refine_cameras"]:
-        rig, together.others["rig.json"] = rig_of(folder, model, size, refining, renderer)
+    rig, backgrounds = None, Backgrounds({})
+    if together:
+        backgrounds, rig, together.others["rig.json"] = shared_by(folder, model, size, refining, renderer)
         refining["refine_cameras"] = 0
     for given, waited in captures_of(folder):
-        capture = rig.applied(given) if rig else given
+        capture = mended_by(backgrounds, given)
+        capture = rig.applied(capture) if rig else capture
         result = predict(capture, model, size, **refining, renderer=renderer, temporal=temporal)
         result.seconds["read"] = waited
         seconds = write_result(directories[capture.name], result, model, renderer, config, options)
@@ -152,27 +154,40 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
         print(f"left out: {left_out} of {len(folder.instants)} instants", flush=True)
 
 
-def rig_of(
+def shared_by(
     folder: CaptureFolder,
     model: GHGS,
     size: tuple[int, int],
     refining: Mapping[str, Any],
     renderer: Renderer,
-) -> tuple[Rig | None, bytes]:
-    """The cameras of a sequence, corrected over some of its instants, and said; and the content of their
-    file. None: they stay, and have no file."""
+) -> tuple[Backgrounds, Rig | None, bytes]:
+    """What the instants of a sequence share, found over some of them: backgrounds; the cameras, corrected,
+    which is said; and the content of their file. None: they stay, and have no file."""
     begin, names, captures = time.perf_counter(), folder.instants, []
-    for name in dict.fromkeys(names[round((len(names) - 1) * i / (INSTANTS - 1))] for i in range(INSTANTS)):
+    rounds, masks = refining["refine_cameras"], refining["refine_masks"]
+    spread = [round((len(names) - 1) * i / (INSTANTS - 1)) for i in range(INSTANTS)]
+    for name in [names[place] for place in dict.fromkeys(spread)] if rounds or masks else ():
         with contextlib.suppress(InputError):  # one that is left out
             captures.append(Capture(name, folder.photographs(name)))
-    rounds, masks = refining["refine_cameras"], refining["refine_masks"]
-    rig = corrected_rig(captures, model, size, rounds, masks, renderer) if captures else None
+    backgrounds = Backgrounds.of(captures if masks else [])
+    mended = [backgrounds.applied(capture) for capture in captures]
+    rig = corrected_rig(mended, model, size, rounds, masks, renderer) if captures and rounds else None
     if rig is None:
-        return None, b""
+        return backgrounds, None, b""
     why = f"; {rig.why} (refine_cameras=0 leaves them)" if rig.why else ""
     took = time.perf_counter() - begin
     print(f"{moved_line(rig.moved)} in all instants{why}; {took:.3g} s", flush=True)
-    return rig, json_text(rig.calibrations(folder, captures)).encode()
+    return backgrounds, rig, json_text(rig.calibrations(folder, captures)).encode()
+
+
+def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
+    """The capture with the masks that static backgrounds mend, which is said."""
+    capture = backgrounds.applied(given)
+    both = zip(given.photographs, capture.photographs, strict=True)
+    if mended := [after.name for before, after in both if after is not before]:
+        line = f"instant {given.name}: the background mends masks of {', '.join(mended)}"
+        print(f"{line} (refine_masks=0 leaves them)", flush=True)
+    return capture
 
 
 def advice_of(directory: Path) -> Iterator[str]:

@@ -48,7 +48,7 @@ class CaptureFolder:
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each instant; or of
             videos named after their cameras.
-        cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`.
+        cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`, or read.
         masks: folder of masks, laid out and named as the photographs; None: ``backgrounds``, ``segment``,
             masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
         backgrounds: folder of photographs without the subject, named after the cameras.
@@ -63,7 +63,7 @@ class CaptureFolder:
     """
 
     images: str | Path
-    cameras: str | Path
+    cameras: str | Path | CameraFile
     masks: str | Path | None = None
     backgrounds: str | Path | None = None
     segment: str | None = None
@@ -72,7 +72,7 @@ class CaptureFolder:
 
     def __post_init__(self) -> None:
         for name in ("images", "cameras", "masks", "backgrounds"):
-            if (path := getattr(self, name)) is not None:
+            if isinstance(path := getattr(self, name), str | Path):
                 object.__setattr__(self, name, Path(path).expanduser())
         for name in ("masks", "backgrounds"):
             path = getattr(self, name)
@@ -95,7 +95,8 @@ class CaptureFolder:
     @functools.cached_property
     def file(self) -> CameraFile:
         """The cameras as stored."""
-        return read_cameras(self.cameras, self._said.format)
+        given = self.cameras
+        return given if isinstance(given, CameraFile) else read_cameras(given, self._said.format)
 
     @functools.cached_property
     def convention(self) -> Convention:
@@ -146,7 +147,7 @@ class CaptureFolder:
         """The files that may be read, such as photographs with what lies beside them, and the calibration."""
         sources = (path for paths in self.paths.values() for path in paths.values())
         folders = {path.parent if isinstance(path, Path) else self.images for path in sources}
-        given = [path for path in (self.cameras, self.masks, self.backgrounds) if path is not None]
+        given = [path for path in (self.cameras, self.masks, self.backgrounds) if isinstance(path, Path)]
         files = [path for folder in folders for path in folder.iterdir()]
         return files + [file for path in given for file in (path.rglob("*") if path.is_dir() else [path])]
 

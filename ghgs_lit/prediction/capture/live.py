@@ -12,7 +12,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats import read_cameras
-from ghgs_lit.prediction.capture.photographs import composed, images_in
+from ghgs_lit.prediction.capture.photographs import composed, counted, images_in
 from ghgs_lit.prediction.capture.videos import SUFFIXES
 
 #: Seconds after which a folder is looked at again.
@@ -52,15 +52,15 @@ def live_frames(
     require(Sequence.read(part, "sequence") == Sequence(), "sequence", expected, part)
     said = options.get("calibration", {})
     names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}
-    wanted = set(read_cameras(cameras, said.get("format") or "auto").cameras)
+    stored = read_cameras(cameras, said.get("format") or "auto")
     places = [folder] if masks is None else [folder, Path(masks).expanduser()]
 
     def read(name: str) -> Capture:
-        found = CaptureFolder(folder / name, cameras, None if masks is None else places[1] / name, **options)
+        found = CaptureFolder(folder / name, stored, None if masks is None else places[1] / name, **options)
         return Capture(name, found.photographs(found.instants[0]))
 
     def is_whole(name: str) -> bool:
-        return wanted <= {names.get(found, found) for found in images_in(folder / name)}
+        return stored.cameras.keys() <= {names.get(found, found) for found in images_in(folder / name)}
 
     return _arriving(places, is_whole, read, idle, clock, sleep)
 
@@ -95,12 +95,12 @@ def _arriving(
     clock: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> Iterator[tuple[Capture, int]]:
-    done, before, unread, last = (0, ""), {}, {}, clock()
+    done, before, unread, last = [], {}, {}, clock()
     while idle is None or clock() - last < idle:
         folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
-        sizes = {name: [_sizes(place / name) for place in places] for name in folders if _order(name) > done}
+        sizes = {name: [_sizes(place / name) for place in places] for name in folders if counted(name) > done}
         still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
-        newest, before = max(filter(is_whole, still), key=_order, default=None), sizes
+        newest, before = max(filter(is_whole, still), key=counted, default=None), sizes
         if newest is None:
             sleep(_POLL)
             continue
@@ -109,13 +109,8 @@ def _arriving(
         except InputError:  # until its files change: masks may come later
             unread[newest] = sizes[newest]
             continue
-        done, last = _order(newest), clock()
-        yield capture, sum(_order(name) < done for name in sizes)
-
-
-def _order(name: str) -> tuple[int, str]:
-    """By which numbers follow one another, whether zeros are before them or not."""
-    return len(name), name
+        done, last = counted(newest), clock()
+        yield capture, sum(counted(name) < done for name in sizes)
 
 
 def _sizes(folder: Path) -> dict[str, int]:

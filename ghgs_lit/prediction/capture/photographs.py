@@ -133,7 +133,7 @@ def find_instants(
         return {folder.resolve().name: by_camera(folder, photographs, cameras, names)}
     below = {
         composed(path.name): images_in(path)
-        for path in sorted(folder.iterdir(), key=lambda path: _counted(path.name))
+        for path in sorted(folder.iterdir(), key=lambda path: counted(path.name))
         if path.is_dir() and not path.name.startswith(".")
     }
     folders = {name: paths for name, paths in below.items() if paths}
@@ -144,7 +144,7 @@ def find_instants(
     return {name: by_camera(folder / name, paths, cameras, names, least) for name, paths in folders.items()}
 
 
-def _counted(name: str) -> list[str | int]:
+def counted(name: str) -> list[str | int]:
     """What names are sorted by so that their numbers follow one another: 2 before 10."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
@@ -156,7 +156,7 @@ def _by_instant(folder: Path, by_camera: Mapping[str, dict[str, Path]]) -> dict[
         shared = by_camera[first].keys() & by_camera[other].keys()
         expected, found = f"photographs named as those of {first}", ", ".join(list(by_camera[other])[:3])
         require(bool(shared), f"{folder}: {other}", expected, f"others: {found}")
-    instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=_counted)
+    instants = sorted({instant for paths in by_camera.values() for instant in paths}, key=counted)
     return {
         instant: {camera: paths[instant] for camera, paths in by_camera.items() if instant in paths}
         for instant in instants

@@ -4,11 +4,11 @@ A body moves little from one instant to the next, and a rig not at all. So the G
 follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few gradient steps on the inputs' renders,
 whose optimiser goes on over the instants, take back what flow leaves and what light changes (the streams of
 Luiten et al., 3DV 2024, begin with an optimised scene; these with a prediction). What appears is seen by the
-renders: where they no longer fit the photographs, and every few instants, all is predicted anew.
+renders, and so is a mask that changes more than the body: where they no longer fit photographs or masks, and
+every few instants, all is predicted anew.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ _CHANGES = {
 }
 #: Of L1 and of the silhouettes' L1; without SSIM, which takes as long as the renders.
 _WEIGHTS = (0.8, 0.0, 0.1)
-#: Times the inputs' error after a new prediction at which Gaussians no longer fit.
+#: Times the misfit after a new prediction at which Gaussians no longer fit.
 _WORSE = 1.5
 
 
@@ -75,7 +75,7 @@ class Temporal:
     def reset(self) -> None:
         """Forget the last instant: the next one has nothing to do with it."""
         self._last: _Last | None = None
-        self._age, self._error = 0, math.inf
+        self._age = 0
 
     @torch.no_grad()
     def __call__(self, batch: Batch) -> Prediction:
@@ -88,29 +88,32 @@ class Temporal:
         levels, age = pyramid(at_least_float32(on_black(batch))[0]), 0
         if last is not None and last.batch.views == batch.views and self._age + 1 < self.every:
             self._descent.start = _moved(self._descent.start, last, batch, levels)
-            found, error = self._improved(last.prediction, batch, levels)
-            if error <= _WORSE * self._error:
+            found, misfit = self._improved(last.prediction, batch, levels)
+            if (misfit <= _WORSE * self._misfit).all():
                 self._age += 1
                 return found
             age = self.every - 1  # what moves too fast is not followed in vain at every instant
         prediction = self.predict(batch)
         self.anew, self._age = self.anew + 1, age
         self._descent = Descent(prediction.gaussians, batch, _CHANGES)
-        found, self._error = self._improved(prediction, batch, levels)
+        found, self._misfit = self._improved(prediction, batch, levels)
         return found
 
     def _improved(
         self, prediction: Prediction, batch: Batch, levels: list[Tensor]
-    ) -> tuple[Prediction, float]:
-        """The prediction after some steps, and the error of its inputs before the last one."""
+    ) -> tuple[Prediction, Float[Tensor, " 2"]]:
+        """The prediction after some steps, and by how much the inputs' renders before the last one do not
+        fit: the error within masks, and the share of the subject beyond its mask in the worst view."""
         photographs, silhouettes, cameras = seen_by(batch, range(batch.images.shape[1]))
         for _ in range(_STEPS):
             drawn = self._descent.step(self.renderer, photographs, silhouettes, cameras, _WEIGHTS)
         masks, depth = batch.masks[:, :, None], drawn.depth.detach()
         error = ((drawn.image - photographs).abs() * masks).sum() / (3 * masks.sum()).clamp(min=1)
+        beyond = (drawn.alpha - silhouettes).clamp(min=0).sum((-2, -1))
+        beyond = (beyond / silhouettes.sum((-2, -1)).clamp(min=1)).max()
         found = _as_drawn(prediction, self._descent.gaussians, batch, depth[:, :, 0])
         self._last = _Last(batch, found, levels, depth)
-        return found, float(error)
+        return found, torch.stack((error, beyond))
 
 
 def _are_equal(first: Batch, second: Batch) -> bool:

@@ -97,8 +97,8 @@ def show_live(
                     before = times.get(name, 0.0)
                     times[name] = before + (value - before) / min(shown, _RECENT)
                 last = now
-                means = ", ".join(f"{name} {1000 * times[name]:.0f} ms" for name in stages)
-                line = f"{shown} shown, {dropped} dropped, {1 / times['all']:.3g} a second ({means})"
+                rates = ", ".join(f"{name} {1 / times[name]:.3g}" for name in stages)
+                line = f"{shown} shown, {dropped} dropped, {1 / times['all']:.3g} a second ({rates})"
                 text.content = f"instant {subject.name}: {line}"
     finally:
         if page is not None:

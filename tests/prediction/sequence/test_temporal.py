@@ -148,3 +148,20 @@ def test_unit_and_origin_of_the_world_do_not_matter():
     assert there.anew == 1
     back = other.gaussians.means / 1e3 - shift
     assert (back - one.gaussians.means).abs().mean() < 1e-4
+
+
+def test_a_mask_that_loses_a_part_is_predicted_anew_and_so_is_what_comes_next():
+    """What a mask takes no longer for the subject is in no error within masks."""
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    whole = [instant(moved) for moved in steps(5)]
+    rows = whole[2].masks[0, 0].any(1).nonzero()
+    lost = whole[2].masks.clone()
+    lost[0, 0, : int(rows[len(rows) // 4])] = False
+    whole[2] = dataclasses.replace(
+        whole[2], images=whole[2].images * lost[:, :, None], masks=lost, depths=whole[2].depths * lost
+    )
+    for batch in whole:
+        found = temporal(batch)
+    assert [int(b.masks.sum()) for b in asked] == [int(whole[n].masks.sum()) for n in (0, 2, 3)]
+    assert quality(found, steps(5)[4]) > quality(at_true_depth(whole[4]), steps(5)[4]) - 1.0
