@@ -23,11 +23,9 @@ for name in ("bounds", "encoder", "geometry", "heads", "pretext", "recalibration
     _CHECKED += [f"{name}.{path.stem}" for path in (_PACKAGE / name).glob("*.py")]
 check_shapes([f"ghgs_lit.{name}" for name in _CHECKED])
 
-import hydra  # noqa: E402
 import torch  # noqa: E402
 
-if hydra.__version__.startswith("1.3"):
-    import tests.helpers.composing  # noqa: F401
+import tests.helpers.composing  # noqa: E402, F401
 
 torch.set_num_threads(_THREADS)
 

@@ -82,7 +82,7 @@ def keys() -> frozenset[str]:
             found.add(f"{prefix}{name}")
             collect(value, f"{prefix}{name}.")
 
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with initialize_config_dir(str(CONF), **VERSION_BASE):
         shipped = [
             [f"{group}={option}" for option in sorted(options - OPTIONS.get(group, set()))]
             for group, options in groups().items()

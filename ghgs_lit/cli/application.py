@@ -32,7 +32,7 @@ from ghgs_lit.cli.messages import (
     takes_value,
 )
 from ghgs_lit.cli.usage import VERBS
-from ghgs_lit.config import conf_dir, own_keys
+from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.config.registry import check
 from ghgs_lit.kernels.allocation import collect_garbage_again
 from ghgs_lit.runs.job import register_resolvers
@@ -155,7 +155,7 @@ def run(verb: str, argv: list[str]) -> int:
         check_deletions(sys.argv[1:])
         read_yaml_quickly()
         with interruptible(), composed_once(sys.argv[1:]):
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=verb)(task)()
+            hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader, such as `head`, has seen enough; Python must not write the rest when it exits.

@@ -7,7 +7,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from ghgs_lit.config.paths import conf_dir
+from ghgs_lit.config.paths import VERSION_BASE, conf_dir
 from ghgs_lit.config.registry import KINDS, check
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
@@ -22,7 +22,7 @@ def compose(verb: str, overrides: Sequence[str] = (), with_hydra: bool = False) 
     running = GlobalHydra.instance().hydra
     GlobalHydra.instance().hydra = None
     try:
-        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        with hydra.initialize_config_dir(str(conf_dir()), **VERSION_BASE):
             return hydra.compose(verb, overrides=list(overrides), return_hydra_config=with_hydra)
     finally:
         GlobalHydra.instance().hydra = running

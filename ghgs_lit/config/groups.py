@@ -8,7 +8,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from ghgs_lit.config.options import did_you_mean
-from ghgs_lit.config.paths import conf_dir
+from ghgs_lit.config.paths import VERSION_BASE, conf_dir
 from ghgs_lit.errors import InputError
 
 
@@ -19,7 +19,7 @@ def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]
     the group has no such option; names ``key``, or the group.
     """
     inside = GlobalHydra.instance().is_initialized()
-    with nullcontext() if inside else initialize_config_dir(str(conf_dir()), version_base="1.3"):
+    with nullcontext() if inside else initialize_config_dir(str(conf_dir()), **VERSION_BASE):
         known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
         if name in known:
             node = OmegaConf.select(compose(f"{group}/{name}"), group.replace("/", "."))

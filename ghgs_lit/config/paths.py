@@ -1,8 +1,14 @@
 """Finds the Hydra configuration of the installed package or of the checkout."""
 
 from pathlib import Path
+from typing import Any
+
+import hydra
 
 from ghgs_lit.errors import InputError
+
+#: How Hydra is to behave: Hydra 1.3 asks, later ones no longer do.
+VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
 
 
 def conf_dir() -> Path:

@@ -1,4 +1,4 @@
-"""Where this is imported, Hydra reads each file once and merges the same files once.
+"""Where this is imported, Hydra 1.3 reads each file once and merges the same files once.
 
 Composing configurations takes a quarter of the suite otherwise.
 """
@@ -17,7 +17,7 @@ from hydra.core.object_type import ObjectType
 from omegaconf import OmegaConf
 
 _load, _merge = ConfigRepository.load_config, ConfigLoaderImpl._compose_config_from_defaults_list
-_map = defaults_list._create_interpolation_map
+_map = getattr(defaults_list, "_create_interpolation_map", None)  # of Hydra 1.3 alone
 _pickled: dict[tuple, bytes] = {}  # what is composed is changed afterwards: each caller gets its own
 
 
@@ -52,9 +52,10 @@ def _merge_once(self, defaults, repo):
     return pickle.loads(_pickled[key])
 
 
-# LibYAML is faster.
-yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-version._get_version = functools.cache(version._get_version)
-defaults_list._create_interpolation_map = _map_where_needed
-ConfigRepository.load_config = _load_once
-ConfigLoaderImpl._compose_config_from_defaults_list = _merge_once
+if _map is not None:
+    # LibYAML is faster.
+    yaml.SafeLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    version._get_version = functools.cache(version._get_version)
+    defaults_list._create_interpolation_map = _map_where_needed
+    ConfigRepository.load_config = _load_once
+    ConfigLoaderImpl._compose_config_from_defaults_list = _merge_once

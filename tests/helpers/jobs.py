@@ -8,7 +8,7 @@ from typing import Any
 import hydra
 
 from ghgs_lit.cli.runtime import output_dir
-from ghgs_lit.config import conf_dir, own_keys
+from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.runs.grid import run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
 from ghgs_lit.runs.plan import PlannedRun
@@ -49,7 +49,7 @@ def hydra_app(monkeypatch, *overrides: str) -> None:
     """Run ``job`` as an application over ``conf/train.yaml``."""
     monkeypatch.setattr("sys.argv", ["ghgs", *overrides])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(job)()
+    hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name="train")(job)()
 
 
 def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:

@@ -5,8 +5,8 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from ghgs_lit.config import VERSION_BASE, conf_dir
 from ghgs_lit.config import compose as project_compose
-from ghgs_lit.config import conf_dir
 from ghgs_lit.errors import InputError
 from ghgs_lit.rendering import RasterSettings, Renderer, render
 from ghgs_lit.types import Cameras, Gaussians
@@ -18,7 +18,7 @@ NAMES = sorted(path.stem for path in (conf_dir() / "renderer").glob("*.yaml"))
 @pytest.mark.parametrize("name", NAMES)
 def test_every_config_builds_a_renderer(name):
     """Each file of the config group builds a renderer with the backend of its name."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+    with initialize_config_dir(str(conf_dir()), **VERSION_BASE):
         options = dict(compose(f"renderer/{name}").renderer)
     assert options.pop("kind") == "splats"
     assert Renderer(**options).backend == {"release": "auto"}.get(name, name)
