@@ -8,7 +8,7 @@ INSTALL = $(BIN)/python -m pip install -qq --no-compile --disable-pip-version-ch
 JOBS   ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-pythons documents lint format bench clean
+.PHONY: help setup demo test test-pythons test-latest documents lint format bench clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -30,6 +30,15 @@ test: setup ## Run the whole test suite (CPU)
 
 test-pythons: ## Run it on the oldest and the newest Python (those that are installed)
 	bash scripts/test_pythons.sh
+
+LATEST = .venv-latest/bin/python -m pip install -qq --no-compile -U
+test-latest: ## Run it on the newest of every package, Hydra's release candidate included
+	$(PYTHON) -m venv .venv-latest
+	$(LATEST) torch hatchling editables
+	$(LATEST) --no-build-isolation -e '.[dev]'
+	$(LATEST) --pre hydra-core omegaconf
+	.venv-latest/bin/python -m pip list
+	.venv-latest/bin/python -m pytest -n $(JOBS) --dist worksteal
 
 documents: setup ## Run every command of README and docs, with small settings (minutes)
 	$(BIN)/python scripts/check_documents.py

@@ -13,6 +13,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from ghgs_lit.config import VERSION_BASE
 from tests.helpers.processes import run_block, run_verb
 
 REPOSITORY = Path(__file__).resolve().parents[1]
