@@ -11,7 +11,6 @@ PyTorch's interface for backends in Python is experimental; all of its use is in
 accelerator: where CUDA is, tests of this one are skipped.
 """
 
-import functools
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -147,7 +146,7 @@ class _Backend(_DummyBackendModule):
         return False
 
 
-# Called "pretend" once :func:`_register` has run.
+# Called "pretend" where it is registered, below.
 CPU, DEVICE = torch.device("cpu"), torch.device("privateuseone", 0)
 
 
@@ -199,7 +198,6 @@ def pretend_device(by_line: bool = False) -> Iterator[Log]:
     """Inside, ``device="pretend"`` works for every function of PyTorch; gives what is asked of it."""
     if torch.cuda.is_available():
         raise SkipTest("the pretend device needs a process without CUDA (CUDA_VISIBLE_DEVICES=)")
-    _register()
     log = Log(by_line)
     _logs.append(log)
     try:
@@ -296,12 +294,11 @@ def _copy_from(source, target, non_blocking=False):
     return _call(torch.ops.aten.copy_.default, (target, source), {"non_blocking": non_blocking})
 
 
-@functools.cache
-def _register() -> library.Library:
+# On import: a device that comes after a process's first backward pass gets none.
+if not torch.cuda.is_available():
     _setup_privateuseone_for_python_backend("pretend", _Backend())
     # Indexing by lists and a few others come from C++ without passing through the mode.
-    ours = library.Library("aten", "IMPL")
-    ours.impl("empty_strided", _empty_strided, "PrivateUse1")
-    ours.impl("empty.memory_format", _empty, "PrivateUse1")
-    ours.impl("_copy_from", _copy_from, "PrivateUse1")
-    return ours
+    _library = library.Library("aten", "IMPL")
+    _library.impl("empty_strided", _empty_strided, "PrivateUse1")
+    _library.impl("empty.memory_format", _empty, "PrivateUse1")
+    _library.impl("_copy_from", _copy_from, "PrivateUse1")
