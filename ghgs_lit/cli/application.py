@@ -35,6 +35,7 @@ from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.config.registry import check
 from ghgs_lit.kernels.allocation import collect_garbage_again
+from ghgs_lit.kernels.cores import children_sleep
 from ghgs_lit.runs.job import register_resolvers
 from ghgs_lit.runs.signals import Interrupted, interruptible
 
@@ -75,6 +76,7 @@ class Verb:
             check(config)
             module = importlib.import_module(module_of(self.name))
             collect_garbage_again()
+            children_sleep()
             return module.run(cfg)
         except BAD_INPUT as error:
             # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.

@@ -9,6 +9,7 @@ import sys
 
 from ghgs_lit.cli.usage import VERBS, usage
 from ghgs_lit.kernels.allocation import collect_garbage_again, keep_freed_memory
+from ghgs_lit.kernels.cores import spin_if_alone
 
 
 def _completion_argv(argv: list[str]) -> list[str] | None:
@@ -63,6 +64,8 @@ def main() -> int:
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     # OpenMP threads that spin while they wait slow down other processes on the same cores tenfold.
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "LOCAL_RANK"} & os.environ.keys():
+        spin_if_alone(argv)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     keep_freed_memory()
     # Modules are no garbage: looking for some among them takes a third of the start.

@@ -26,3 +26,23 @@ def test_affinity_and_quota_limit_the_cores(monkeypatch, tmp_path, files, expect
     for name, text in files.items():
         (tmp_path / name).write_text(text + "\n")
     assert cores.allowed_cores(tmp_path) == expected
+
+
+def test_one_process_of_a_machine_spins_where_nothing_else_runs(monkeypatch, tmp_path):
+    """Its children do not, nor one that starts beside it, nor one of several."""
+    monkeypatch.setattr(cores.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(cores, "_spins", [])
+    monkeypatch.setattr(os, "environ", {})
+    busy, idle = tmp_path / "busy", tmp_path / "idle"
+    busy.write_text("0.20 0.18 0.12 3/80 11206")
+    idle.write_text("0.20 0.18 0.12 1/80 11206")
+    for arguments, running in ([], busy), (["hydra/launcher=joblib"], idle), ([], tmp_path / "none"):
+        cores.spin_if_alone(arguments, running)
+        assert os.environ == {}
+    cores.spin_if_alone(["ghgs", "train"], idle)
+    assert os.environ.pop("GOMP_SPINCOUNT") == "20000"
+    cores.spin_if_alone(["ghgs", "train"], idle)
+    assert os.environ == {}
+    os.environ["GOMP_SPINCOUNT"] = "20000"
+    cores.children_sleep()
+    assert os.environ == {}
