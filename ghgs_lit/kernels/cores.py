@@ -10,7 +10,7 @@ from typing import IO
 #: Turns of a waiting thread of libgomp before it sleeps: 0.2 ms.
 _TURNS = "20000"
 #: What asks for several processes, in arguments of the command line.
-_SEVERAL = ("launcher", "sweep", "ddp", "devices")
+_SEVERAL = ("launcher=", "sweep=", "ddp", "devices=")
 #: Held while this process is the one that spins.
 _spins: list[IO[str]] = []
 

@@ -39,7 +39,7 @@ def test_one_process_of_a_machine_spins_where_nothing_else_runs(monkeypatch, tmp
     for arguments, running in ([], busy), (["hydra/launcher=joblib"], idle), ([], tmp_path / "none"):
         cores.spin_if_alone(arguments, running)
         assert os.environ == {}
-    cores.spin_if_alone(["ghgs", "train"], idle)
+    cores.spin_if_alone(["ghgs", "train", "-m", "hydra.sweep.dir=runs"], idle)
     assert os.environ.pop("GOMP_SPINCOUNT") == "20000"
     cores.spin_if_alone(["ghgs", "train"], idle)
     assert os.environ == {}
