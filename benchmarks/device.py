@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import OTHER, TOTAL, top_level, watched
-from ghgs_lit.kernels.watching import Inputs, Watcher
+from ghgs_lit.kernels.watching import Watcher
 from ghgs_lit.losses import Losses, LossWeights
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import api, gsplat_backend
@@ -44,7 +44,7 @@ class CountingProbe(Watcher):
         self.counts: Counts = {}
         self._open: list[tuple[int, int, int]] = []
 
-    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+    def begin(self, stage: str) -> None:
         self._open.append(self._so_far())
 
     def end(self, stage: str, result: Any = None) -> None:

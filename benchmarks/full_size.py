@@ -33,7 +33,7 @@ def variants(cfg, presets: list[str], device: torch.device) -> list[Case]:
         chosen["fast, margin 0"] = {**chosen["fast"], "margin": 0}
     chosen["literal"] = chosen["none"]
     shared = {name: config[name] for name in ("renderer", "precision")}
-    source = Source("model", config, None)
+    source = Source(config, None)
     cases = cases_of(source, chosen, {}, shared, device, seed=1)
     write_out(cases[-1].model)
     return cases

@@ -1,4 +1,4 @@
-"""The doctor's estimates of memory beside measured peaks on this machine, for a configuration.
+"""The peak memory of a prediction and of a training step on this machine, for a configuration.
 
     python benchmarks/memory.py --size 140 encoder=vggt_nano model=hull
     python benchmarks/memory.py --size 518 --device cuda encoder=vggt_1b model=paper renderer=auto
@@ -9,7 +9,6 @@ once.
 
 import argparse
 import dataclasses
-import json
 import os
 import subprocess
 import sys
@@ -21,17 +20,17 @@ from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import TOTAL
 from ghgs_lit.diagnostics.benchmark.weights import random_model
-from ghgs_lit.diagnostics.doctor.estimate import Scene, estimate
 from ghgs_lit.model import GHGS
+from ghgs_lit.types import Batch
 
 #: Blocks above this size go back to the system when they are freed.
 _AT_ONCE = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "65536"}
 
 
-def measured_prediction(config: dict, scene: Scene, device: torch.device) -> int:
+def measured_prediction(config: dict, batch: Batch, device: torch.device) -> int:
     """Peak bytes of a second prediction in addition to the weights."""
     model = random_model(config).to(device)
-    batch = dataclasses.replace(_batch(scene), targets=None).to(device)
+    batch = dataclasses.replace(batch, targets=None).to(device)
     with torch.no_grad():
         model(batch)
         probe = PeakProbe(device)
@@ -41,14 +40,13 @@ def measured_prediction(config: dict, scene: Scene, device: torch.device) -> int
     return probe.peaks[TOTAL]
 
 
-def measured_training(config: dict, scene: Scene, device: torch.device) -> int:
+def measured_training(config: dict, batch: Batch, device: torch.device) -> int:
     """Peak bytes of a second training step in addition to weights and moments."""
     model, renderer = GHGS.from_config(config).to(device), build(config["renderer"], "renderer")
     losses, optimizer = (
         build(config["loss"], "loss"),
         build(config["optimizer"], "optimizer").optimizer(model),
     )
-    batch = _batch(scene)
     batch = dataclasses.replace(
         batch, depths=2.0 * batch.masks, body_vertices=[torch.rand(10475, 3) for _ in batch.images]
     ).to(device)
@@ -66,19 +64,18 @@ def measured_training(config: dict, scene: Scene, device: torch.device) -> int:
     return probe.peaks[TOTAL]
 
 
-def _batch(scene: Scene):
-    return ellipsoid_batch(scene.share, scene.views, scene.size, scene.batch)
-
-
-def compare(
+def measured(
     overrides: list[str], size: int, views: int, batch: int, device: torch.device, training: bool
 ) -> dict[str, int]:
-    """Bytes by estimate and by measurement, weights and moments included."""
+    """Peak bytes, weights and moments included, and theirs."""
     config = resolve(compose("train", overrides))
-    scene = Scene(0.15, views, (size, size), batch)
-    needed = estimate(config, scene, device.type, "float32", training)
-    measured = (measured_training if training else measured_prediction)(config, scene, device)
-    return {"estimated": needed.bytes, "measured": needed.held + measured, "held": needed.held}
+    with torch.device("meta"):
+        model = GHGS.from_config(config)
+    held = sum(
+        p.numel() * p.element_size() * (3 if training and p.requires_grad else 1) for p in model.parameters()
+    )
+    measure = measured_training if training else measured_prediction
+    return {"peak": held + measure(config, ellipsoid_batch(0.15, views, size, batch), device), "held": held}
 
 
 def main() -> None:
@@ -88,19 +85,15 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--device", type=torch.device, default=torch.device("cpu"))
-    parser.add_argument("--json", action="store_true", help="one line for a program")
     options = parser.parse_args()
     if _AT_ONCE.items() - os.environ.items():
         sys.exit(subprocess.call([sys.executable, *sys.argv], env={**os.environ, **_AT_ONCE}))
     torch.set_num_threads(1)
     for what in ("prediction", "training"):
         scene = options.size, options.views, options.batch, options.device
-        found = compare(options.overrides, *scene, what == "training")
-        if options.json:
-            print(json.dumps({"what": what, **found}))
-            continue
+        found = measured(options.overrides, *scene, what == "training")
         megabytes = ", ".join(f"{name} {value / 1e6:.1f} MB" for name, value in found.items())
-        print(f"{what}: {megabytes}, ratio {found['estimated'] / found['measured']:.2f}", flush=True)
+        print(f"{what}: {megabytes}", flush=True)
 
 
 if __name__ == "__main__":

@@ -52,8 +52,6 @@ class GHGS(nn.Module):
         self.auto = self.skip.build()
         #: The nodes that :meth:`from_config` built it of; none where stages were given.
         self.config: dict[str, Any] = {}
-        #: A lookup of a frozen encoder's features; None: they are computed each time.
-        self.feature_cache = None
         #: Whether predictions outside of training hold the Gaussians before each round, too.
         self.keeps_drafts = False
         #: Whether photographs, depths and bodies with NaN or values out of range are refused.
@@ -94,7 +92,7 @@ class GHGS(nn.Module):
 
     def _encode(self, batch: Batch, bounds: DepthBounds | None, kept: Tensor | None) -> Tokens:
         """Tokens in the precision of the heads, whatever that of the encoder's weights."""
-        tokens = self.encoder(batch.images, batch.masks, bounds, self.feature_cache, kept)
+        tokens = self.encoder(batch.images, batch.masks, bounds, kept)
         heads = (parameter for name in HEADS for parameter in getattr(self, name).parameters())
         return tokens.in_precision(next(heads, tokens.semantic).dtype)
 

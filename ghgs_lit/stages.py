@@ -63,10 +63,9 @@ class Encoder(Protocol):
         images: Float[Tensor, "B V 3 H W"],
         masks: Bool[Tensor, "B V H W"],
         bounds: DepthBounds | None,
-        cache: Any,
         kept: Bool[Tensor, "B V h w"] | None,
     ) -> Tokens:
-        """Tokens of the ``kept`` patches (None: those of ``keeps``); ``cache`` may hold them already."""
+        """Tokens of the ``kept`` patches (None: those of ``keeps``)."""
 
     def keeps(self, masks: Bool[Tensor, "B V H W"]) -> Bool[Tensor, "B V h w"]:
         """Patches that take part."""

@@ -11,7 +11,6 @@ from torch.utils.data import DataLoader
 
 from ghgs_lit.cli import predict
 from ghgs_lit.config import conf_dir
-from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.measure import ModelMethod, measure
 from ghgs_lit.metrics import MetricsOptions
@@ -190,17 +189,6 @@ def test_everything_is_measured_there(tmp_path, monkeypatch):
         numbers = [key for key, value in b.items() if isinstance(value, float) and key != "seconds"]
         assert "psnr_subject" in numbers
         assert [a[key] for key in numbers] == pytest.approx([b[key] for key in numbers], rel=1e-4, abs=1e-4)
-
-
-def test_the_feature_cache_serves_the_device(tmp_path):
-    """Tokens come back where the photographs are."""
-    model = make_model("model=hull", "encoder.trainable=none").eval()
-    with pretend_device(), torch.no_grad():
-        model, batch = model.to(DEVICE), make_batch(2, 3, 28, 42).to(DEVICE)
-        model.feature_cache = FeatureCache(tmp_path)
-        first, second = (model(batch).to("cpu") for _ in range(2))
-    assert (model.feature_cache.made, model.feature_cache.hits) == (2, 2)
-    close(first.gaussians, second.gaussians, 0)
 
 
 def test_predict_runs_there(tmp_path, monkeypatch):

@@ -16,9 +16,8 @@ from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.config import build
 from ghgs_lit.config.keys import is_below
 from ghgs_lit.diagnostics.benchmark import report
-from ghgs_lit.diagnostics.benchmark.machine import in_words, machine_facts
+from ghgs_lit.diagnostics.benchmark.machine import machine_facts
 from ghgs_lit.diagnostics.benchmark.measure import record_cases, threads
-from ghgs_lit.diagnostics.benchmark.plot import draw_presets
 from ghgs_lit.diagnostics.benchmark.presets import (
     KNOBS,
     YARDSTICK,
@@ -27,11 +26,12 @@ from ghgs_lit.diagnostics.benchmark.presets import (
     cases_of,
     presets_of,
 )
-from ghgs_lit.diagnostics.output import print_tables, save_figure
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.diagnostics.output import print_tables
+from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import decisions_of
 from ghgs_lit.runs.provenance import provenance
 from ghgs_lit.types import Batch
+from ghgs_lit.weights.checkpoint import read_checkpoint
 
 
 def run(cfg: DictConfig) -> None:
@@ -55,7 +55,6 @@ def run(cfg: DictConfig) -> None:
 def check_options(config: Mapping[str, Any], given: Sequence[str]) -> None:
     """Refuse an option, or one of the overrides that were ``given``, that has no effect beside others."""
     if config["checkpoint"] is None:
-        require(config["vs"] is None, "vs", "null where there is no checkpoint", config["vs"])
         return
     # A checkpoint brings its own model: what is asked for beside it must not be ignored in silence.
     for key in (text.split("=", 1)[0].lstrip("+~") for text in given):
@@ -68,18 +67,14 @@ _APPLIED = ("skip", "renderer", "precision")
 
 
 def configured_cases(config: Mapping[str, Any], device: torch.device) -> list[Case]:
-    """Every source in every preset, the yardstick always among them. FileNotFoundError, InputError: as for
-    :meth:`Source.of_checkpoint` and :func:`cases_of`."""
+    """The model in every preset, the yardstick always among them. FileNotFoundError, InputError: as for
+    :func:`read_checkpoint` and :func:`cases_of`."""
     names = dict.fromkeys([YARDSTICK, *config["presets"]])
     presets = presets_of(list(names), config["skip"])
-    if config["checkpoint"] is None:
-        sources = [Source("model", config, None)]
-    else:
-        given = {"model": config["checkpoint"], "vs": config["vs"]}
-        sources = [Source.of_checkpoint(name, path) for name, path in given.items() if path is not None]
+    path = config["checkpoint"]
+    source = Source(config if path is None else read_checkpoint(path)["config"], path)
     shared = {name: config[name] for name in ("renderer", "precision")}
-    options = (presets, config["knobs"] or {}, shared, device, config["seed"])
-    return [case for source in sources for case in cases_of(source, *options)]
+    return cases_of(source, presets, config["knobs"] or {}, shared, device, config["seed"])
 
 
 def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) -> dict[str, Any]:
@@ -113,14 +108,11 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
 def _weights(config: dict[str, Any], cases: list[Case]) -> str:
     number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
     own = config["checkpoint"] or f"{choices().get('encoder', 'encoder')}, random weights"
-    against = f" vs: {config['vs']}" if config["vs"] else ""
-    return f"{own} ({number:.1f} M parameters, precision {config['precision']}){against}"
+    return f"{own} ({number:.1f} M parameters, precision {config['precision']})"
 
 
 def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
-    rows, words = content["rows"], (in_words(content["machine"]), content["about"])
-    tables = report.tables_of(rows)
-    save_figure(draw_presets(rows, *words), directory / "benchmark.png")
+    tables = report.tables_of(content["rows"])
     print_tables(tables)
     print(*content.get("decisions", []), sep="\n", flush=True)
     source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())

@@ -21,7 +21,6 @@ from ghgs_lit.cli.inputs import (
 )
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
-from ghgs_lit.encoder import FeatureCacheOptions
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
 from ghgs_lit.evaluation.check import check_evaluation
@@ -74,7 +73,6 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
         model = methods["model"].model
         expected = "1: ghgs evaluate measures each subject by itself (skip=temporal is of ghgs predict)"
         require(model.skip.every == 1, "skip.every", expected, model.skip.every)
-        model.feature_cache = FeatureCacheOptions.read(config["feature_cache"], "feature_cache").build()
         facts |= found
     methods |= baselines_of(config["baselines"], config, device)
     return methods, facts
@@ -90,7 +88,6 @@ def run(cfg: DictConfig) -> None:
     L.seed_everything(config["seed"], workers=True, verbose=False)
     device = pick_device(config["device"])
     methods, facts = _methods(config, device)
-    cache = methods["model"].model.feature_cache if "model" in methods else None
     data = build_data(config)
     for method in methods.values():
         if isinstance(method, ModelMethod):
@@ -98,8 +95,6 @@ def run(cfg: DictConfig) -> None:
     check_evaluation(config, data)
     facts |= {"verb": "evaluate", "choices": choices()}
     path = measure_and_write(methods, data, config, directory, device, **facts)
-    if cache is not None:
-        print(cache.report(), flush=True)
     if "model" in methods and (auto := methods["model"].model.auto) is not None:
         rows = (row for row in read_results(path)["rows"] if row["method"] == METHOD)
         print(auto.report(decisions_of(rows)), flush=True)

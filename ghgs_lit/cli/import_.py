@@ -31,7 +31,7 @@ def run(cfg: DictConfig) -> None:
     require(safe, "compat", "none where there is no release=<file>", config["compat"]["name"])
     L.seed_everything(config["seed"], workers=True, verbose=False)
     model = {key: config[key] for key in MODEL_NODES if key in config}
-    options = (config[key] for key in ("out", "vggt", "release", "dtype", "depth_head_start"))
+    options = (config[key] for key in ("out", "vggt", "release", "dtype"))
     report = import_weights(initial_state(model, config["release"]), model, *options)
     print("\n".join(report), flush=True)
     if config["release"] is not None and (differing := differences(config)):

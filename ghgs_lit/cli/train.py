@@ -19,7 +19,6 @@ from torch import nn
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
-from ghgs_lit.encoder import FeatureCacheOptions
 from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
@@ -27,10 +26,8 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import (
     Train,
-    in_sweep,
     is_multirun,
-    needs_own_process,
-    train_in_own_process,
+    refuse_several_processes,
     train_once,
     with_resume,
 )
@@ -144,12 +141,12 @@ def _changes_to_go_on(run_directory: RunDirectory) -> str:
 
 
 def _run(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
-    if needs_own_process(config):
-        return train_in_own_process(run_directory)
+    if is_multirun():
+        refuse_several_processes(config, choices().get("hydra/launcher", "basic"))
     if rank_zero_only.rank == 0:
         return train_once(run_directory, config, train)
     # The first process has locked the run for all of them.
-    if in_sweep() and run_directory.done:
+    if is_multirun() and run_directory.done:
         return None
     return train(with_resume(config, run_directory), run_directory.path, {})
 
@@ -166,7 +163,6 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     data = build_data(config)
     model = GHGS.from_config(config)
     check_size(data, model)
-    model.feature_cache = FeatureCacheOptions.read(config.get("feature_cache") or {}, "feature_cache").build()
     step = prepare_start(config, model, directory)
     config = start.with_origin(config, model)
     renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")

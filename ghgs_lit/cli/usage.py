@@ -27,7 +27,7 @@ VERBS = {
         "ghgs predict checkpoint=last.ckpt images=photographs cameras=cameras.json masks=masks out=splat",
     ),
     "doctor": (
-        "find out whether cameras and masks fit together, a configuration this machine, a GPU the CPU",
+        "whether cameras and masks fit together, what this machine lacks, whether a GPU computes well",
         "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks",
     ),
     "view": (

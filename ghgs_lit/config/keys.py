@@ -8,7 +8,6 @@ WITHOUT_INFLUENCE = (
     "hydra",
     "allow_random_encoder",
     "dry_run",
-    "feature_cache.max_gb",
     "overwrite",
     "resume",
     "logger",

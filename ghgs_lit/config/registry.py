@@ -28,7 +28,6 @@ KINDS: dict[str, dict[str | None, str]] = {
         "none": "ghgs_lit.bounds.NoBounds",
     },
     "encoder": {"vggt": "ghgs_lit.encoder.VGGTOptions"},
-    "feature_cache": {None: "ghgs_lit.encoder.FeatureCacheOptions"},
     "depth_head": {
         "dpt": "ghgs_lit.heads.depth.DepthHeadOptions",
         "stereo": "ghgs_lit.heads.stereo.StereoHeadOptions",

@@ -21,7 +21,6 @@ from ghgs_lit.config.options import (
     Path,
     Positive,
     Seed,
-    Share,
     Size,
     Text,
     Workers,
@@ -160,14 +159,10 @@ class Doctor(Photographs):
 
     task: Literal["cameras", "machine", "selfcheck"] = "cameras"
     """cameras: whether photographs, masks and calibration fit together, and what would fit. machine: what
-    there is, what is missing for which feature; operations and memory of a configuration, by stage.
-    selfcheck: whether ``device`` computes as the CPU does in float64: a table for a bug report."""
+    there is, and what is missing for which feature. selfcheck: whether ``device`` computes as the CPU does in
+    float64: a table for a bug report."""
     device: Device = "auto"
     """Of task=machine and selfcheck."""
-    share: Share = 0.15
-    """Of task=machine and selfcheck: part of the frame that the subject covers."""
-    gpu_memory: Positive | None = None
-    """Of task=machine: GB of a GPU that is not here; null: what is free on ``device``."""
     seed: Seed = 1
     """Of random weights."""
     token_budgets: Budgets | None = None
@@ -194,8 +189,6 @@ class Benchmark(Measured):
 
     checkpoint: Path | None = None
     """null: random weights, of which only run times and differences mean something."""
-    vs: Path | None = None
-    """A second checkpoint, measured in the same rounds."""
     presets: Annotated[tuple[Text, ...], Field(min_length=1)] = ("none", "exact", "balanced", "fast")
     """Names of files of conf/skip; none, which the others are compared with, is always measured, too."""
     knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
@@ -235,8 +228,6 @@ class Import(Options):
     """The authors' checkpoint; null: heads start afresh."""
     out: Path
     """File of the checkpoint."""
-    depth_head_start: Literal["fresh", "vggt"] = "fresh"
-    """vggt: VGGT's depth head but its last projection (where there is no release)."""
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
     """Of the encoder in the checkpoint; the heads are float32."""
     seed: Seed = 1
@@ -277,8 +268,6 @@ class Table(Options):
         Text | Annotated[tuple[Text, ...], Field(min_length=1)], Words("a text or a list of paths")
     ]
     """The directory of a sweep, or a list of directories."""
-    list: bool = False
-    """No table, but all runs with their state, their best figure and their overrides."""
     layout: Literal["ablation", "table1", "table2", "table3", "table4"] = "ablation"
     """ablation: four rows, 3 to 5 views | table1: data sets | table2: 3 to 5 views | table3: NeRF methods |
     table4: the paper's ablation."""

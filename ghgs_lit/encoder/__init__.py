@@ -1,6 +1,5 @@
 """The encode stage: VGGT's aggregator over patch tokens, of any size."""
 
-from ghgs_lit.encoder.cache import FeatureCache, FeatureCacheOptions, PhotographCache
 from ghgs_lit.encoder.encoder import VGGTEncoder, VGGTOptions
 
-__all__ = ["FeatureCache", "FeatureCacheOptions", "PhotographCache", "VGGTEncoder", "VGGTOptions"]
+__all__ = ["VGGTEncoder", "VGGTOptions"]

@@ -1,7 +1,5 @@
 """Alternating attention inside each view and across all views (VGGT's aggregator)."""
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -54,14 +52,12 @@ class Aggregator(nn.Module):
         self,
         images: Float[Tensor, "b v i H W"],
         kept: KeptPatches,
-        embed: Callable[[Tensor, KeptPatches], Tensor] | None = None,
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
         """Tokens of the layers that are read out. Returns: For each layer in ``layers`` the packed tokens
         after its frame block and after its global block, special tokens included; and the patch tokens that
-        entered. ``kept``: the patches that take part; all others are as if they did not exist. ``embed``:
-        gives the patch tokens; None: ``patch_embed``."""
+        entered. ``kept``: the patches that take part; all others are as if they did not exist."""
         b, v = images.shape[:2]
-        patches = (embed or self.patch_embed)(images.flatten(0, 1), kept)
+        patches = self.patch_embed(images.flatten(0, 1), kept)
         special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)
         x = kept.join(special, patches)
         rotary = rotary_tables(kept.positions(self.special), self.head_width, x)

@@ -1,7 +1,6 @@
 """The encode stage: photographs and masks to tokens."""
 
-import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Bool, Float
@@ -68,7 +67,6 @@ class VGGTEncoder(nn.Module):
         images: Float[Tensor, "b v c H W"],
         masks: Bool[Tensor, "..."],
         bounds: DepthBounds | None = None,
-        cache: Callable[..., Tokens] | None = None,
         kept: Bool[Tensor, "b v h w"] | None = None,
     ) -> Tokens:
         """Tokens of all views: of all patches, or of those that are kept.
@@ -78,28 +76,12 @@ class VGGTEncoder(nn.Module):
             masks: [B, V, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, and where
                 ``tokens`` is not ``all``.
             bounds: read with ``bounds_input``.
-            cache: to look features up in (:mod:`ghgs_lit.encoder.cache`); None: compute them.
             kept: which patches take part; None: those of :meth:`keeps`.
         """
         self._check(images, masks)
-        kept = self.keeps(masks) if kept is None else kept
-        encode = self.encode if cache is None else functools.partial(cache, self)
-        return encode(images, masks, bounds, kept)
-
-    def encode(
-        self,
-        images: Float[Tensor, "b v c H W"],
-        masks: Bool[Tensor, "..."],
-        bounds: DepthBounds | None,
-        kept: Bool[Tensor, "b v h w"],
-        embed: Callable[[Tensor, KeptPatches], Tensor] | None = None,
-    ) -> Tokens:
-        """Compute the tokens of the kept patches of all views; arguments as in :meth:`forward`.
-
-        ``embed`` takes the place of the patch embedding.
-        """
-        chosen, kept = kept, KeptPatches(kept, images.device)
-        pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept, embed)
+        chosen = self.keeps(masks) if kept is None else kept
+        kept = KeptPatches(chosen, images.device)
+        pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
         return Tokens(
             latent=tuple(_joined(pairs, kept, self.aggregator.special)),
             semantic=patches.detach() if self.semantic is None else self.semantic(images, masks, chosen),

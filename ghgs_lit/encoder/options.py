@@ -1,7 +1,7 @@
 """What the encode stage can be told."""
 
 import re
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -86,9 +86,3 @@ class VGGTSettings(Options):
         fits = match is not None and int(match[1] or 0) <= self.depth
         self.require(fits, "trainable", f"all, none or last_<n>, n up to {self.depth}")
         return self
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """All that the tokens depend on, the weights and the choice of tokens apart."""
-        others = {"image_size", "layer_scale", "trainable", "checkpointing", "weights"}
-        return self.model_dump(exclude=others)

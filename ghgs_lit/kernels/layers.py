@@ -21,7 +21,7 @@ from ghgs_lit.kernels.tile import PANEL, ROWS
 ZERO, ONE = np.float32(0), np.float32(1)
 
 #: ``out += x y^T`` over the lanes of lines of ``x``, and of ``y`` as :func:`_turn` stores them.
-_lane_product = make_product(lambda half: (PANEL, 1), adds=True)
+_lane_product = make_product((PANEL, 1), adds=True)
 
 
 def room(channels: int) -> int:

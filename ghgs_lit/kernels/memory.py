@@ -41,9 +41,9 @@ def _make_access(alignment_of):
     return load, store
 
 
-# ``load`` and ``store`` need vectors of floats to start on a cache line; ``load_anywhere`` takes any address.
+# ``load`` and ``store`` need vectors of floats to start on a cache line; the others take any address.
 load, store = _make_access(lambda kind: 64 if kind is floats else 8)
-load_anywhere = _make_access(lambda kind: 4 if kind is floats else 8)[0]
+load_anywhere, store_anywhere = _make_access(lambda kind: 4 if kind is floats else 8)
 
 
 @intrinsic

@@ -43,7 +43,7 @@ def is_supported(*tensors: Tensor) -> bool:
 
 
 def have_values(*tensors: Tensor) -> bool:
-    """Whether NumPy can read these; it cannot read tensors of shapes alone, as the estimates have them."""
+    """Whether NumPy can read these; it cannot read PyTorch's FakeTensors."""
     return all(type(x) in (Tensor, nn.Parameter) for x in tensors)
 
 

@@ -46,15 +46,13 @@ def mean_inside(
     return mean_over(values, region)
 
 
-def box_of(mask: Bool[Tensor, "n h w"], margin: float = 0.0) -> Bool[Tensor, "n h w"]:
-    """The bounding box of each mask, as a mask; empty where the mask is empty. ``margin``: part of the box's
-    height and width that is added on each side, inside the image."""
+def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
+    """The bounding box of each mask, as a mask; empty where the mask is empty."""
 
     def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
         index = torch.arange(hit.shape[1], device=hit.device)
         first, last = (end[:, None] for end in first_and_last(hit))
-        grow = (margin * (last - first + 1)).round()
-        return (index >= first - grow) & (index <= last + grow) & hit.any(-1, keepdim=True)
+        return (index >= first) & (index <= last) & hit.any(-1, keepdim=True)
 
     return span(mask.any(-1))[:, :, None] & span(mask.any(-2))[:, None, :]
 
@@ -73,16 +71,14 @@ def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
     return span(mask.any(-1), height)[:, :, None] & span(mask.any(-2), width)[:, None, :]
 
 
-def region_of(
-    mask: Bool[Tensor, "n h w"], name: str, box_margin: float = 0.0
-) -> Bool[Tensor, "n h w"] | None:
+def region_of(mask: Bool[Tensor, "n h w"], name: str) -> Bool[Tensor, "n h w"] | None:
     """The pixels of one of :data:`REGIONS` (None: all), from the subject's mask."""
     choice("region", name, REGIONS)
     if name == "image":
         return None
     if name == "crop":
         return crop_of(mask)
-    return box_of(mask, box_margin) if name == "box" else mask
+    return box_of(mask) if name == "box" else mask
 
 
 def squared_error(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.config.options import Amount, Options
+from ghgs_lit.config.options import Options
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics.flip import PIXELS_PER_DEGREE, flip_map
 from ghgs_lit.metrics.functional import (
@@ -32,8 +32,6 @@ class MetricsOptions(Options):
     regions: tuple[Literal["image", "box", "subject", "crop"], ...] = ("image", "box", "subject")
     """Where PSNR, SSIM and FLIP are measured: all pixels, the box of the mask, its pixels (without FLIP), the
     window around the box that GHG and LIFe-GoM crop (1000 x 500 of 1024 x 1024)."""
-    box_margin: Amount = 0.0
-    """Part of the box's height and width that is added to it on each side."""
     lpips: Literal["auto", "require", "off"] = "auto"
     """auto: left out, with a message, where torchvision or its weights are missing; require: an error."""
 
@@ -103,8 +101,7 @@ class ImageMetrics:
         if set(options.regions) - {"subject"}:
             said["flip"] = f"FLIP at {PIXELS_PER_DEGREE:.2f} pixels a degree"
         if "box" in options.regions:
-            wider = f", {options.box_margin:g} of its sides wider on each side" * (options.box_margin > 0)
-            said["box"] = f"the smallest upright box of the subject's mask in the target{wider}"
+            said["box"] = "the smallest upright box of the subject's mask in the target"
         if "subject" in options.regions:
             said["subject"] = "the pixels of the subject's mask in the target"
         if "crop" in options.regions:
@@ -128,7 +125,7 @@ class ImageMetrics:
         values = {}
         for name in options.regions:
             suffix = "" if name == "image" else f"_{name}"
-            region = region_of(mask, name, options.box_margin)
+            region = region_of(mask, name)
             values[f"psnr{suffix}"] = decibels(mean_over(errors, region))
             values[f"ssim{suffix}"] = mean_inside(similarity, region)
             if name != "subject":

@@ -21,17 +21,13 @@ WRITTEN = (
     "tensorboard",
 )
 
-#: Keys of ``augmentation`` that change the photographs or masks of the inputs.
-PHOTOGRAPHS_CHANGE = ("exposure", "white_balance", "mask_offset", "mask_ragged", "mask_hole_chance")
-
 
 def check_config(config: Mapping[str, Any]) -> None:
-    """Refuse a run that cannot give what it is started for. InputError: ``skip=auto``, a frozen encoder
-    without weights, or a feature cache that cannot pay."""
+    """Refuse a run that cannot give what it is started for. InputError: ``skip=auto``, or a frozen
+    encoder without weights."""
     one_preset = not lookup(config, "skip.choices")
     require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
     _require_weights(config)
-    _require_useful_cache(config)
 
 
 def _require_weights(config: Mapping[str, Any]) -> None:
@@ -51,29 +47,6 @@ def _require_weights(config: Mapping[str, Any]) -> None:
         f"init_from: expected a checkpoint with the encoder's weights for encoder.trainable={trainable},"
         " such as that of `ghgs import vggt=facebook/VGGT-1B compat=none out=vggt.ckpt`; found none:"
         " the encoder would stay random (allow_random_encoder=true to try things out)"
-    )
-
-
-def _require_useful_cache(config: Mapping[str, Any]) -> None:
-    """Each order of views is a sample of its own, so random choices of views hardly ever come again."""
-    if lookup(config, "feature_cache.directory") is None:
-        return
-    trainable, views = lookup(config, "encoder.trainable"), lookup(config, "views.training")
-    photographs = lookup(config, "feature_cache.of") == "photographs"
-    frozen = trainable == "none" or (photographs and trainable != "all")
-    require(frozen, "feature_cache.directory", "null where the encoder learns", "a directory")
-    require(
-        photographs or views == "even",
-        "feature_cache.directory",
-        "null, feature_cache.of=photographs, or views.training=even, which has few choices of views to keep",
-        f"views.training={views}",
-    )
-    changed = [name for name in PHOTOGRAPHS_CHANGE if lookup(config, f"augmentation.{name}")]
-    require(
-        not changed,
-        "feature_cache.directory",
-        "null where each step changes the photographs, which are never found again",
-        ", ".join(f"augmentation.{name}" for name in changed),
     )
 
 

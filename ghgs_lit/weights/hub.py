@@ -2,17 +2,11 @@
 
 import hashlib
 import re
-import urllib.error
-import urllib.request
 from pathlib import Path
-from types import ModuleType
 
 from ghgs_lit.errors import InputError
 
 FILE = "model.safetensors"
-
-#: Seconds after which the hub counts as unreachable; its own client would try for half a minute.
-TIMEOUT = 5.0
 
 
 def is_repository(name: str) -> bool:
@@ -42,32 +36,16 @@ def fetch(repository: str, filename: str = FILE) -> tuple[Path, str]:
     address = huggingface_hub.hf_hub_url(repository, filename)
     cached = huggingface_hub.try_to_load_from_cache(repository, filename)
     if not isinstance(cached, str):
-        _require_network(huggingface_hub, repository, address)
         try:
             cached = huggingface_hub.hf_hub_download(repository, filename)
         except Exception as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            raise InputError(f"{repository}: expected {address}; found: {reason}") from error
+            raise InputError(
+                f"{repository}: expected the hub or a cached copy; found: {reason}. Download {address} by"
+                " hand and set vggt=<that file>"
+            ) from error
     path = Path(cached)
     return path, _checked(path)
-
-
-def _require_network(huggingface_hub: ModuleType, repository: str, address: str) -> None:
-    """Refuse if the hub does not answer; its client handles what it answers."""
-    found = "HF_HUB_OFFLINE is set"
-    if not huggingface_hub.constants.HF_HUB_OFFLINE:
-        try:
-            request = urllib.request.Request(address, method="HEAD")
-            urllib.request.urlopen(request, timeout=TIMEOUT).close()
-            return
-        except urllib.error.HTTPError:
-            return
-        except (urllib.error.URLError, OSError) as error:
-            found = str(getattr(error, "reason", error))
-    raise InputError(
-        f"{repository}: expected the hub or a cached copy; found no connection ({found}). Download {address}"
-        f" by hand and set vggt=<that file>"
-    )
 
 
 def sha256(path: Path) -> str:

@@ -80,21 +80,16 @@ class Source:
         )
 
 
-def sources(vggt: str | None, release: str | None, depth_head: str = "fresh") -> Iterator[Source]:
+def sources(vggt: str | None, release: str | None) -> Iterator[Source]:
     """The files to read; a repository of the hub is downloaded first."""
     require(vggt is not None, "vggt", "a file or facebook/VGGT-1B (heads need their encoder)", None)
-    use_depth = depth_head == "vggt" and release is None
-    table = names.VGGT | (names.VGGT_DEPTH if use_depth else {})
-    ignored = names.VGGT_DEPTH_IGNORED + names.VGGT_IGNORED
-    if use_depth:
-        ignored = tuple(part for part in ignored if part not in names.VGGT_DEPTH)
     if is_repository(vggt):
         label, (path, checksum) = vggt, fetch(vggt)
     else:
         path = Path(vggt)
         open_file(path)
         label, checksum = path.name, sha256(path)
-    yield Source("vggt", label, path, checksum, table, ignored)
+    yield Source("vggt", label, path, checksum, names.VGGT, names.VGGT_IGNORED)
     if release is not None:
         path = Path(release)
         open_file(path)
@@ -108,7 +103,6 @@ def import_weights(
     vggt: str | None,
     release: str | None = None,
     dtype: str = "float32",
-    depth_head: str = "fresh",
 ) -> list[str]:
     """Write a checkpoint with published weights; returns a report.
 
@@ -119,13 +113,12 @@ def import_weights(
             their values.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
         dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
-        depth_head: what the depth head starts from without ``release``, ``fresh`` or ``vggt``.
 
     Raises:
         FileNotFoundError: a file is missing.
         InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
-    files = list(sources(vggt, release, depth_head))
+    files = list(sources(vggt, release))
     for source in files:
         same = Path(out).exists() and Path(out).samefile(source.path)
         require(not same, "out", f"another file than {source.key}", str(out))

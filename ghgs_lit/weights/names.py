@@ -15,11 +15,6 @@ VGGT = {
 #: Parts of VGGT-1B that the method does not have: 62, 62, 69 and 394 tensors.
 VGGT_IGNORED = ("depth_head.", "point_head.", "camera_head.", "track_head.")
 
-#: VGGT's depth head as the start of ours (``depth_head_start=vggt``), without its last projection: that
-#: predicts the logarithm of depth in the scene's own unit, ours a position between near and far.
-VGGT_DEPTH = {"depth_head.": "depth_head.dpt."}
-VGGT_DEPTH_IGNORED = ("depth_head.scratch.output_conv2.2.",)
-
 #: The checkpoint of the authors' release, under the key ``network``.
 RELEASE = {
     "pos_head.": "depth_head.dpt.",

@@ -181,7 +181,6 @@ NUMBERS = [
     ("prepare data.render.samples=99", 1, "data.render.samples: expected", "<= 16", "found 99"),
     ("prepare data.render.quality=0", 1, "data.render.quality: expected", "found 0"),
     ("prepare check.min_iou=2", 1, "check.min_iou: expected", "<= 1", "found 2"),
-    ("train data=thuman2 data.limit.val=0", 1, "data.limit.val: expected an integer >= 1 or null; found 0"),
     (
         "train 'data.evaluation_positions=[[a]]'",
         1,
@@ -213,8 +212,6 @@ NUMBERS = [
     ("train evaluation.pictures=-1", 1, "evaluation.pictures: expected an integer >= 0; found -1"),
     ("train callbacks.pictures.subjects=-1", 1, "callbacks.pictures.subjects: expected", "found -1"),
     ("train callbacks.last.minutes=0", 1, "callbacks.last.minutes: expected", "found 0"),
-    ("train callbacks.pictures.token=[1]", 1, "callbacks.pictures.token: expected a list of 3 values"),
-    ("train metrics.box_margin=-1", 1, "metrics.box_margin: expected a number >= 0; found -1"),
     (
         "predict checkpoint=x turntable.frames=-1",
         1,
@@ -223,7 +220,6 @@ NUMBERS = [
     ("predict checkpoint=x subject=1.5", 1, "subject: expected a text or an integer", "found 1.5"),
     ("predict checkpoint=5", 1, "checkpoint: expected a path or null; found 5"),
     ("import out=x dtype=float8", 1, "dtype: expected one of float32, bfloat16, float16; found 'float8'"),
-    ("import out=x depth_head_start=old", 1, "depth_head_start: expected one of fresh, vggt; found 'old'"),
     ("table runs={tmp} test.alpha=2", 1, "test.alpha: expected", "< 1", "found 2"),
     ("table runs={tmp} evaluation.views=four", 1, "evaluation.views: expected", "found 'four'"),
     ("table runs={tmp} reported=maybe", 1, "reported: expected true or false; found 'maybe'"),

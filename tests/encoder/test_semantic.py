@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ghgs_lit.encoder import FeatureCache, VGGTEncoder
+from ghgs_lit.encoder import VGGTEncoder
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
@@ -112,17 +112,6 @@ def test_the_branch_does_not_learn_and_the_rest_does():
     trained = Optimization(lr=1e-3).optimizer(encoder).param_groups[0]["params"]
     assert {id(p) for p in trained} == {id(p) for n, p in encoder.named_parameters() if "semantic." not in n}
     assert encoder.dim_semantic == 16
-
-
-def test_a_cached_feature_is_not_that_of_another_mask(tmp_path):
-    """The branch reads masks, also in an encoder that does not."""
-    encoder, (images, masks) = make(trainable="none").float(), views()
-    cache = FeatureCache(tmp_path)
-    first, again, other = (
-        encoder(images.float(), mask, cache=cache).semantic for mask in (masks, masks, ~masks)
-    )
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
 
 
 @pytest.mark.parametrize(

@@ -336,31 +336,12 @@ def test_lpips_without_its_weights_is_left_out_with_one_line(monkeypatch):
     assert protocol.left_out["lpips"] == "LPIPS: the weights of 'vgg' could not be loaded: no route"
 
 
-def test_the_box_can_be_wider():
-    """The margin widens the box on each side and stops at the image's border."""
-    mask = torch.zeros(2, 20, 30, dtype=torch.bool)
-    mask[0, 8, 10] = mask[0, 11, 19] = True  # 4 high, 10 wide
-    wider = box_of(mask, 0.5)
-    assert wider[0].nonzero().amin(0).tolist() == [6, 5]
-    assert wider[0].nonzero().amax(0).tolist() == [13, 24]
-    assert wider[0].sum() == 8 * 20
-    assert not wider[1].any()
-    # The box ends at the image's border.
-    assert box_of(mask, 9.0)[0].all()
-    image, target = _images(2, 20, 30)
-    values = MetricsOptions(lpips="off", box_margin=0.5).build()(image, target, mask)
-    assert torch.equal(values["psnr_box"][:1], psnr(image, target, wider)[:1])
-    assert values["psnr_box"][1].isnan()
-    with pytest.raises(InputError, match="box_margin"):
-        MetricsOptions(lpips="off", box_margin=-0.1).build()
-
-
 def test_a_protocol_says_what_its_numbers_mean():
     """Definitions stored beside the numbers name padding, cap, box and clamp."""
-    said = MetricsOptions(lpips="off", box_margin=0.1).build().definitions
+    said = MetricsOptions(lpips="off").build().definitions
     assert said["ssim"].endswith("padding reflect")
     assert "at most 100 dB" in said["psnr"]
-    assert "0.1 of its sides wider" in said["box"]
+    assert "smallest upright box" in said["box"]
     assert "clamped" in said["image"]
     release = RELEASE.build().definitions
     assert release["ssim"].endswith("padding zeros")

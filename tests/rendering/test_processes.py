@@ -4,15 +4,12 @@ import dataclasses
 import multiprocessing
 import platform
 import threading
-import warnings
 
-import numba
 import pytest
 import torch
 
 from ghgs_lit.kernels import pool
 from ghgs_lit.rendering import render
-from ghgs_lit.rendering.cpu import backend
 from tests.helpers.processes import run_prepared, run_python
 from tests.helpers.splats import FIELDS, body, camera_ring, with_gradients
 
@@ -108,19 +105,6 @@ def train_in_workers():
         assert torch.equal(found[1], gradient)
 
 
-@pytest.mark.parametrize(("features", "warned"), [("+sse2", 1), ("+avx,+avx2", 0), ("+avx512f,+avx2", 0)])
-def test_one_warning_where_vectors_are_narrow(monkeypatch, features, warned):
-    """A slow processor is reported once, and a fast one never."""
-    monkeypatch.setattr(numba.config, "CPU_NAME", "x86-64")
-    monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
-    backend._warn_of_narrow_vectors.cache_clear()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        for _ in range(2):
-            render(body(10, 8), camera_ring(1, 8, 8), "cpu")
-    assert sum("256 bits" in str(warning.message) for warning in caught) == warned
-
-
 def sums() -> tuple[float, float]:
     """Of an image, and of a gradient's squares."""
     gaussians = with_gradients(body(300, 24))
@@ -135,4 +119,3 @@ def test_the_same_image_without_wide_vectors():
     code = "from tests.rendering.test_processes import sums; print(*sums())"
     done = run_python(code, NUMBA_CPU_NAME="x86-64", NUMBA_CPU_FEATURES="+sse2")
     assert [float(number) for number in done.stdout.split()] == pytest.approx(sums(), rel=1e-5)
-    assert done.stderr.count("no vectors of 256 bits") == 1

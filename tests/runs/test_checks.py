@@ -64,21 +64,6 @@ def test_a_semantic_branch_needs_weights():
     check_config(config(branch, "allow_random_encoder=true"))
 
 
-def test_a_feature_cache_that_cannot_pay_is_refused():
-    """Each order of random views is a file of its own: terabytes, and hardly a hit."""
-    frozen = ("feature_cache.directory=features", "encoder.trainable=none", "allow_random_encoder=true")
-    with pytest.raises(InputError, match=r"feature_cache\.directory: .*views\.training=even.*any"):
-        check_config(config(*frozen, "views.training=any"))
-    check_config(config(*frozen, "views.training=even"))
-    photographs = ("feature_cache.of=photographs", "views.training=any")
-    check_config(config(*frozen, *photographs))
-    check_config(config(frozen[0], frozen[2], *photographs, "encoder.trainable=last_1"))
-    with pytest.raises(InputError, match=r"null where each step changes the photographs.*augmentation\.expo"):
-        check_config(config(*frozen, *photographs, "augmentation=captures"))
-    with pytest.raises(InputError, match=r"feature_cache\.directory: expected null where the encoder learns"):
-        check_config(config("feature_cache.directory=features"))
-
-
 def test_training_needs_a_preset():
     """What ``skip=auto`` chooses depends on what the training has shown."""
     with pytest.raises(InputError, match=r"skip: expected the preset to train with.*token_budgets.*auto"):

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from ghgs_lit.config.verbs import Train
-from ghgs_lit.encoder import FeatureCache
 from ghgs_lit.errors import InputError
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.module import drawn_budget, token_budget
@@ -36,21 +35,6 @@ def test_a_budget_is_a_preset_while_it_lasts(configured, budget, preset):
         with token_budget(model, budget):
             close(model(batch).gaussians, expected(batch).gaussians)
         assert torch.equal(model(batch).gaussians.means, before.means)
-
-
-def test_budgets_need_features_of_their_own(tmp_path):
-    """A frozen encoder's features of one budget must not be found for another."""
-    encoder = make_model("encoder.trainable=none", "encoder.bounds_input=false").encoder
-    batch = make_batch(views=2, height=112, width=84)
-    model = SimpleNamespace(encoder=encoder)
-    cache = FeatureCache(tmp_path)
-    for made, budget in enumerate([1, 0, "all"], start=1):
-        with token_budget(model, budget):
-            tokens = encoder(batch.images, batch.masks, None, cache)
-            assert torch.equal(tokens.semantic, encoder(batch.images, batch.masks).semantic)
-        assert cache.made == made
-    encoder(batch.images, batch.masks, None, cache)
-    assert (cache.made, cache.hits) == (3, 1)
 
 
 def test_the_draw_is_even_and_depends_on_all_numbers():

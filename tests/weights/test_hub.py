@@ -3,7 +3,6 @@
 import hashlib
 import sys
 import types
-import urllib.error
 
 import pytest
 
@@ -21,15 +20,6 @@ def fake_client(monkeypatch, cached=None, download=None, offline=False):
     client.try_to_load_from_cache = lambda repository, filename: cached
     client.hf_hub_download = download or (lambda *_: pytest.fail("no download was needed"))
     monkeypatch.setitem(sys.modules, "huggingface_hub", client)
-
-
-def unreachable(monkeypatch, error):
-    def open_nothing(request, timeout):
-        assert request.full_url == ADDRESS
-        assert timeout <= 5
-        raise error
-
-    monkeypatch.setattr(hub.urllib.request, "urlopen", open_nothing)
 
 
 def cached_file(folder, content, name=None):
@@ -76,43 +66,24 @@ def test_a_cached_file_needs_no_network(monkeypatch, tmp_path):
 
 def test_a_download_is_checked(monkeypatch, tmp_path):
     """A broken download must not become a checkpoint."""
-    monkeypatch.setattr(hub.urllib.request, "urlopen", lambda *_, **__: types.SimpleNamespace(close=int))
     broken = cached_file(tmp_path, b"half of the wei", name="0" * 64)
     fake_client(monkeypatch, download=lambda *_: broken)
     with pytest.raises(InputError, match=r"0{64}: expected SHA-256 0{64}; found \w{64}: a broken download"):
         hub.fetch("facebook/VGGT-1B")
 
 
-@pytest.mark.parametrize(
-    ("error", "offline", "reason"),
-    [
-        (urllib.error.URLError(ConnectionRefusedError("refused")), False, "refused"),
-        (urllib.error.URLError("name or service not known"), False, "not known"),
-        (TimeoutError("timed out"), False, "timed out"),
-        (None, True, "HF_HUB_OFFLINE is set"),
-    ],
-)
-def test_without_a_network_it_says_at_once_what_to_fetch(monkeypatch, error, offline, reason):
-    """The client itself would try for half a minute before it fails."""
-    fake_client(monkeypatch, offline=offline)
-    unreachable(monkeypatch, error)
-    with pytest.raises(InputError, match=reason) as caught:
-        hub.fetch("facebook/VGGT-1B")
-    text = str(caught.value)
-    assert f"Download {ADDRESS} by hand and set vggt=<that file>" in text
-    assert "\n" not in text
-
-
 def test_what_the_hub_refuses_is_one_line(monkeypatch):
-    """The client's long answer must become one line with the address."""
-    unreachable(monkeypatch, urllib.error.HTTPError(ADDRESS, 404, "not found", {}, None))
+    """The client's long answer must become one line that says what to fetch."""
 
     def refuse(*_):
         raise RuntimeError("Repository Not Found.\nMake sure that you are logged in.")
 
     fake_client(monkeypatch, download=refuse)
-    with pytest.raises(InputError, match=r"expected https://hub\.test.*; found: Repository Not Found\.$"):
+    with pytest.raises(InputError, match=r"found: Repository Not Found\.") as caught:
         hub.fetch("facebook/VGGT-1B")
+    text = str(caught.value)
+    assert f"Download {ADDRESS} by hand and set vggt=<that file>" in text
+    assert "\n" not in text
 
 
 def test_without_the_package_it_names_the_extra_and_the_file(monkeypatch):

@@ -123,17 +123,6 @@ def test_without_the_release_heads_start_with_initial_values(tmp_path, files):
     assert last.weight.eq(0).all()  # depth starts where the safe parameterisation says
 
 
-def test_the_depth_head_can_start_from_vggts(tmp_path, files):
-    """The option must take VGGT's tensors, but not its last projection, which has another meaning."""
-    vggt, _, agg, _ = files
-    out = tmp_path / "out.ckpt"
-    report = import_weights(config("compat=none"), out, vggt, depth_head="vggt")
-    assert "depth_head 2" in report[0]
-    dpt = GHGS.from_checkpoint(out).depth_head.dpt
-    assert torch.equal(dpt.norm.weight, agg["depth_head.norm.weight"])
-    assert dpt.scratch.output_conv2[-1].weight.eq(0).all()
-
-
 @pytest.mark.parametrize("dtype", ["bfloat16", "float16"])
 def test_the_encoders_precision_is_a_choice(tmp_path, files, dtype):
     """Half precision must reach the encoder alone, and stay close to the float32 model."""

@@ -133,8 +133,8 @@ def record_cases(
     device: torch.device,
     repeats: int,
 ) -> list[Record]:
-    """Measure work and error of cases on batches, then their times. ``cases``: of each source the yardstick
-    first. ``batches``: on the device, with targets."""
+    """Measure work and error of cases on batches, then their times. ``cases``: the yardstick first.
+    ``batches``: on the device, with targets."""
     works: list[list[Work]] = [[] for _ in cases]
     records = [Record(case, Work({}, {}, {})) for case in cases]
     for batch in track(batches, "errors"):

@@ -35,19 +35,12 @@ class Source:
     """Weights and the configuration that fits them.
 
     Args:
-        name: ``model``, or ``vs`` for the second of two.
         config: with :data:`MODEL_NODES`.
         checkpoint: path of the weights; None: random ones.
     """
 
-    name: str
     config: Mapping[str, Any]
     checkpoint: str | None
-
-    @classmethod
-    def of_checkpoint(cls, name: str, path: str) -> "Source":
-        """The model of a checkpoint. FileNotFoundError, InputError: as for :func:`read_checkpoint`."""
-        return cls(name, read_checkpoint(path)["config"], path)
 
 
 @dataclass(frozen=True)
@@ -62,7 +55,6 @@ class Case:
             :data:`ROUNDS_AMPLIFY` where there are rounds; None: nothing is promised.
     """
 
-    source: str
     preset: str
     knobs: Mapping[str, Any]
     model: GHGS
@@ -75,7 +67,7 @@ class Case:
     def label(self) -> str:
         """A name that no other case has."""
         changes = [f"{key}={value}" for key, value in self.knobs.items()]
-        return " ".join(["vs:"] * (self.source == "vs") + [self.preset, *changes])
+        return " ".join([self.preset, *changes])
 
     @property
     def is_yardstick(self) -> bool:
@@ -130,7 +122,7 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """The cases of one source; they share one copy of the weights. InputError: a preset or knob that the
+    """The cases of a model; they share one copy of the weights. InputError: a preset or knob that the
     model refuses, or to which the weights do not fit.
 
     Args:
@@ -154,7 +146,7 @@ def cases_of(
         if max_rel_diff is not None and model.rounds is not None:
             max_rel_diff *= ROUNDS_AMPLIFY
         is_trained = source.checkpoint is not None
-        cases.append(Case(source.name, name, change, model, renderer, budget_db, max_rel_diff, is_trained))
+        cases.append(Case(name, change, model, renderer, budget_db, max_rel_diff, is_trained))
     return cases
 
 

@@ -41,8 +41,8 @@ _COLUMNS = {
 
 
 def rows_of(records: Sequence[Record]) -> list[Row]:
-    """One row for each case and stage; the row ``total`` has the errors and the budgets, too. ``records``: of
-    each source the yardstick first."""
+    """One row for each case and stage; the row ``total`` has the errors and the budgets, too. The first of
+    ``records`` is the yardstick's."""
     rows: list[Row] = []
     for record in records:
         (means,) = summarize(record.metrics)
@@ -62,7 +62,6 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
         for stage, times in record.times.items():
             rows.append(
                 {
-                    "model": record.case.source,
                     "preset": record.case.label,
                     "stage": stage,
                     "seconds": times.median,
@@ -110,7 +109,7 @@ def tables_of(rows: Sequence[Row]) -> Tables:
     times = whole[["seconds", "seconds_low", "seconds_high"]].itertuples(index=False)
     cases = whole.assign(
         quartiles=["{:.3f} ({:.3f} to {:.3f})".format(*quartiles) for quartiles in times],
-        speed_up=whole.groupby("model").seconds.transform("first") / whole.seconds,
+        speed_up=whole.seconds.iloc[0] / whole.seconds,
         peak_mb=whole.peak_bytes.astype(float) / 1e6,
         gflop=whole.flops.astype(float) / 1e9,
         ply_mb=whole.ply_bytes / 1e6,

@@ -4,7 +4,6 @@ import importlib.metadata
 import os
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 from rich.filesize import decimal
@@ -23,26 +22,16 @@ def machine_lines(device: torch.device) -> list[Line]:
     """What there is, as pairs of a name and its value."""
     facts = machine_facts(device)
     versions = (DISTRIBUTION, "torch", "lightning", "numpy", "numba", "gsplat")
-    total, available = memory_of_host()
     return [
         ("versions", ", ".join(f"{name} {_version(name) or 'none'}" for name in versions)),
         ("platform", facts["platform"]),
         ("processor", f"{facts['processor']}, vectors {facts['vectors']}"),
         ("threads", f"{facts['threads']} of {facts['cores']} cores"),
-        ("memory", f"{decimal(available)} free of {decimal(total)}" if total else "not known here"),
+        ("memory", decimal(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))),
         *_gpus(),
         ("renderer", _gsplat_state()),
         ("compiled kernels", os.environ.get("NUMBA_CACHE_DIR") or "beside the package's sources"),
     ]
-
-
-def memory_of_host() -> tuple[int, int]:
-    """All and the free memory in bytes; (0, 0) where the system does not say (only Linux does here)."""
-    path = Path("/proc/meminfo")
-    if not path.exists():
-        return 0, 0
-    found = dict(re.findall(r"^(\w+):\s+(\d+) kB", path.read_text(), re.MULTILINE))
-    return int(found.get("MemTotal", 0)) * 1024, int(found.get("MemAvailable", 0)) * 1024
 
 
 def missing_extras() -> Iterator[Line]:

@@ -13,18 +13,18 @@ from ghgs_lit.kernels import pool
 # Multiplications from which the kernel is faster, on one thread and on several, on which PyTorch's own
 # operator divides small products better: 360 and 1450 tokens in two heads of 32 channels.
 _SMALL, _LARGE = 1 << 23, 1 << 27
-# Processor features that the kernel needs: fused multiplications, and products of bfloat16.
-_FEATURES = {torch.float32: {"avx2", "fma"}, torch.bfloat16: {"avx512f", "avx512bf16"}}
+# Processor features that the kernel needs.
+_FEATURES = {"avx2", "fma"}
 
 
 def is_supported(q: Tensor, v: Tensor) -> bool:
     """Whether :func:`attend` can compute this attention, and faster than PyTorch. ``q``: queries [n, a, t,
     d]. ``v``: values [n, a, s, d]."""
-    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in _FEATURES:
+    if torch.is_grad_enabled() or v.device.type != "cpu" or v.dtype not in (torch.float32, torch.bfloat16):
         return False
     n, a, t, d = q.shape
     least = _SMALL if torch.get_num_threads() == 1 else _LARGE
-    return d % WIDTH == 0 and n * a * t * v.shape[2] * d >= least and pool.features() >= _FEATURES[v.dtype]
+    return d % WIDTH == 0 and n * a * t * v.shape[2] * d >= least and pool.features() >= _FEATURES
 
 
 def attend(
@@ -32,30 +32,28 @@ def attend(
 ) -> Float[Tensor, "n t a d"]:
     """``softmax(q k^T / sqrt(d)) v`` of every head, in the dtype of ``v``; see :func:`is_supported`.
 
-    Scores and softmax are float32. The result has the same bits with any number of threads.
+    All of it is float32, to which bfloat16 is widened before. The result has the same bits with any number of
+    threads.
     """
     from ghgs_lit.encoder.cpu.kernel import attend_head
 
-    out = torch.empty(*q.transpose(1, 2).shape, dtype=v.dtype)
-    words = [_words(x.to(v.dtype)) for x in (q, k, v, out.transpose(1, 2))]
+    out = torch.empty(q.transpose(1, 2).shape)
+    arrays = [_rows(x.float()).numpy() for x in (q, k, v, out.transpose(1, 2))]
     n, a, t, d = q.shape
     heads = [(i, j) for i in range(n) for j in range(a)]
     # Every task packs its own keys and values, so a head is split only where there are few heads.
     parts = max(1, min(-(-2 * torch.get_num_threads() // len(heads)), t // QUERIES))
     edges = [t * p // (parts * QUERIES) * QUERIES for p in range(parts)] + [t]
-    compiled = attend_head(words[0].dtype.type)
+    compiled = attend_head()
     tasks = [
-        partial(compiled, *(x[head] for x in words), first, last)
+        partial(compiled, *(x[head] for x in arrays), first, last)
         for head in heads
         for first, last in pairwise(edges)
     ]
     pool.run(tasks, work=n * a * t * d)
-    return out
+    return out.to(v.dtype)
 
 
-def _words(x: Tensor):
-    """The numbers as a NumPy array of 32-bit words: float32, or int32 that hold two bfloat16 each."""
-    x = x.detach()
-    if x.stride(-1) != 1 or (x.dtype == torch.bfloat16 and any(s % 2 for s in x.stride()[:-1])):
-        x = x.contiguous()
-    return (x.view(torch.int32) if x.dtype == torch.bfloat16 else x).numpy()
+def _rows(x: Tensor) -> Tensor:
+    """The same numbers, those of a row beside one another."""
+    return x if x.stride(-1) == 1 else x.contiguous()

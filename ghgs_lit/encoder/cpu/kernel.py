@@ -1,6 +1,5 @@
 """Attention of one head, ``KEYS`` keys at a time with a running maximum (Dao et al., FlashAttention, 2022).
 
-Scores, exponentials and sums are float32; queries, keys, values and weights are float32 or bfloat16.
 Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``.
 """
 
@@ -9,11 +8,9 @@ from functools import cache
 
 import numpy as np
 from numba.core import types
-from numba.np.numpy_support import from_dtype
 
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.bfloat16 import aligned_words, pack_line, per_word, store_numbers
 from ghgs_lit.kernels.compile import helper, kernel_for
 from ghgs_lit.kernels.products import make_product, product
 from ghgs_lit.kernels.simd import EXP2_LIMIT
@@ -21,22 +18,20 @@ from ghgs_lit.kernels.tile import PANEL, ROWS
 
 LANES = simd.LANES
 LOWEST = np.float32(-np.inf)
-#: ``out += x y`` where the words of one row are neighbours: ``KEYS`` numbers.
-add_values = make_product(lambda half: (KEYS // 2 if half else KEYS, 1), adds=True)
+#: ``out += x y`` where the numbers of one row are neighbours: ``KEYS`` of them.
+add_values = make_product((KEYS, 1), adds=True)
 
 
 def _attend_head(q, k, v, out, first, last):
     """Write ``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` to ``out``.
 
-    Every matrix is [tokens, words]: float32 [t, d], or int32 [t, d / 2] of two bfloat16 each. ``d`` is a
-    multiple of 32.
+    Every matrix is [tokens, d], ``d`` a multiple of 32.
     """
-    tokens, steps = k.shape
-    width = steps * per_word(k)
+    tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
     keys, values = _packed_keys(k), _packed_values(v)
-    queries = aligned_words(q, QUERIES * steps)
-    scores, weights = simd.aligned(ROWS * KEYS), aligned_words(q, ROWS * KEYS // per_word(q))
+    queries = simd.aligned(QUERIES * width)
+    scores, weights = simd.aligned(ROWS * KEYS), simd.aligned(ROWS * KEYS)
     totals, sums = simd.aligned(QUERIES * width), simd.aligned(QUERIES * LANES)
     highest = np.empty(QUERIES, np.float32)
     for start in range(first, last, QUERIES):
@@ -46,7 +41,7 @@ def _attend_head(q, k, v, out, first, last):
         for key in range(0, tokens, KEYS):
             seen = min(KEYS, tokens - key)
             for row in range(0, count, ROWS):
-                _score(queries, row, keys, key, seen, steps, scores)
+                _score(queries, row, keys, key, seen, width, scores)
                 for r in range(row, row + ROWS):
                     old = highest[r]
                     top = _highest(scores, r - row, seen) * scale
@@ -60,9 +55,9 @@ def _attend_head(q, k, v, out, first, last):
 
 
 @cache
-def attend_head(word: type):
-    """The kernel for words of type ``np.float32`` or ``np.int32`` and matrices with any strides."""
-    matrix = types.Array(from_dtype(np.dtype(word)), 2, "A")
+def attend_head():
+    """The kernel for matrices with any strides."""
+    matrix = types.Array(types.float32, 2, "A")
     return kernel_for(_attend_head, matrix, matrix, matrix, matrix, types.int64, types.int64)
 
 
@@ -73,9 +68,9 @@ def _padded(count):
 
 @helper
 def _packed_keys(k):
-    """Panels of ``PANEL`` keys, each [words, PANEL]; missing keys of the last panel are zero."""
+    """Panels of ``PANEL`` keys, each [channels, PANEL]; missing keys of the last panel are zero."""
     tokens, steps = k.shape
-    packed = aligned_words(k, _padded(tokens) * steps)
+    packed = simd.aligned(_padded(tokens) * steps)
     for panel in range(0, tokens, PANEL):
         count = min(PANEL, tokens - panel)
         for t in range(steps):
@@ -89,19 +84,21 @@ def _packed_keys(k):
 
 @helper
 def _packed_values(v):
-    """Panels of ``PANEL`` channels, each [words of tokens, PANEL]; missing tokens are zero."""
-    tokens, steps = v.shape
-    lines, width = _padded(tokens) // per_word(v), steps * per_word(v)
-    packed = aligned_words(v, lines * width)
+    """Panels of ``PANEL`` channels, each [tokens, PANEL]; missing tokens are zero."""
+    tokens, width = v.shape
+    lines = _padded(tokens)
+    packed = simd.aligned(lines * width)
     for panel in range(0, width, PANEL):
         for line in range(lines):
-            pack_line(v, line, panel, packed, panel * lines + line * PANEL)
+            at = panel * lines + line * PANEL
+            for i in range(PANEL):
+                packed[at + i] = v[line, panel + i] if line < tokens else 0
     return packed
 
 
 @helper
 def _pack_queries(q, start, count, packed):
-    """Tiles of ``ROWS`` queries, each [words, ROWS]; the last query fills the last tile."""
+    """Tiles of ``ROWS`` queries, each [channels, ROWS]; the last query fills the last tile."""
     steps = q.shape[1]
     for row in range(0, count, ROWS):
         for r in range(ROWS):
@@ -147,17 +144,16 @@ def _weigh(scores, r, seen, scale, top, weights, sums, query):
         # ``minimum`` gives the second argument where either is NaN, so NaN stays.
         weight = simd.exp2_minus(simd.minimum(limit, depth))
         total = total + weight
-        store_numbers(weights, (r * KEYS + i) // per_word(weights), weight)
+        memory.store(weights, r * KEYS + i, weight)
     memory.store(sums, query * LANES, total)
 
 
 @helper
 def _add_values(weights, values, key, seen, totals, row, width):
     lines = len(values) // width
-    words, first = _padded(seen) // per_word(weights), key // per_word(weights) * PANEL
     for panel in range(0, width, PANEL):
         at = row * width + panel
-        add_values(weights, 0, values, panel * lines + first, words, totals, at, width)
+        add_values(weights, 0, values, panel * lines + key * PANEL, _padded(seen), totals, at, width)
 
 
 @helper
@@ -165,4 +161,4 @@ def _finish(out, sums, totals, r, width):
     """Write the weighted values of query ``r``, divided by the sum of its weights, to ``out``."""
     share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
     for i in range(0, width, LANES):
-        store_numbers(out, i // per_word(out), memory.load(totals, r * width + i) * simd.full(share))
+        memory.store_anywhere(out, i, memory.load(totals, r * width + i) * simd.full(share))

@@ -1,9 +1,8 @@
 """The CPU backend as one differentiable function of PyTorch."""
 
 import threading
-import warnings
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,7 +10,6 @@ from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.kernels import pool, simd
-from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.rendering.cpu import binning, layout, projection
 from ghgs_lit.rendering.cpu.backward import backward
 from ghgs_lit.rendering.cpu.forward import forward
@@ -36,25 +34,9 @@ def rasterize(
     Differentiable in the Gaussians, not in the cameras. The result has the same bits with any number of
     threads.
     """
-    _warn_of_narrow_vectors()
     fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
     plan = Plan.of(gaussians, cameras, settings, near, far)
     return Rendering(*_Rasterize.apply(*(field.float().contiguous() for field in fields), plan))
-
-
-@cache
-def _warn_of_narrow_vectors() -> None:
-    """Warn, once in a process, on a processor whose vectors are narrower than 256 bits.
-
-    The image is the same there: LLVM splits the kernels' vectors into those of the machine.
-    """
-    if not processor_features() & {"avx2", "sve"}:
-        warnings.warn(
-            "renderer=cpu: this processor has no vectors of 256 bits or more (AVX2, AVX-512, SVE); "
-            "the rasterizer splits its own and takes several times as long",
-            RuntimeWarning,
-            stacklevel=3,
-        )
 
 
 @dataclass

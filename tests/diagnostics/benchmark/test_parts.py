@@ -1,4 +1,4 @@
-"""The parts of a benchmark: order, errors, FLOPs, memory, the Pareto front, scenes."""
+"""The parts of a benchmark: order, errors, FLOPs, memory, scenes."""
 
 import dataclasses
 import math
@@ -13,7 +13,6 @@ from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES, differences, partne
 from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
 from ghgs_lit.diagnostics.benchmark.measure import Times, order, time_cases
 from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
-from ghgs_lit.diagnostics.benchmark.plot import pareto
 from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import (
@@ -44,7 +43,7 @@ def model():
 
 
 def case(model, name, renderer):
-    return Case("model", name, {}, model, renderer, None, None, False)
+    return Case(name, {}, model, renderer, None, None, False)
 
 
 def test_rounds_begin_with_another_case_each():
@@ -99,12 +98,6 @@ def test_quartiles_of_one_round_are_its_value():
     """One round, as for models of a minute, has no spread."""
     assert Times.of([2.0]) == Times(2.0, 2.0, 2.0)
     assert Times.of([1.0, 2.0, 3.0, 4.0, 5.0]) == Times(3.0, 2.0, 4.0)
-
-
-def test_the_front_has_what_nothing_else_beats():
-    """A preset that is slower and worse than another one is not on the front."""
-    assert pareto([(3, 0.0), (1, 0.5), (2, 0.5), (2, 0.2), (4, 0.0)]) == [1, 3, 0]
-    assert pareto([(1, 1.0), (1, 1.0)]) == [0]
 
 
 def test_relative_differences_are_always_defined():

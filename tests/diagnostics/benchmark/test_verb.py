@@ -114,9 +114,8 @@ def test_all_files_of_a_benchmark_are_written(measured):
     text = (measured / "benchmark.md").read_text()
     assert "| balanced |" in text
     assert "Machine: " in text
-    assert (measured / "benchmark.png").read_bytes().startswith(b"\x89PNG")
     files = {path.name for path in measured.iterdir() if not path.name.startswith(".")}
-    assert files >= {"benchmark.json", "benchmark.md", "benchmark.png", "config.yaml"}
+    assert files >= {"benchmark.json", "benchmark.md", "config.yaml"}
     assert not files & {"benchmark.csv", "benchmark.html", "tensorboard"}
 
 
@@ -136,11 +135,11 @@ def test_a_preset_of_the_user_that_breaks_its_budget_ends_with_code_1(data, tmp_
     assert "did you mean mine?" in capsys.readouterr().err
 
 
-def test_a_checkpoint_in_every_preset_against_another_one(data, checkpoint, tmp_path, capsys):
+def test_a_checkpoint_in_every_preset(data, checkpoint, tmp_path, capsys):
     """Presets act on the weights of a checkpoint, whose configuration has those of its training."""
     run = ["benchmark", *data, *QUICK, f"checkpoint={checkpoint}", "subjects=1"]
     code = ghgs(
-        *run, f"vs={checkpoint}", "presets=[balanced]", "knobs={recalibration.k:[2],precision:[float32]}",
+        *run, "presets=[balanced]", "knobs={recalibration.k:[2],precision:[float32]}",
         f"hydra.run.dir={tmp_path / 'a'}",
     )  # fmt: skip
     content = json.loads((tmp_path / "a" / "benchmark.json").read_text())
@@ -148,15 +147,12 @@ def test_a_checkpoint_in_every_preset_against_another_one(data, checkpoint, tmp_
     changed = "balanced recalibration.k=2 precision=float32"
     assert set(whole) == {
         "none", "none recalibration.k=2 precision=float32", changed,
-        "vs: none", "vs: none recalibration.k=2 precision=float32", f"vs: {changed}",
     }  # fmt: skip
     assert not content["random_weights"]
     assert whole["none"]["trained"]
     assert whole[changed]["budget_db"] is None
     assert whole[changed]["max_rel_diff"] > 0
     assert whole[changed]["tokens"] < whole["none"]["tokens"]
-    for name in ("psnr", "max_rel_diff", "gaussians"):
-        assert whole[changed][name] == pytest.approx(whole[f"vs: {changed}"][name])
     assert code == 0
     # What the checkpoint decides is not ignored in silence.
     assert ghgs(*run, "recalibration.k=2", f"hydra.run.dir={tmp_path / 'b'}") == 1
@@ -178,7 +174,6 @@ def test_impossible_settings_are_named(data, tmp_path, capsys):
         "timing.repeats=0": "timing.repeats",
         "presets=[]": "presets",
         "presets=exact": "presets",
-        "vs=other.ckpt": "vs",
         "subjects=0": "subjects",
         "knobs={recalibration.colour:[1]}": "knobs.recalibration.colour",
     }.items():
