@@ -1,4 +1,4 @@
-"""Milliseconds of a training step with its wait for data, of several versions of the package in turns.
+"""Milliseconds of a training step by part, of several versions of the package in turns.
 
     python benchmarks/training_step.py experiment=scans data.root=/data/scans
     python benchmarks/training_step.py --packages ../before . -- experiment=scans data.root=/data/scans
@@ -18,7 +18,7 @@ from pathlib import Path
 
 # What a process of one version runs: only names that older versions have, too.
 CHILD = """
-import json, logging, sys, tempfile, time
+import json, logging, sys, tempfile
 import lightning.pytorch as L
 import torch
 from hydra import compose, initialize_config_dir
@@ -27,6 +27,7 @@ from omegaconf import OmegaConf
 from ghgs_lit.config import build, conf_dir
 from ghgs_lit.model import GHGS
 from ghgs_lit.training import GHGSModule
+from ghgs_lit.training.callbacks import Costs
 
 steps, warmup, threads, *overrides = sys.argv[1:]
 torch.set_num_threads(int(threads))
@@ -47,9 +48,9 @@ found = {}
 class Keep(L.Callback):
     def on_train_batch_end(self, trainer, pl_module, *args):
         if trainer.global_step == int(warmup):
-            self.began = time.perf_counter()
+            pl_module.clock.means()
         if trainer.global_step == trainer.max_steps:
-            found["ms"] = 1e3 * (time.perf_counter() - self.began) / int(steps)
+            found["ms"] = pl_module.clock.means()
             found["loss"] = float(trainer.callback_metrics["loss/total"])
 
 with tempfile.TemporaryDirectory() as folder:
@@ -57,14 +58,14 @@ with tempfile.TemporaryDirectory() as folder:
         accelerator="cpu", max_steps=int(steps) + int(warmup), max_epochs=-1, logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
         limit_val_batches=0, num_sanity_val_steps=0, log_every_n_steps=10**9, default_root_dir=folder,
-        callbacks=[Keep()],
+        callbacks=[Costs(), Keep()],
     ).fit(module, data)
 print("RESULT" + json.dumps(found))
 """
 
 
 def measure(package: Path, arguments: argparse.Namespace) -> dict:
-    """Milliseconds and the last loss of one process."""
+    """Milliseconds by part and the last loss of one process."""
     numbers = [str(n) for n in (arguments.steps, arguments.warmup, arguments.threads)]
     run = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", CHILD, *numbers, *arguments.overrides],
@@ -94,9 +95,12 @@ def main() -> None:
     for _ in range(arguments.rounds):
         for package in packages:
             found[package].append(measure(package, arguments))
-    print(f"{'':12}", *(f"{package.name:>14}" for package in packages), "   ms, medians")
-    medians = [statistics.median(one["ms"] for one in found[package]) for package in packages]
-    print(f"{'step':12}", *(f"{ms:14.1f}" for ms in medians))
+    print(f"{'part':12}", *(f"{package.name:>14}" for package in packages), "   ms, medians")
+    for part in found[packages[-1]][0]["ms"]:
+        medians = [
+            statistics.median(one["ms"].get(part, 0.0) for one in found[package]) for package in packages
+        ]
+        print(f"{part:12}", *(f"{ms:14.1f}" for ms in medians))
     print(f"{'loss':12}", *(f"{found[package][-1]['loss']:14.6f}" for package in packages))
 
 

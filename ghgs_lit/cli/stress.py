@@ -25,7 +25,7 @@ def run(cfg: DictConfig) -> None:
     tasks = tasks_of(config["stages"], config["families"], config["quick"])
     require(bool(tasks), "families", "a family that one of the stages has", config["families"])
     workers = allowed_cores() if config["workers"] is None else config["workers"]
-    rows = run_tasks(tasks, workers)
+    rows = run_tasks(tasks, directory / "cells.jsonl", workers)
     _print(rows)
     source = provenance(config, seed=0, verb="stress", choices=choices())
     announce(report.write(directory, rows, source))

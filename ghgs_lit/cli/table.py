@@ -1,4 +1,4 @@
-"""``ghgs table``: the runs below a directory as one of the paper's tables."""
+"""``ghgs table``: the runs below a directory as one of the paper's tables, or as a list."""
 
 import re
 from pathlib import Path
@@ -6,12 +6,14 @@ from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.markdown import Markdown
+from rich.text import Text
+from tabulate import tabulate
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation import tables as t
 from ghgs_lit.files import write_text_atomically
+from ghgs_lit.runs.listing import list_runs
 
 
 def _listed(value: Any) -> tuple | None:
@@ -38,11 +40,17 @@ def _options(config: dict[str, Any]) -> t.TableOptions:
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb; prints the tables, and the path of the Markdown file last."""
+    """The verb; prints the tables, and the path of the Markdown file last; with ``list`` the runs."""
     directory = output_dir()
     config = save_config(cfg, directory)
     options = _options(config)
     folders = [Path(p).expanduser() for p in _listed(config["runs"]) or ()]
+    if config["list"]:
+        runs = list_runs(folders)
+        write_text_atomically(directory / "runs.csv", runs.to_csv(index=False))
+        print(tabulate(runs, "keys", showindex=False, disable_numparse=True))
+        announce(directory / "runs.csv")
+        return
     others = [t.read_others(Path(p).expanduser()) for p in _listed(config["others"]) or ()]
     sweep = t.read_sweep(folders, _listed(config["by"]) or ())
     tables = t.build_tables(sweep, others, options)
@@ -50,7 +58,14 @@ def run(cfg: DictConfig) -> None:
     latex = "\n".join(t.to_latex(table, label) for table, label in zip(tables, labels, strict=True))
     write_text_atomically(directory / "table.csv", t.to_csv(tables))
     write_text_atomically(directory / "table.tex", t.PREAMBLE + latex)
-    text = "\n".join(t.to_markdown(table) for table in tables)
-    write_text_atomically(directory / "table.md", text)
-    Console().print(Markdown(text))
+    write_text_atomically(directory / "table.md", "\n".join(t.to_markdown(table) for table in tables))
+    for table in tables:
+        _print(table)
     announce(directory / "table.md")
+
+
+def _print(table: t.Table) -> None:
+    console = Console()
+    console.print(table.caption.replace("`", ""), highlight=False)
+    console.print(Text.from_ansi(t.to_terminal(table, console.width)), soft_wrap=True)
+    console.print("\n".join(table.notes).replace("**", "").replace("`", ""), markup=False, highlight=False)

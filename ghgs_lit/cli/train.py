@@ -26,8 +26,10 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import (
     Train,
+    in_sweep,
     is_multirun,
-    refuse_several_processes,
+    needs_own_process,
+    train_in_own_process,
     train_once,
     with_resume,
 )
@@ -141,12 +143,12 @@ def _changes_to_go_on(run_directory: RunDirectory) -> str:
 
 
 def _run(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
-    if is_multirun():
-        refuse_several_processes(config, choices().get("hydra/launcher", "basic"))
+    if needs_own_process(config):
+        return train_in_own_process(run_directory)
     if rank_zero_only.rank == 0:
         return train_once(run_directory, config, train)
     # The first process has locked the run for all of them.
-    if is_multirun() and run_directory.done:
+    if in_sweep() and run_directory.done:
         return None
     return train(with_resume(config, run_directory), run_directory.path, {})
 

@@ -48,3 +48,8 @@ class Completeness:
     def missing(self, phase: str, names: Sequence[str]) -> list[str]:
         """Those of ``names`` that are not completely rendered."""
         return [name for name in names if not self.marker(phase, name).exists()] if self.rendered_here else []
+
+    def whole(self, phase: str, names: Sequence[str]) -> list[str]:
+        """Those of ``names`` that are completely rendered."""
+        missing = set(self.missing(phase, names))
+        return [name for name in names if name not in missing]

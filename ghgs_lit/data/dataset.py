@@ -17,6 +17,19 @@ if TYPE_CHECKING:  # it imports Lightning, which takes seconds
     from ghgs_lit.data.datamodule import PhotographsDataModule
 
 
+class Limit(Options):
+    """Numbers of subjects."""
+
+    train: Count | None = None
+    """Subjects of training that are used, the first ones; null: all."""
+    val: Count | None = None
+    """Subjects of validation that are used, the first ones; null: all."""
+
+    def of(self, phase: str) -> int | None:
+        """The number of a phase; None: all."""
+        return getattr(self, phase, None)
+
+
 class DataOptions(Options):
     """Everything that data sets have in common; each has a subclass with the keys of its own.
 
@@ -114,6 +127,8 @@ class DataSet(DataOptions):
 
     root: options.Path | None = None
     """Folder of the data."""
+    limit: Limit = Limit()
+    """Subjects used of each phase."""
 
 
 def required_folder(key: str, expected: str, value: str | None) -> Path:

@@ -44,7 +44,7 @@ BodyReader = Callable[[str], np.ndarray | None]
 
 
 class Rendered(DataOptions):
-    """Data in the rendered layout. A subclass says ``root`` and ``pixel_centers``."""
+    """Data in the rendered layout. A subclass says ``root``, ``limit`` and ``pixel_centers``."""
 
     @property
     def facts(self) -> dict[str, str]:
@@ -65,8 +65,8 @@ class Rendered(DataOptions):
         return None
 
     def reader(self, phase: str, strict: bool = True) -> "Layout":
-        names, further = self.subject_names(phase), self.further_bodies()
-        return Layout(self.folder, phase, names, self.pixel_centers, further, strict)
+        names, limit, further = self.subject_names(phase), self.limit.of(phase), self.further_bodies()
+        return Layout(self.folder, phase, names, limit, self.pixel_centers, further, strict)
 
 
 class Layout(Reader):
@@ -76,6 +76,7 @@ class Layout(Reader):
     Args:
         names: the subjects to read (None: all that there are). Those that the folder of the phase lacks are
             read from the other one: a split may differ from the one that the folders were made for.
+        limit: number of subjects, the first ones (None: all).
         pixel_centers: where the renderer that made the files put pixel centres: ``half`` (+0.5, as this
             package), ``integer`` (as the published scripts) or ``auto`` (integer unless rendered here).
     """
@@ -85,6 +86,7 @@ class Layout(Reader):
         root: str | Path,
         phase: str,
         names: Sequence[str] | None = None,
+        limit: int | None = None,
         pixel_centers: str = "half",
         further_bodies: BodyReader | None = None,
         strict: bool = True,
@@ -96,9 +98,9 @@ class Layout(Reader):
         integer = pixel_centers == "auto" and not self._complete.rendered_here
         self._shift = 0.5 if integer or pixel_centers == "integer" else 0.0
         self._folders: dict[str, Path] = {}
-        self._find(phase, names)
+        self.find(phase, names, limit)
 
-    def _find(self, phase: str, names: Sequence[str] | None) -> None:
+    def find(self, phase: str, names: Sequence[str] | None, limit: int | None = None) -> None:
         """Fill ``subjects`` with those that are complete."""
         if not self.root.is_dir():
             raise InputError(f"{self.root}: expected the root of a rendered data set; found no such folder")
@@ -114,7 +116,7 @@ class Layout(Reader):
             for name in sorted(stored[phase].keys() & other.keys()):
                 self.problem(f"{self.root}: expected each subject in train or in val; found {name!r} in both")
         planned = self._complete.plan.get(phase, [])
-        wanted = sorted({*stored[phase], *planned}) if names is None else list(names)
+        wanted = (sorted({*stored[phase], *planned}) if names is None else list(names))[:limit]
         homes = {name: next((p for p in phases if name in stored[p]), phase) for name in wanted}
         missing = [
             name

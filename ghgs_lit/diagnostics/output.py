@@ -1,10 +1,14 @@
-"""Tables of texts for Markdown and the terminal."""
+"""Tables of texts for Markdown and the terminal, and figures as PNG."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 from tabulate import tabulate
+
+from ghgs_lit.files import write_atomically
 
 #: Tables of texts by their titles.
 Tables = dict[str, pd.DataFrame]
@@ -51,3 +55,8 @@ def print_tables(tables: Tables) -> None:
     """Print tables; a line that wraps is better than a number that is cut."""
     for name, table in tables.items():
         print(name, tabulate(table, "keys", showindex=False, disable_numparse=True), sep="\n\n", end="\n\n")
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
+    write_atomically(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))

@@ -18,7 +18,7 @@ from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.checks import check_config
-from ghgs_lit.runs.job import BUSY, refuse_several_processes
+from ghgs_lit.runs.job import BUSY, trains_in_several_processes
 from ghgs_lit.runs.plan import PlannedRun, print_plan, print_results
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
@@ -50,7 +50,7 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
         lambda overrides: loader.load_sweep_config(config, overrides),
     )
     for item in planned:  # an impossible launcher is refused before anything starts
-        refuse_several_processes(item.config, config.hydra.runtime.choices["hydra/launcher"])
+        trains_in_several_processes(item.config, config.hydra.runtime.choices["hydra/launcher"])
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []

@@ -1,5 +1,8 @@
 """What a job of a sweep does: lock its run if that is free and not done, and train or resume it."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,14 +12,17 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError
 from ghgs_lit.runs.checks import check_directory
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.signals import STOP, Interrupted
 
 BUSY = "busy"
 """The return value of a job whose run another process works on."""
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
+# Set in the environment of a job's own process: whether to "skip" a locked run or to "wait" for it.
+_VARIABLE = "GHGS_SWEEP_JOB"
 
 Train = Callable[[dict[str, Any], Path, dict[str, Any]], float | None]
 """``(config, directory, stats) -> metric``; ``stats`` is filled for ``sessions.jsonl``."""
@@ -27,9 +33,16 @@ def is_multirun() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
+def in_sweep() -> bool:
+    """Whether this process runs a job of a sweep."""
+    return is_multirun() or _VARIABLE in os.environ
+
+
 def _waits() -> bool:
     """Whether to wait for a locked run: the grid returns to it later, other sweepers need its result now."""
-    return is_multirun() and HydraConfig.get().sweeper.get("_target_") != SWEEPER
+    if is_multirun():
+        return HydraConfig.get().sweeper.get("_target_") != SWEEPER
+    return os.environ.get(_VARIABLE) == "wait"
 
 
 def _hash_of_run(*, _root_: DictConfig) -> str:
@@ -62,7 +75,7 @@ def register_resolvers() -> None:
 
 def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
     """``config`` that, in a sweep, resumes from the run's own last checkpoint."""
-    if not is_multirun() or config["resume"] is not None or run.checkpoint is None:
+    if not in_sweep() or config["resume"] is not None or run.checkpoint is None:
         return config
     return {**config, "resume": str(run.checkpoint)}
 
@@ -70,24 +83,66 @@ def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
 def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float | str | None:
     """Train ``run`` unless it is done; returns its metric, or ``BUSY`` if another process works on it."""
     with run.claim(wait=_waits()) as claimed:
-        if not claimed and is_multirun():
+        if not claimed and in_sweep():
             print(f"skipped: {run.owner} works on {run.path}", flush=True)
             return BUSY
         if not claimed:
             raise InputError(f"{run.path}: expected a directory that no process works in; found {run.owner}")
-        if is_multirun() and run.done:
+        if in_sweep() and run.done:
             print(f"done before: {run.path}", flush=True)
             return run.metric
         config = with_resume(config, run)
-        if not is_multirun():
+        if not in_sweep():
             check_directory(run.path, config)
         with run.session(resumed=config["resume"]) as stats:
             return train(config, run.path, stats)
 
 
-def refuse_several_processes(config: Mapping[str, Any], launcher: str) -> None:
-    """Refuse a job of a sweep that trains in several processes, which only SLURM can start. InputError: it
-    does, and the launcher is another one."""
+def train_in_own_process(run: RunDirectory) -> float | str | None:
+    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process.
+
+    The new process locks the run, so that the lock stays when this process dies.
+    """
+    hydra = HydraConfig.get()
+    command = [sys.executable, "-m", "ghgs_lit", hydra.job.name, *hydra.overrides.task]
+    command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
+    mode = {_VARIABLE: "wait" if _waits() else "skip"}
+    code = _run_process(command, {**os.environ, **mode})
+    if code in [128 + number for number in STOP]:
+        raise Interrupted(code - 128)
+    if code:
+        raise InputError(f"{run.path}: expected a job that succeeds; found exit code {code}")
+    return run.metric if run.done else BUSY
+
+
+def _run_process(command: list[str], environment: Mapping[str, str]) -> int:
+    """The exit code of ``command``; a signal that stops this process is handed on, and awaited."""
+    with subprocess.Popen(command, env=environment) as process:
+        try:
+            return process.wait()
+        except Interrupted as stop:
+            process.send_signal(stop.number)
+            process.wait()
+            raise
+
+
+def trains_in_several_processes(config: Mapping[str, Any], launcher: str) -> bool:
+    """Whether a job of a sweep trains in several processes; InputError: Hydra's launcher runs all in one."""
     devices = config["trainer"].get("devices", 1)
-    alone = devices in (1, "1", [0]) or "slurm" in launcher
-    require(alone, "trainer.devices", "1 in a sweep without SLURM (hydra/launcher=slurm)", devices)
+    if devices in (1, "1", [0]):
+        return False
+    if launcher == "basic":
+        raise InputError(
+            f"trainer.devices: expected 1 in a sweep whose jobs share a process; found {devices}"
+            " (hydra/launcher=joblib, submitit_local or submitit_slurm gives each job its own)"
+        )
+    return True
+
+
+def needs_own_process(config: Mapping[str, Any]) -> bool:
+    """Whether this job of a sweep trains in several processes that Lightning starts."""
+    if not is_multirun():
+        return False
+    launcher = HydraConfig.get().runtime.choices.get("hydra/launcher", "basic")
+    # SLURM starts the processes of a job itself.
+    return trains_in_several_processes(config, launcher) and "slurm" not in launcher

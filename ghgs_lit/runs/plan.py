@@ -1,5 +1,6 @@
 """What a sweep will run, and what it has run, as tables on the terminal."""
 
+import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from tabulate import tabulate
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import is_multirun
+from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
 
@@ -27,10 +29,37 @@ class PlannedRun:
     run: RunDirectory
 
 
-def _budget(config: Mapping[str, Any]) -> str:
-    """``trainer.max_time`` and ``trainer.max_steps``, of which the first that ends counts."""
-    time, steps = config["trainer"].get("max_time"), config["trainer"].get("max_steps", -1)
-    return " or ".join([*([str(time)] if time else []), *([f"{steps} steps"] if steps > 0 else [])])
+def time_budget(config: Mapping[str, Any]) -> float | None:
+    """Seconds of ``trainer.max_time`` (``days:hours:minutes:seconds`` or a mapping); None without one."""
+    value = config["trainer"].get("max_time")
+    if value is None:
+        return None
+    if isinstance(value, Mapping):
+        return datetime.timedelta(**value).total_seconds()
+    days, hours, minutes, seconds = map(int, value.split(":"))
+    return datetime.timedelta(days, seconds, hours=hours, minutes=minutes).total_seconds()
+
+
+def step_seconds(directory: Path) -> tuple[float, int] | None:
+    """Mean seconds of a training step in the runs below ``directory`` that are done, and their number."""
+    steps = seconds = count = 0
+    for path in sorted(directory.glob("*/metrics.json")):
+        sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
+        steps += sum(s["steps"] for s in sessions)
+        seconds += sum(s["seconds"] for s in sessions)
+        count += bool(sessions)
+    return (seconds / steps, count) if steps else None
+
+
+def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | None:
+    """How long a run trains, from its budgets and the measured seconds of a ``step``; None if unknown."""
+    steps = config["trainer"].get("max_steps", -1)
+    known = [time_budget(config), steps * step if steps > 0 and step is not None else None]
+    return min((seconds for seconds in known if seconds is not None), default=None)
+
+
+def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
+    return f"{config['trainer'].get('max_steps')} steps" if seconds is None else clock(seconds)
 
 
 def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
@@ -47,11 +76,20 @@ def _counts(states: Sequence[State]) -> str:
 
 
 def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
-    """Print the runs with their states, how long each trains, and where results go."""
+    """Print the runs with their states, how long the remaining ones train, and where results go."""
     states = [item.run.state for item in planned]
-    budgets = [_budget(item.config) for item in planned]
+    measured = step_seconds(directory)
+    times = [expected_seconds(item.config, measured and measured[0]) for item in planned]
+    budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
     _print_table(planned, {"state": [s.value for s in states], "trains for": budgets})
     print(f"{len(planned)} runs: {_counts(states)}; nothing was run")
+    left = [t for t, state in zip(times, states, strict=True) if state != State.DONE]
+    basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
+    if measured:
+        basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
+    known = "unknown" if None in left else clock(sum(left))
+    reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
+    print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
     print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
     print_refusals([item.config for item in planned])
 
@@ -86,6 +124,7 @@ def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
         raise SystemExit(
             "dry_run: expected hydra/sweeper=grid, which knows its runs in advance; found another"
         )
-    _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [_budget(config)]})
+    budget = _budget(config, expected_seconds(config, None))
+    _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [budget]})
     print(f"nothing was run; outputs: {run.path}/ with {OUTPUTS}", flush=True)
     print_refusals([config])

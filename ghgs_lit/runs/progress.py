@@ -50,14 +50,12 @@ def clock(seconds: float) -> str:
     return str(datetime.timedelta(seconds=round(seconds)))
 
 
-def track(items: Iterable[T], text: str, every: float = EVERY, total: int | None = None) -> Iterator[T]:
-    """``items``, with a bar or, each ``every`` seconds, with a line that says how many of them are done.
-    ``total``: their number where they do not know it."""
-    total = len(items) if hasattr(items, "__len__") else total
+def track(items: Iterable[T], text: str, every: float = EVERY) -> Iterator[T]:
+    """``items``, with a bar or, each ``every`` seconds, with a line that says how many of them are done."""
     if on_terminal():
-        yield from bar(items, text, total, transient=True)
+        yield from bar(items, text, transient=True)
         return
-    total = "" if total is None else f" of {total}"
+    total = f" of {len(items)}" if hasattr(items, "__len__") else ""
     lines, started = Lines(every=every), time.monotonic()
     for done, item in enumerate(items):
         if lines.due() and done:

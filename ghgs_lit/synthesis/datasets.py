@@ -14,13 +14,15 @@ from pydantic import Field
 from ghgs_lit.config import options
 from ghgs_lit.config.describe import Words
 from ghgs_lit.config.options import Index, Options, Share, Size, Text, Workers
-from ghgs_lit.data.dataset import DataSet, required_folder
-from ghgs_lit.data.layout import Rendered
+from ghgs_lit.data.completeness import Completeness
+from ghgs_lit.data.dataset import DataSet, Limit, required_folder
+from ghgs_lit.data.layout import Layout, Rendered
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import bench, people
+from ghgs_lit.synthesis.beside import Joining, render_beside
 from ghgs_lit.synthesis.capture_rig import CaptureRig, RigCamera
 from ghgs_lit.synthesis.jobs import (
     ACTIVE,
@@ -39,6 +41,8 @@ from ghgs_lit.synthesis.scans import ScanSource
 _PEOPLE_SEED = 0
 # Of heights, yaws, lights and of the split by fraction of scans.
 _SEED = 0
+# People in a rig that training begins with.
+_FIRST_TRAIN = 8
 
 
 class _Renderable(Rendered):
@@ -101,6 +105,7 @@ class ActivePeople(Options):
 class _Generated(_Renderable):
     """Generated people, rendered on first use and kept in a cache folder named after all their settings."""
 
+    limit: ClassVar[Limit] = Limit()
     pixel_centers: ClassVar[str] = "half"
 
     size: Size = (140, 140)
@@ -149,10 +154,13 @@ class _Generated(_Renderable):
         if bench.SPLIT in splits:
             made_with = everything(self.camera_rig(), self.render)
             bench.check_settings({"people_seed": _PEOPLE_SEED, **made_with})
-        names = {phase: self.subject_names(phase) for phase in splits}
-        self.render_into(Path(self.root), names, self.source_of_people, _PEOPLE_SEED)
+        self.render_first({phase: self.subject_names(phase) for phase in splits})
         if bench.SPLIT in splits:
             bench.check_photographs(self.reader(bench.SPLIT))
+
+    def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
+        """Render these people, by phase."""
+        self.render_into(Path(self.root), names, self.source_of_people, _PEOPLE_SEED)
 
     def check_targets(self, targets: TargetProtocol) -> None:
         needed = {RING_VIEW} | targets.view_numbers
@@ -185,7 +193,11 @@ class Synthetic(_Generated, _OnRing):
 
 
 class PeopleInRig(_Generated):
-    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on."""
+    """Generated people in the rig of a capture, as crops around them: what ``ghgs adapt`` trains on.
+
+    Training waits for the first of its people only (for all where ``render_workers`` is 0): the others are
+    rendered beside it.
+    """
 
     name: Text = "people_in_rig"
     cameras: Annotated[dict, Words("a mapping of cameras")] = Field({})
@@ -197,6 +209,26 @@ class PeopleInRig(_Generated):
     @property
     def ring(self) -> int:
         return len(self.cameras)
+
+    def subject_names(self, phase: str) -> list[str]:
+        """Both kinds of people in turn, so that the first ones are of both."""
+        return sorted(super().subject_names(phase), key=lambda name: name[1:])
+
+    def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
+        """Render these people, of training the first; begin to render the others."""
+        if self.render_workers == 0:
+            return super().render_first(names)
+        trained, root, source = list(names.get("train", [])), Path(self.root), SyntheticSource(_PEOPLE_SEED)
+        super().render_first({**names, "train": trained[:_FIRST_TRAIN]})
+        render_beside(root, trained, source, self.camera_rig(), self.render, _PEOPLE_SEED)
+
+    def reader(self, phase: str, strict: bool = True) -> Layout:
+        if phase != "train":
+            return super().reader(phase, strict)
+        names, made = self.subject_names(phase), Completeness(self.folder)
+        layout = Layout(self.folder, phase, made.whole(phase, names) or names, strict=strict)
+        Joining(layout, made, names)
+        return layout
 
     def camera_rig(self) -> CaptureRig:
         read = [RigCamera.read(camera, f"data.cameras.{name}") for name, camera in self.cameras.items()]
@@ -237,9 +269,10 @@ class Scans(DataSet, _OnRing):
         return ScanSource(self.source_folder)
 
     def render_missing(self) -> int:
-        """Render the scans of the split that ``root`` lacks; returns their number."""
+        """Render the scans of the split (up to ``limit``) that ``root`` lacks; returns their number."""
         source, root = self.scans(), required_folder("data.root", "a folder", self.root)
         names = split_names(self.source_folder, source.names(), self.split, self.val_fraction, _SEED)
+        names = {phase: listed[: self.limit.of(phase)] for phase, listed in names.items()}
         return self.render_into(root, names, source, _SEED)
 
 

@@ -21,6 +21,9 @@ from typing import Protocol
 import numpy as np
 import torch
 from pydantic import Field
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
 from ghgs_lit.config.options import Index, Options, Size
 from ghgs_lit.data.layout import position_name
@@ -29,7 +32,6 @@ from ghgs_lit.data.view import View, encode_depth
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import naming
 from ghgs_lit.kernels.cores import allowed_cores
-from ghgs_lit.runs.progress import track
 from ghgs_lit.synthesis import motion, people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
@@ -181,6 +183,7 @@ def render_people(
     settings: RenderOptions,
     seed: int,
     workers: int | None = None,
+    shown: bool = True,
 ) -> int:
     """Render people below ``root``; those that are already there are kept.
 
@@ -216,12 +219,15 @@ def render_people(
             # Without the instant's _t000.
             for name in dict.fromkeys(name[:-5] if instants else name for name in missing(phase, listed))
         ]
-        try:
-            with contextlib.closing(_run(todo, workers)) as finished:
-                for job in track(finished, f"rendering into {root}", total=len(todo)):
-                    progress.publish(job.workspace, job.phase, job.subjects)
-        finally:
-            progress.clear_workspaces()
+        with _bar(shown) as bar:
+            task = bar.add_task(f"rendering into {root}", total=len(todo))
+            try:
+                with contextlib.closing(_run(todo, workers)) as finished:
+                    for job in finished:
+                        progress.publish(job.workspace, job.phase, job.subjects)
+                        bar.advance(task)
+            finally:
+                progress.clear_workspaces()
     return len(todo)
 
 
@@ -234,7 +240,7 @@ def _run(jobs: list[_Job], workers: int | None) -> Iterator[_Job]:
         # A worker of joblib: its start method is inherited by name, and a fresh process does not know it.
         multiprocessing.set_start_method("spawn", force=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_start_worker) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=start_worker) as pool:
         try:
             futures = [pool.submit(render_subject, job) for job in jobs]
             for future in as_completed(futures):
@@ -257,7 +263,7 @@ def _check_main_guard() -> None:
         )
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
     """One thread for each process; Ctrl-C is left to the parent; a worker ends with its parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -268,3 +274,8 @@ def _end_with_parent() -> None:
     """Nothing else ends a worker whose parent is killed (``kill``, ``kill -9``, the batch system)."""
     multiprocessing.parent_process().join()
     os._exit(1)
+
+
+def _bar(shown: bool) -> Bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Bar(*columns, console=Console(stderr=True), disable=not shown)

@@ -6,6 +6,7 @@ release render is read as it is. GHG keeps its bodies beside the scans (``<sourc
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -31,10 +32,13 @@ class THuman2(Scans):
     pixel_centers: Literal["half", "integer", "auto"] = "auto"
     fits: options.Path | None = None
     """Folder with <id>/smplx_param.pkl, mesh_smplx.obj; null: by its usual names in or beside source."""
+    body_model: options.Path | None = None
+    """Folder of the licensed SMPL-X model; null: the fits' mesh_smplx.obj."""
 
     def scans(self) -> THuman2Source:
         folder = self.source_folder
-        return THuman2Source(folder, find_fits(folder, self.fits))
+        model = Path(self.body_model).expanduser() if self.body_model else None
+        return THuman2Source(folder, find_fits(folder, self.fits), model)
 
     def further_bodies(self) -> BodyReader | None:
         return None if self.source is None else partial(_body_beside_scan, self.scans())

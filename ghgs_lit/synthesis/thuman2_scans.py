@@ -4,33 +4,68 @@
 <fits>/<id>/smplx_param.pkl, mesh_smplx.obj               the fit, in the frame of its scan
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.data.pickles import load_npy, load_pickle
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import InputError, installed
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.scans import ScanSource
 
 # Names of the folder of the fits in published archives and scripts.
 FIT_FOLDERS = ("THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "THuman2.0_SMPLX_Paras", "smplx_2", "smplx")
+_NEEDED = ("betas", "global_orient", "body_pose")
+_MORE = ("left_hand_pose", "right_hand_pose", "jaw_pose", "leye_pose", "reye_pose", "expression")
+_FIT_SIZES = {"global_orient": (3,), "scale": (1,), "translation": (3,), "transl": (3,)}
 
 
-def facing_of(path: Path) -> float:
-    """Degrees about y from +z to where the body of the fit at ``path`` faces; its pickle is read without
-    running it. InputError: it is missing, no plain pickle, or has no such rotation."""
+@dataclass(frozen=True)
+class SmplxFit:
+    """The content of ``smplx_param.pkl``. ``parameters``: of the male SMPL-X model, by name, [1, n].
+    ``scale``, ``translation``: from the model's frame to the scan's: ``v * scale + translation``, scale
+    first."""
+
+    parameters: Mapping[str, np.ndarray]
+    scale: float
+    translation: np.ndarray
+
+    def to_scan(self, vertices: np.ndarray) -> np.ndarray:
+        """Vertices [n, 3] of the model in the scan's frame."""
+        return vertices * self.scale + self.translation
+
+    @property
+    def facing(self) -> float:
+        """Degrees about y from +z to where the body faces."""
+        forward = Rotation.from_rotvec(self.parameters["global_orient"][0]).as_matrix()[:, 2]
+        return float(np.degrees(np.arctan2(forward[0], forward[2])))
+
+
+def read_fit(path: Path) -> SmplxFit:
+    """The fit at ``path``; its pickle is read without running it. InputError: it is missing, no plain pickle,
+    lacks a key, or a value is of another shape or not finite."""
     content = load_pickle(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a dictionary; found {type(content).__name__}")
-    if "global_orient" not in content:
-        raise InputError(f"{path}: expected the key 'global_orient'; found {sorted(map(str, content))}")
-    turn = check_array(f"{path}: global_orient", np.ravel(content["global_orient"]), [(3,)])
-    forward = Rotation.from_rotvec(turn).as_matrix()[:, 2]
-    return float(np.degrees(np.arctan2(forward[0], forward[2])))
+    # Fits of SMPL made for the same scans call it transl.
+    moved = "transl" if "transl" in content else "translation"
+    for name in (*_NEEDED, "scale", moved):
+        if name not in content:
+            raise InputError(f"{path}: expected the key {name!r}; found {sorted(map(str, content))}")
+    values = {
+        name: check_array(f"{path}: {name}", np.ravel(content[name]), [_FIT_SIZES.get(name, (None,))])
+        for name in (*_NEEDED, "scale", moved, *(n for n in _MORE if n in content))
+    }
+    scale, translation = values.pop("scale"), values.pop(moved)
+    if scale[0] <= 0:
+        raise InputError(f"{path}: scale: expected more than 0; found {scale[0]}")
+    return SmplxFit({name: value[None] for name, value in values.items()}, float(scale[0]), translation)
 
 
 def find_fits(source: Path, fits: str | None) -> Path | None:
@@ -52,10 +87,13 @@ class THuman2Source:
 
     Attributes:
         fits: folder of the fits (None: each scan's own folder).
+        body_model: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
+            ``smplx_param.pkl`` (None: read ``mesh_smplx.obj``, a part of the fits).
     """
 
     folder: Path
     fits: Path | None
+    body_model: Path | None = None
 
     def names(self) -> list[str]:
         return ScanSource(self.folder).names()
@@ -72,12 +110,20 @@ class THuman2Source:
         return self.fits / name
 
     def body(self, name: str) -> np.ndarray | None:
-        """Body vertices [n, 3] float64 in the scan's frame; None without fits. InputError: the fit is bad."""
+        """Body vertices [n, 3] float64 in the scan's frame; None without fits. InputError: the fit is bad, or
+        its vertices are neither stored nor computable."""
         folder = self.fit(name)
         if folder is None:
             return None
-        mesh = folder / "mesh_smplx.obj"
-        require(mesh.exists(), str(mesh), "the fitted mesh", "none")
+        parameters, mesh = folder / "smplx_param.pkl", folder / "mesh_smplx.obj"
+        if self.body_model is not None:
+            fit = read_fit(parameters)
+            return fit.to_scan(smplx_vertices(self.body_model, fit.parameters))
+        if not mesh.exists():
+            raise InputError(
+                f"{mesh}: expected the fitted mesh, or data.body_model with the licensed SMPL-X model to "
+                "compute it; found neither"
+            )
         return _obj_vertices(mesh)
 
     def load(self, name: str) -> Person:
@@ -98,7 +144,7 @@ class THuman2Source:
         """Degrees about y that the first camera is turned by, to face the person; 0 without a fit."""
         folder = self.fit(name)
         path = None if folder is None else folder / "smplx_param.pkl"
-        return 0.0 if path is None or not path.exists() else facing_of(path)
+        return 0.0 if path is None or not path.exists() else read_fit(path).facing
 
 
 def _obj_vertices(path: Path) -> np.ndarray:
@@ -124,6 +170,28 @@ def _check_body(folder: Path, scan: Person, body: np.ndarray) -> None:
             f"{folder}: expected a body in its scan's frame; found one {ratio:.2f} times as tall as the scan "
             f"that leaves its box by {outside / tall:.2f} of its height (scale before translation?)"
         )
+
+
+@lru_cache(maxsize=2)
+def _smplx_model(folder: Path) -> Any:
+    smplx = installed("smplx", "smpl", "data.body_model")
+    if not folder.exists():
+        raise InputError(f"{folder}: expected the SMPL-X model (data.body_model); found no such folder")
+    try:
+        return smplx.create(str(folder), "smplx", gender="male", num_pca_comps=12, use_pca=True, num_betas=10)
+    except (AssertionError, OSError, ValueError) as error:
+        raise InputError(f"{folder}: expected smplx/SMPLX_MALE.npz; found {error}") from error
+
+
+def smplx_vertices(folder: Path, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Vertices [10475, 3] of the male SMPL-X model, before scale and translation. ``parameters``: by name,
+    [1, n]. InputError: the package or the model files are missing."""
+    import torch
+
+    model = _smplx_model(folder)
+    with torch.no_grad():
+        posed = model(**{name: torch.from_numpy(value).float() for name, value in parameters.items()})
+    return posed.vertices[0].double().numpy()
 
 
 def ghg_body(path: Path, vertices: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from torch import nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError
+from ghgs_lit.training.clock import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
@@ -30,6 +31,7 @@ class BudgetedModule(L.LightningModule):
             it, beside the nodes of a model that was built of them. None: these alone.
 
     Attributes:
+        clock: marks where the parts of a step end; it runs where the callback ``Costs`` starts it.
         used_budget: share of the run's budget in [0, 1] that is used, as of the last step.
     """
 
@@ -39,6 +41,7 @@ class BudgetedModule(L.LightningModule):
         self.optimization = optimization
         self.config = {**getattr(model, "config", {}), **(config or {})}
         self.used_budget = 0.0
+        self.clock = StepClock()
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         # Lightning copies structures that it does not know one tensor after the other, and waits for each.
@@ -92,6 +95,13 @@ class BudgetedModule(L.LightningModule):
 
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_train_batch_end(self, *args: Any) -> None:
+        # Called after all callbacks: what they did since the step ended is not counted.
+        self.clock.restart()
+
+    def on_validation_end(self) -> None:
+        self.on_train_batch_end()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""

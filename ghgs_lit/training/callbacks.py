@@ -1,8 +1,9 @@
 """What runs beside the training step: a progress bar, times and memory."""
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import lightning.pytorch as L
 import torch
@@ -11,7 +12,9 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from ghgs_lit.config.options import Options
 from ghgs_lit.kernels.allocation import resident_bytes
+from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
+from ghgs_lit.training.clock import PARTS
 from ghgs_lit.types import Batch
 
 
@@ -102,29 +105,62 @@ class RunProgress(ProgressBar):
 
 
 class CostsOptions(Options):
-    """``time_ms/step``: milliseconds of a step; ``memory_mb/*``: of the process and of the GPU."""
+    """``time_ms/*``: milliseconds of each part of a step; ``memory_mb/*``: of the process and of the GPU."""
 
     def build(self) -> "Costs":
         return Costs()
 
 
-class Costs(Callback):
-    """Logs milliseconds of a step, the mean since the last log, and memory in MiB: on CUDA the peak of all
-    tensors since then. The wait for data, validation and the writing of checkpoints and logs do not count."""
+class Costs(Callback, Watcher):
+    """Logs milliseconds of a step and of its parts, and memory in MiB, each since the last log.
+
+    Times are means, memory on CUDA is the peak of all tensors. ``time_ms/01_data`` is the wait for data,
+    ``time_ms/step`` the sum of all parts. Validation and the writing of checkpoints and logs are not counted;
+    parts that a model does not have are left out.
+    """
+
+    #: Stages of the model: the part that ends where the stage begins, the part that the stage is.
+    STAGES: ClassVar = {
+        "encoder": ("interval", "encode"),
+        "depth_head": (None, "depth"),
+        "recalibration": ("unproject", "recalibrate"),
+        "gaussian_head": (None, "gaussians"),
+        "rounds": (None, "rounds"),
+    }
 
     def __init__(self):
-        self._steps, self._seconds = 0, 0.0
+        self._stack = ExitStack()
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._clock = pl_module.clock
+        self._stack.enter_context(watched(pl_module.model, {name: name for name in self.STAGES}, self))
+        self._clock.start(pl_module.device)
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        if (before := self.STAGES[stage][0]) is not None:
+            self._clock.mark(before)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self._clock.mark(self.STAGES[stage][1])
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        self._started = time.perf_counter()
+        pl_module.clock.mark("data")
+
+    def on_after_backward(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        pl_module.clock.mark("backward")
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *args: Any) -> None:
-        self._steps, self._seconds = self._steps + 1, self._seconds + time.perf_counter() - self._started
+        pl_module.clock.end_step()
         if trainer.global_step % trainer.log_every_n_steps == 0:
-            pl_module.log("time_ms/step", 1e3 * self._seconds / self._steps)
-            self._steps, self._seconds = 0, 0.0
+            names = {part: f"{number:02d}_{part}" for number, part in enumerate(PARTS, start=1)}
+            means = pl_module.clock.means()
+            pl_module.log_dict({f"time_ms/{names.get(part, part)}": ms for part, ms in means.items()})
             pl_module.log("memory_mb/process", resident_bytes() / 2**20)
             if pl_module.device.type == "cuda":
                 peak = torch.cuda.max_memory_allocated(pl_module.device)
                 pl_module.log("memory_mb/cuda_peak", peak / 2**20)
                 torch.cuda.reset_peak_memory_stats(pl_module.device)
+
+    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        pl_module.clock.stop()
+        self._stack.close()

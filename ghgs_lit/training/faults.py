@@ -1,22 +1,24 @@
-"""What is not finite in a training step: its weights, its data, a result, or a gradient."""
+"""The first value of a training step that is not finite: its stage, its place and its subject."""
 
 import dataclasses
-import re
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from ghgs_lit.kernels.watching import Watcher, watched
+from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.model import STAGES
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, map_tensors
 
 if TYPE_CHECKING:  # it imports this module
     from ghgs_lit.training.module import GHGSModule
+
+#: What faults are told apart by; other modules belong to the model.
+_STAGES = (*STAGES, "renderer", "losses")
 
 
 @dataclass(frozen=True)
@@ -33,17 +35,50 @@ class Step:
     scale: float = 1.0
 
 
-class _Faults(list[str], Watcher):
-    """What is not finite, in the order in which it is seen."""
+@dataclass(frozen=True)
+class Fault:
+    """A value that is not finite; ``place`` is its tensor, ``sample`` the subject that is at fault alone."""
+
+    values: str
+    where: str
+    stage: str
+    place: str
+    sample: str | None = None
+
+    def __str__(self) -> str:
+        sample = "" if self.sample is None else f", subject {self.sample}"
+        return f"{self.values} in the {self.where} {self.stage} ({self.place}{sample})"
+
+
+class _Faults(list[Fault], Watcher):
+    """Faults in the order in which they are seen, in results of stages and in gradients of their inputs."""
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
+        """Views of the inputs, whose gradients are those from this stage alone."""
+
+        def view(value: Tensor) -> Tensor:
+            if not value.requires_grad:
+                return value
+            value = value.view_as(value)
+            value.register_hook(lambda slope: self.see("gradient from", "an input", slope, stage))
+            return value
+
+        return map_tensors(inputs, view)
 
     def end(self, stage: str, result: Any = None) -> None:
-        self.see(f"the result of {stage}", result)
+        self.see("result of", stage, result)
 
-    def see(self, place: str, value: Any) -> None:
-        """Look at all tensors in ``value``."""
+    def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
+        """Look at all tensors in ``value``; ``stage`` is the beginning of ``place`` unless it is given."""
         for name, tensor in _tensors(value, place):
             if broken := int((~tensor.isfinite()).sum()):
-                self.append(f"{broken} of {tensor.numel()} values are not finite in {name}")
+                values = f"{broken} of {tensor.numel()} values are not finite"
+                self.append(Fault(values, where, stage or _stage_of(place), name))
+
+
+def _stage_of(place: str) -> str:
+    first = place.split(".")[0]
+    return first if first in _STAGES else "model"
 
 
 def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
@@ -61,45 +96,72 @@ def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
             yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
 
 
-def first_fault(module: "GHGSModule", step: Step) -> str | None:
-    """Run ``step`` again: what is not finite first in weights, batch, results of modules, gradients.
+def first_fault(module: "GHGSModule", step: Step) -> Fault | None:
+    """Run ``step`` again and look at weights, batch, results of all modules and gradients, in this order.
 
-    PyTorch's anomaly detection names the operation whose gradient is NaN. Weights and their gradients are not
-    changed. None: all values are finite.
+    A batch that is at fault is run again subject by subject, to name the one that is at fault alone. Weights
+    and their gradients are not changed. None: all values are finite.
     """
-    faults, model = _Faults(), module.model
-    faults.see("the weights", dict(model.state_dict()))
-    faults.see("the batch", step.batch)
-    if faults:
-        return faults[0]
+    fault = _search(module, step)
+    if fault is None or fault.where == "weights of":
+        return fault
+    for element in range(len(step.batch.images)):
+        alone = dataclasses.replace(step, batch=_one_subject(step.batch, element))
+        if len(step.batch.images) == 1 or _search(module, alone) is not None:
+            subjects = step.batch.subjects
+            return dataclasses.replace(fault, sample=subjects[element] if subjects else str(element))
+    return fault
+
+
+def _search(module: "GHGSModule", step: Step) -> Fault | None:
+    faults, model, device = _Faults(), module.model, step.batch.images.device.type
+    for name, value in (*model.named_parameters(), *model.named_buffers()):
+        faults.see("weights of", name, value)
+    faults.see("data that enters", "batch", step.batch, "the model")
     trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
-    with ExitStack() as stack, torch.enable_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a mode that is slow
-        stack.enter_context(torch.autograd.detect_anomaly())
+    with ExitStack() as stack, torch.enable_grad():
+        if faults:
+            return faults[0]
         _watch(module, faults, stack)
         try:
-            device, half = step.batch.images.device.type, step.autocast
-            with torch.autocast(device, half, enabled=half is not None):
+            with torch.autocast(device, step.autocast, enabled=step.autocast is not None):
                 _, total, _ = module.forward_losses(step)
+        except Exception:  # a later stage may refuse what is not finite
             if not faults:
-                slopes = torch.autograd.grad(total * step.scale, list(trained.values()), allow_unused=True)
-                faults.see("the gradient", dict(zip(trained, slopes, strict=True)))
-                norms = torch.tensor([float(slope.norm()) for slope in slopes if slope is not None])
-                faults.see("the norm of the gradient", norms.norm())
-        except Exception as error:  # of the detection, or of a stage that refuses what is not finite
-            operation = re.match(r"Function '(\w+)Backward\d*' returned nan", str(error))
-            if not faults and operation is None:
                 raise
-            faults += [f"NaN in the gradient of the operation {operation[1]}"] if operation else []
+        if not faults:
+            slopes = torch.autograd.grad(total * step.scale, list(trained.values()), allow_unused=True)
+            norms = {n: slope.norm() for n, slope in zip(trained, slopes, strict=True) if slope is not None}
+            if norms:  # of finite values the largest is named
+                name = max(norms, key=lambda name: float(norms[name]))
+                norm = torch.stack(list(norms.values())).norm()
+                faults.see("gradient from", f"norm, largest of {name}", norm, _stage_of(name))
     return faults[0] if faults else None
 
 
 def _watch(module: "GHGSModule", faults: _Faults, stack: ExitStack) -> None:
-    """Until ``stack`` closes, ``faults`` sees the results of every layer and stage of ``module``."""
-    for name, part in module.model.named_modules():
+    """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
+    model = module.model
+    for name, part in model.named_modules():
         hook = part.register_forward_hook(
-            lambda part, inputs, result, name=name or "the model": faults.end(name, result)
+            lambda part, inputs, result, name=name or "model": faults.see("result of", name, result)
         )
         stack.callback(hook.remove)
-    paths = {name: f"model.{name}" for name in STAGES} | {name: name for name in ("renderer", "losses")}
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            stack.callback(parameter.register_hook(partial(faults.see, "gradient from", name)).remove)
+    paths = {name: f"model.{name}" if name in STAGES else name for name in _STAGES}
     stack.enter_context(watched(module, paths, faults))
+
+
+def _one_subject(batch: Batch, element: int) -> Batch:
+    one = slice(element, element + 1)
+    bodies, targets = batch.body_vertices, batch.targets
+    part = map_tensors(dataclasses.replace(batch, body_vertices=None), lambda t: t[one])
+    return dataclasses.replace(
+        part,
+        targets=targets and dataclasses.replace(part.targets, names=targets.names[one]),
+        body_vertices=bodies and bodies[one],
+        subjects=batch.subjects[one],
+        views=batch.views[one],
+    )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_atomically
-from ghgs_lit.training.faults import Step, first_fault
+from ghgs_lit.training.faults import Fault, Step, first_fault
 
 
 class DivergedError(InputError):
@@ -19,7 +19,7 @@ class DivergedError(InputError):
 class Guard:
     """Looks at each step of the optimizer once, and runs the step again only where it is not finite.
 
-    All processes decide alike. The first fault is saved as ``<run>/faults/step_<n>.pt``, which
+    All processes decide alike. A fault is saved as ``<run>/faults/step_<n>.pt`` (once for each stage), which
     :mod:`ghgs_lit.training.replay` runs again. ``limit`` steps in a row are skipped before the run stops;
     ``skipped`` counts those of all sessions of the run.
     """
@@ -28,7 +28,7 @@ class Guard:
         self.limit, self.skipped = limit, 0
         self._in_a_row = 0
         self._steps: list[tuple[Step, Tensor]] = []
-        self._is_saved = False
+        self._saved: set[str] = set()
 
     def note(self, step: Step, loss: Tensor) -> None:
         """A forward pass of the optimizer's next step, and its loss; it does not wait for the device."""
@@ -71,14 +71,14 @@ class Guard:
             print(f"{said}; the step is skipped", flush=True)
 
     def _explain(self, module: L.LightningModule, scale: float) -> str:
-        """The first fault of this process, and of the first step that has one the file; "" without one."""
-        for step in (dataclasses.replace(step, scale=scale) for step, _ in self._steps):
+        """The first fault of this process, and the file of its step, once for each stage; "" without one."""
+        for step, _ in self._steps:
+            step = dataclasses.replace(step, scale=scale)
             if (fault := first_fault(module, step)) is None:
                 continue
-            fault += f" (subjects {', '.join(step.batch.subjects)})" if step.batch.subjects else ""
-            if self._is_saved:
-                return fault
-            self._is_saved = True
+            if fault.stage in self._saved:
+                return str(fault)
+            self._saved.add(fault.stage)
             rank = f"_process_{module.global_rank}" if module.global_rank else ""
             folder = Path(module.trainer.default_root_dir) / "faults"
             path = folder / f"step_{module.global_step:06d}{rank}.pt"
@@ -87,9 +87,9 @@ class Guard:
         return ""
 
 
-def _write(path: Path, module: L.LightningModule, step: Step, fault: str) -> None:
+def _write(path: Path, module: L.LightningModule, step: Step, fault: Fault) -> None:
     content = {
-        "fault": fault,
+        "fault": str(fault),
         "global_step": module.global_step,
         "step": {**dataclasses.asdict(step), "autocast": str(step.autocast or "").removeprefix("torch.")},
         "state_dict": module.model.state_dict(),

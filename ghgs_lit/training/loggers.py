@@ -57,6 +57,24 @@ class TensorBoardLog(_StepsTaken, TensorBoardLogger):
         """Log without the epoch that Lightning adds: runs are counted in steps."""
         super().log_metrics({name: value for name, value in metrics.items() if name != "epoch"}, step)
 
+    @rank_zero_only
+    def log_hyperparams(self, params: Mapping[str, Value], *args: Any, **kwargs: Any) -> None:
+        """Begin a session without a list of metrics: TensorBoard then compares runs by all metrics."""
+        from torch.utils.tensorboard.summary import hparams
+
+        _, session, _ = hparams(dict(params), {})
+        self.experiment.file_writer.add_summary(session)
+
+    @rank_zero_only
+    def log_results(self, results: Mapping[str, float], step: int) -> None:
+        """Log the final numbers and end the session with success."""
+        from torch.utils.tensorboard.summary import hparams
+
+        self.log_metrics(dict(results), step - 1)
+        _, _, end = hparams({}, {})
+        self.experiment.file_writer.add_summary(end)
+        self.experiment.flush()
+
 
 class CsvOptions(Options):
     """The logged numbers as ``<run>/csv/metrics.csv``."""
@@ -69,7 +87,7 @@ class TensorBoardOptions(Options):
     """TensorBoard's files in ``<run>/tensorboard``."""
 
     def build(self, save_dir: str) -> TensorBoardLog:
-        return TensorBoardLog(save_dir, name="tensorboard", version="", default_hp_metric=False)
+        return TensorBoardLog(save_dir, name="tensorboard", version="")
 
 
 class WandbLog(_StepsTaken, WandbLogger):
@@ -106,8 +124,7 @@ def log_results(loggers: Sequence[Logger], summary: Sequence[Mapping[str, Any]],
     results = final_numbers(summary)
     for logger in loggers:
         if isinstance(logger, TensorBoardLog):
-            logger.log_hyperparams(logger.hparams, results, step - 1)
-            logger.save()
+            logger.log_results(results, step)
         else:
             logger.log_metrics(results, step - 1)
             logger.save()

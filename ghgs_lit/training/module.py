@@ -100,7 +100,9 @@ class GHGSModule(BudgetedModule):
     def forward(self, batch: Batch) -> tuple[Prediction, Rendering]:
         """The prediction for a batch, and its Gaussians as the batch's target cameras see them."""
         prediction = self.model(batch)
+        self.clock.mark("gaussians")
         rendering = self.renderer(prediction.gaussians, batch.targets.cameras)
+        self.clock.mark("render")
         return prediction, rendering
 
     def forward_losses(self, step: Step) -> tuple[Prediction, Tensor, dict[str, Tensor]]:
@@ -109,6 +111,7 @@ class GHGSModule(BudgetedModule):
         with token_budget(self.model, step.budget):
             prediction, rendering = self(step.batch)
         total, values = self.losses(prediction, rendering, step.batch)
+        self.clock.mark("loss")
         return prediction, total, values
 
     def _step(self, batch: Batch, batch_idx: int) -> Step:

@@ -9,7 +9,7 @@ import torch
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from ghgs_lit.training.faults import Step, first_fault
+from ghgs_lit.training.faults import Fault, Step, first_fault
 from ghgs_lit.training.module import GHGSModule
 from ghgs_lit.types import Batch, Cameras, Targets
 from ghgs_lit.weights.checkpoint import describe
@@ -18,7 +18,7 @@ from ghgs_lit.weights.reading import open_file
 _KEYS = ("fault", "global_step", "step", "state_dict", "config")
 
 
-def replay(path: str | Path) -> tuple[int, str, str | None]:
+def replay(path: str | Path) -> tuple[int, str, Fault | None]:
     """Run a saved step again, on the CPU.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Pictures and attention of the first validation subjects, while a run trains."""
+"""Pictures, attention and point clouds of the first validation subjects, while a run trains."""
 
 from pathlib import Path
 from typing import Any
@@ -14,27 +14,37 @@ from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.recalibration import Recalibration
 from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.training.pretext.labels import has_parts, part_shares, token_parts
-from ghgs_lit.types import Batch
-from ghgs_lit.visualization.attention import attention_sheet, middle_token
+from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import save_png, sheet
+
+#: How TensorBoard shows clouds: points of two centimetres through a perspective camera.
+CLOUD_VIEW = {
+    "camera": {"cls": "PerspectiveCamera", "fov": 40},
+    "material": {"cls": "PointsMaterial", "size": 0.02},
+}
 
 
 class PicturesOptions(Options):
-    """Pictures of the first subjects of each validation; of the first one also attention."""
+    """Pictures of the first subjects of each validation; of the first one also attention and point clouds."""
 
     group = "callbacks.pictures"
     subjects: Index = 2
     """Number of subjects; 0: none."""
+    token: tuple[Index, Index, Index] | None = None
+    """Whose attention is drawn: view, row and column on the grid of tokens of padded photographs; null: the
+    middle of the subject in its first view."""
 
     def build(self) -> "Pictures":
         return Pictures(self)
 
 
 class Pictures(Callback):
-    """``sheet/<subject>`` and ``attention/<subject>``.
+    """``sheet/<subject>``, ``attention/<subject>`` and, in TensorBoard's mesh tab, ``<subject>/points``.
 
-    A sheet has inputs, depths, targets, renders and errors. Attention is that of the recalibration's token in
-    the middle of the subject in its first view.
+    A sheet has inputs, depths, targets, renders and errors. Attention is that of one token of the
+    recalibration. Clouds are the predicted points and the body's vertices.
     """
 
     def __init__(self, options: PicturesOptions):
@@ -69,6 +79,7 @@ class Pictures(Callback):
             if number == 0:
                 self._show_attention(trainer, batch, element, name)
                 self._log_other_parts(pl_module, batch)
+                _show_clouds(trainer, batch, prediction, element, name)
             self._left -= 1
         self._forget()
 
@@ -84,7 +95,7 @@ class Pictures(Callback):
         if self._seen is None:
             return
         stage, tokens, points = self._seen
-        token = middle_token(tokens, points, element)
+        token = chosen_token(tokens, points, element, self.options.token)
         attention = None if token is None else attention_of(stage, tokens, points, token)
         if attention is not None:
             padding = pad_to_patches(batch.masks, tokens.patch_size)
@@ -112,3 +123,16 @@ def _publish(trainer: L.Trainer, tag: str, picture: np.ndarray, file: str) -> No
             logger.experiment.add_image(tag, picture, step, dataformats="HWC")
         elif isinstance(logger, WandbLogger):
             logger.log_image(tag, [picture])
+
+
+def _show_clouds(trainer: L.Trainer, batch: Batch, prediction: Prediction, element: int, name: str) -> None:
+    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    for kind, (positions, colors) in clouds(batch, prediction, element).items() if loggers else ():
+        for logger in loggers:
+            logger.experiment.add_mesh(
+                f"{name}/{kind}",
+                positions[None],
+                (255 * colors[None]).byte(),
+                config_dict=CLOUD_VIEW,
+                global_step=trainer.global_step,
+            )

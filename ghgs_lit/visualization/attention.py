@@ -5,6 +5,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from ghgs_lit.errors import require
 from ghgs_lit.recalibration.inspection import TokenAttention
 from ghgs_lit.types import Batch, Points, Tokens
 from ghgs_lit.visualization.pictures import grid, palette, row, to_uint8
@@ -13,15 +14,24 @@ _SIDE = 224  # minimum height of a tile in pixels
 _QUERY = (255, 60, 220)
 
 
-def middle_token(tokens: Tokens, points: Points, element: int) -> int | None:
-    """Index of the packed token with a point that is nearest to the middle of the subject in its first view;
-    None where no token of the view has a point."""
-    seen = (tokens.image == element * tokens.grid[1]) & points.tokens_valid
-    candidates = seen.nonzero()[:, 0]
+def chosen_token(
+    tokens: Tokens, points: Points, element: int, at: tuple[int, int, int] | None = None
+) -> int | None:
+    """Index of a packed token that has a point. ``at``: ``(view, row, column)`` on the grid of tokens (None:
+    the middle of the subject in its first view). Returns: The token of that view that is nearest to the
+    place; None where no token of the view has a point. InputError: ``at`` is outside the grid."""
+    views, height, width = tokens.grid[1:]
+    if at is not None:
+        expected = f"view, row, column below {(views, height, width)}"
+        inside = all(0 <= n < end for n, end in zip(at, (views, height, width), strict=True))
+        require(inside, "callbacks.pictures.token", expected, list(at))
+    view = 0 if at is None else at[0]
+    candidates = ((tokens.image == element * views + view) & points.tokens_valid).nonzero()[:, 0]
     if not len(candidates):
         return None
     places = torch.stack((tokens.row[candidates], tokens.column[candidates]), -1).float()
-    return int(candidates[(places - places.mean(0)).square().sum(-1).argmin()])
+    wanted = places.mean(0) if at is None else places.new_tensor(at[1:])
+    return int(candidates[(places - wanted).square().sum(-1).argmin()])
 
 
 def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The command line: verbs, one-line errors, exit codes."""
+"""The command line: verbs, one-line errors, exit codes, completion."""
 
 import importlib
 import os
@@ -160,6 +160,16 @@ def test_a_prediction_does_not_wait_for_what_training_needs():
     loaded = set(run_python(code).stdout.split())
     assert {"torch", "ghgs_lit.prediction.refinement"} <= loaded
     assert not {"lightning", "torchmetrics", "torch._dynamo", "trimesh", "matplotlib.pyplot"} & loaded
+
+
+def test_completion_offers_verbs_then_groups(monkeypatch, capsys):
+    """Hydra completes one application; the shell needs verbs first, and then the groups of that verb."""
+    monkeypatch.setenv("COMP_LINE", "ghgs tr")
+    _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
+    assert set(out.split()) == set(cli.VERBS)
+    monkeypatch.setenv("COMP_LINE", "ghgs train abl")
+    _, out, _ = call(monkeypatch, capsys, "-sc", "query=bash")
+    assert "ablation=" in out
 
 
 def test_the_verb_is_in_argv_while_the_task_runs(monkeypatch):

@@ -9,7 +9,6 @@ import hydra
 
 from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
-from ghgs_lit.runs import job as jobs
 from ghgs_lit.runs.grid import run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
 from ghgs_lit.runs.plan import PlannedRun
@@ -65,7 +64,7 @@ def plan_seeds(sweep: Path, count: int) -> list[PlannedRun]:
 
 def work_through(sweep: Path, count: int, barrier) -> None:
     """One of several processes that work on the same grid, one run after another."""
-    jobs.is_multirun, jobs._waits = lambda: True, lambda: False
+    os.environ["GHGS_SWEEP_JOB"] = "skip"
     items = plan_seeds(sweep, count)
 
     def slow(config, directory, stats):

@@ -3,19 +3,22 @@
 import json
 import os
 import signal
+import sys
 import time
 
 import pytest
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs import job
+from ghgs_lit.runs import job, plan
 from ghgs_lit.runs.grid import combinations, run_all
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
+from ghgs_lit.runs.signals import Interrupted, interruptible
 from tests.cli.test_main import call
 from tests.helpers.jobs import (
     executed,
@@ -23,6 +26,7 @@ from tests.helpers.jobs import (
     plan_seeds,
     record_execution,
     work_through,
+    write_finished_run,
 )
 from tests.helpers.processes import PREPARED
 
@@ -56,20 +60,21 @@ def test_a_grid_that_grows_runs_what_is_missing(sweep):
 
 
 def test_dry_run_runs_nothing_and_says_what_it_would(sweep):
-    """A plan must not start training, and says how long each run trains."""
+    """A plan must not start training, and its expected time must follow from budgets and measured steps."""
     code, out, _ = sweep("seed=1,2", "dry_run=true", "trainer.max_steps=100")
     assert code == 0
     assert not sweep.directory.exists()
     assert "2 runs: 2 missing; nothing was run" in out
-    assert out.count("100 steps") == 2
+    assert "unknown" in out
     sweep("seed=1", "trainer.max_steps=100")
     names = executed(sweep.directory)
     code, out, _ = sweep("seed=1,2,3", "dry_run=true", "trainer.max_steps=100")
     assert executed(sweep.directory) == names
     assert names[0] in out
     assert "3 runs: 1 done, 2 missing" in out
+    assert "0:01:40 (0.5 s a step, measured in 1 finished runs)" in out  # 2 x 100 x 0.5 s
     code, out, _ = sweep("seed=2,3", "dry_run=true", "trainer.max_time=00:00:00:10")
-    assert out.count("00:00:00:10 or ") == 2
+    assert ": 0:00:20 (trainer.max_time; 0.5 s a step" in out  # the budget ends before 5000 x 0.5 s
 
 
 def test_an_interrupted_run_resumes_and_a_failed_one_is_tried_again(sweep, monkeypatch):
@@ -126,6 +131,22 @@ def test_a_sweep_that_is_stopped_starts_no_further_run(sweep, monkeypatch, numbe
     assert "3 runs: 3 done" in out
 
 
+def test_a_job_in_its_own_process_is_stopped_and_awaited(tmp_path):
+    """A signal to a sweep must reach its job, which saves a checkpoint before it ends."""
+    note = tmp_path / "note"
+    script = (
+        "import os, signal, sys, time, pathlib\n"
+        f"def stop(*_): time.sleep(0.3); pathlib.Path({str(note)!r}).write_text('saved'); sys.exit(143)\n"
+        "signal.signal(signal.SIGTERM, stop)\n"
+        "os.kill(os.getppid(), signal.SIGTERM)\n"
+        "time.sleep(60)\n"
+    )
+    with interruptible(), pytest.raises(Interrupted) as stop:
+        job._run_process([sys.executable, "-c", script], os.environ)
+    assert stop.value.code == 143
+    assert note.read_text() == "saved"
+
+
 def test_a_failing_run_is_named_and_the_others_are_run(sweep, monkeypatch):
     """One bad run must not cost the rest of the night."""
 
@@ -149,7 +170,7 @@ def test_an_impossible_job_fails_before_any_is_launched(sweep):
     assert "seed: expected an integer >= 0" in err
     code, _, err = sweep("seed=1,2", "trainer=ddp_cpu", "dry_run=true")
     assert code == 1
-    assert "trainer.devices: expected 1 in a sweep without SLURM (hydra/launcher=slurm); found 2" in err
+    assert "trainer.devices: expected 1 in a sweep whose jobs share a process; found 2" in err
     assert not executed(sweep.directory)
 
 
@@ -209,6 +230,12 @@ def test_a_sweep_over_all_options_of_a_group(monkeypatch, capsys, tmp_path):
     assert (code, out.count("ablation=")) == (0, 4), out
 
 
+@pytest.mark.parametrize(("value", "seconds"), [("01:02:03:04", 93784), ({"minutes": 2}, 120), (None, None)])
+def test_time_budgets(value, seconds):
+    """Expected times of a plan depend on both forms that Lightning accepts."""
+    assert plan.time_budget({"trainer": {"max_time": value}}) == seconds
+
+
 def composed(*overrides: str):
     return compose("train", overrides, with_hydra=True)
 
@@ -252,6 +279,38 @@ def test_tables_share_runs_and_take_other_data(sweep):
     small = names("sweep=table4", "data=synthetic", "encoder=vggt_nano", "trainer=cpu")
     assert len(small) == 4
     assert not small & table4
+
+
+def test_training_in_several_processes_gets_a_process_of_its_own(monkeypatch, tmp_path):
+    """Lightning repeats the command line for its other processes, which must be that of this job."""
+    started = {}
+    write_finished_run(tmp_path, {"seed": 1}, 31.0)
+
+    def fake(command, environment):
+        started.update(command=command, env=environment)
+        return started.get("code", 0)
+
+    cfg = composed("trainer=ddp_cpu", "seed=5", "hydra.mode=MULTIRUN")
+    cfg.hydra.runtime.choices["hydra/launcher"] = "joblib"
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", cfg)
+    monkeypatch.setattr(job, "_run_process", fake)
+    assert job.needs_own_process({"trainer": {"devices": 2}})
+    assert job.train_in_own_process(RunDirectory(tmp_path)) == 31.0
+    assert started["command"][2:] == [
+        "ghgs_lit",
+        "train",
+        "trainer=ddp_cpu",
+        "seed=5",
+        f"hydra.run.dir='{tmp_path}'",
+        "hydra.mode=RUN",
+    ]
+    assert started["env"]["GHGS_SWEEP_JOB"] == "skip"
+    started["code"] = 143
+    with pytest.raises(Interrupted) as stop:  # its own process was stopped, and so is the sweep
+        job.train_in_own_process(RunDirectory(tmp_path))
+    assert stop.value.code == 143
+    cfg.hydra.runtime.choices["hydra/launcher"] = "submitit_slurm"
+    assert not job.needs_own_process({"trainer": {"devices": 2}})
 
 
 def test_hash_ignores_only_what_no_number_depends_on():

@@ -1,5 +1,6 @@
 """THuman2.0 on miniatures in its true layout: one test for each quirk that a loader can get wrong."""
 
+import pickle
 import shutil
 
 import numpy as np
@@ -18,10 +19,10 @@ from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.synthesis.thuman2 import THuman2
-from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body
+from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
 from ghgs_lit.types import Cameras
 from scripts.miniatures import thuman2 as miniature
-from scripts.miniatures.scans import make_scans, scan_of
+from scripts.miniatures.scans import POSE_SIZES, make_scans, scan_of
 from tests.helpers.captures import stored
 from tests.helpers.people import V4
 
@@ -68,8 +69,8 @@ def test_published_renders_have_integer_pixel_centres(rendered):
 def test_own_renders_have_half_pixel_centres(raw, tmp_path):
     """pixel_centers=auto leaves the centres of our own renders alone."""
     render = {"size": 48, "samples": 1, "views": (0, 3), "positions": (0, 1, 2, 3)}
-    split = {"train": ["0000"], "val": ["0426"]}
-    data = module(str(tmp_path), source=str(raw), split=split, render=render, render_workers=0)
+    limit = {"val": 1, "train": 1}
+    data = module(str(tmp_path), source=str(raw), limit=limit, render=render, render_workers=0)
     assert data.dataset.render_missing() == 2
     K = stored(data, "train").view("0000", 0, 0).intrinsics
     np.testing.assert_allclose(K[:2, 2], [24, 24 + 48 * 25 / 1024], atol=1e-5)
@@ -162,6 +163,33 @@ def test_the_first_camera_faces_the_person(raw):
     np.testing.assert_allclose(ratio, ratio[1], rtol=1e-3)
 
 
+def test_scale_comes_before_translation(raw):
+    """The body of the model times scale plus translation is the mesh that lies in the scan."""
+    source = THuman2Source(raw, find_fits(raw, None))
+    fit = read_fit(source.fit("0000") / "smplx_param.pkl")
+    turn = np.radians(fit.facing)
+    rotation = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    posed = people.generate(0, 0).body_vertices @ rotation.T
+    np.testing.assert_allclose(fit.to_scan(posed), source.body("0000"), atol=1e-5)
+    assert np.abs((posed + fit.translation) * fit.scale - source.body("0000")).max() > 0.02
+
+
+def test_bodies_are_computed_where_the_licensed_model_is(raw, monkeypatch, tmp_path):
+    """smplx(...) * scale + translation; without the package or the files one line says so."""
+    from ghgs_lit.synthesis import thuman2_scans
+
+    source = THuman2Source(raw, find_fits(raw, None), tmp_path)
+    fit = read_fit(source.fit("0000") / "smplx_param.pkl")
+    posed = (source_body := THuman2Source(raw, source.fits).body("0000")) - fit.translation
+    monkeypatch.setattr(thuman2_scans, "smplx_vertices", lambda folder, parameters: posed / fit.scale)
+    np.testing.assert_allclose(source.body("0000"), source_body, atol=1e-9)
+    monkeypatch.undo()
+    with pytest.raises(
+        InputError, match=r"data\.body_model: expected the package smplx|expected .*SMPLX_MALE"
+    ):
+        THuman2Source(raw, source.fits, tmp_path).body("0000")
+
+
 @pytest.mark.parametrize("name", ["THuman2.0_smplx", "THuman2.0_Smpl_X_Paras", "smplx_2", "smplx"])
 def test_folders_of_fits_go_by_several_names(raw, tmp_path, name):
     """Fits are found under every published folder name, and beside each scan."""
@@ -185,6 +213,21 @@ def test_scans_without_fits_have_no_body(raw, tmp_path):
     source = THuman2Source(tmp_path, find_fits(tmp_path, None))
     assert source.load("0000").body_vertices is None
     assert source.facing("0000") == 0
+
+
+def test_fits_of_smpl_call_the_translation_transl(raw, tmp_path):
+    """Fits of either naming are read alike."""
+    path = raw.parent / "THuman2.0_smplx" / "0000" / "smplx_param.pkl"
+    content = pickle.loads(path.read_bytes())  # our own file
+    assert type(content["translation"]).__name__ == "TrackedArray"
+    assert {k: v.shape for k, v in content.items() if k != "scale"} == {
+        **{k: (1, n) for k, n in POSE_SIZES.items()},
+        "global_orient": (1, 3),
+        "translation": (3,),
+    }
+    content["transl"] = content.pop("translation")
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(content))
+    np.testing.assert_array_equal(read_fit(tmp_path / "a.pkl").translation, read_fit(path).translation)
 
 
 def test_ghgs_transform_is_applied_to_its_bodies(rendered, raw, tmp_path):

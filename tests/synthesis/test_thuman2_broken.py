@@ -186,13 +186,17 @@ RAW = {
         lambda f: truncate(f / "raw/THuman2.0_smplx/0000/smplx_param.pkl"),
         r"0000/smplx_param\.pkl: expected a readable pickle; found",
     ),
-    "fit without rotation": (
-        lambda f: without(f, "global_orient"),
-        r"0000/smplx_param\.pkl: expected the key 'global_orient'; found \['betas'",
+    "fit without translation": (
+        lambda f: without(f, "translation"),
+        r"0000/smplx_param\.pkl: expected the key 'translation'; found \['betas'",
     ),
     "fit with NaN": (
-        lambda f: fit(f, global_orient=np.full(3, np.nan)),
-        r"0000/smplx_param\.pkl: global_orient: expected finite numbers; found NaN or infinity",
+        lambda f: fit(f, translation=np.full(3, np.nan)),
+        r"0000/smplx_param\.pkl: translation: expected finite numbers; found NaN or infinity",
+    ),
+    "fit of scale 0": (
+        lambda f: fit(f, scale=np.float32(0)),
+        r"0000/smplx_param\.pkl: scale: expected more than 0; found 0\.0",
     ),
     "fit of another scan missing": (
         lambda f: shutil.rmtree(f / "raw/THuman2.0_smplx/0000"),
@@ -200,7 +204,7 @@ RAW = {
     ),
     "fitted mesh missing": (
         lambda f: (f / "raw/THuman2.0_smplx/0000/mesh_smplx.obj").unlink(),
-        r"0000/mesh_smplx\.obj: expected the fitted mesh; found 'none'",
+        r"0000/mesh_smplx\.obj: expected the fitted mesh, or data\.body_model .*; found neither",
     ),
     "body not scaled": (
         lambda f: fitted_mesh(f, lambda v: v * 2),

@@ -1,4 +1,6 @@
-"""The first value that is not finite is named by its place."""
+"""The first value that is not finite is named by its stage, its place and its sample."""
+
+import dataclasses
 
 import pytest
 import torch
@@ -49,8 +51,8 @@ def _nan(value):
     return map_tensors(value, lambda t: t * torch.nan if t.is_floating_point() else t)
 
 
-def _nan_slope(value):
-    return map_tensors(value, lambda t: t + (0 * (t - t.detach())).sqrt() if t.requires_grad else t)
+def _infinite_slope(value):
+    return map_tensors(value, lambda t: t + (t - t.detach()).abs().sqrt() if t.requires_grad else t)
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -58,26 +60,48 @@ def test_a_stage_whose_result_is_not_finite_is_named(stage):
     """Not the stage that the value reaches later."""
     module = make_module()
     after(module, stage, lambda inputs, result: _nan(result))
-    assert f"values are not finite in the result of {stage}" in first_fault(module, Step(training_batch(), 1))
+    fault = first_fault(module, Step(training_batch(), 1))
+    assert (fault.where, fault.stage, fault.sample) == ("result of", stage, "p0")
+    assert fault.place.startswith(stage)
 
 
-@pytest.mark.parametrize("stage", ["depth_head", "renderer"])
-def test_an_operation_whose_gradient_is_nan_is_named(stage):
-    """Not what the gradient reaches later, on its way back."""
+@pytest.mark.parametrize("stage", [stage for stage in STAGES if stage != "bounds"])
+def test_a_stage_whose_gradient_is_not_finite_is_named(stage):
+    """Not the stage that the gradient reaches later, on its way back."""
     module = make_module()
-    after(module, stage, lambda inputs, result: _nan_slope(result))
-    assert first_fault(module, Step(training_batch(), 1)) == "NaN in the gradient of the operation Sqrt"
-    assert not torch.is_anomaly_enabled()
+    after(module, stage, lambda inputs, result: _infinite_slope(result))
+    fault = first_fault(module, Step(training_batch(), 1))
+    assert (fault.where, fault.stage) == ("gradient from", stage)
+
+
+def test_the_sample_is_the_one_that_is_at_fault_alone():
+    """Of three subjects the second, whose target is seen from far away, is drawn as NaN."""
+    module, batch = make_module(), training_batch(3)
+    batch.targets.cameras.extrinsics[1, 0, 2, 3] = 50.0
+
+    def spoil(inputs, result):
+        far = inputs[1].extrinsics[:, :, 2, 3, None, None, None] > 40
+        return dataclasses.replace(result, image=torch.where(far, torch.nan, result.image))
+
+    after(module, "renderer", spoil)
+    fault = first_fault(module, Step(batch, 1))
+    assert (fault.stage, fault.place, fault.sample) == ("renderer", "renderer.image", "p1")
+    assert str(fault) == (
+        f"{3 * 28 * 28} of {9 * 28 * 28} values are not finite in the result of renderer"
+        " (renderer.image, subject p1)"
+    )
 
 
 def test_weights_and_data_are_looked_at_first():
     """A stage that gets NaN is not at fault; the model does not look at targets."""
     module, batch = make_module(), training_batch(2)
     batch.targets.images[1, 0, 0, 3, 4] = torch.inf
-    assert first_fault(module, Step(batch, 1)).endswith("are not finite in the batch.targets.images")
+    fault = first_fault(module, Step(batch, 1))
+    assert (fault.where, fault.place, fault.sample) == ("data that enters", "batch.targets.images", "p1")
     name, parameter = next(iter(module.model.recalibration.named_parameters()))
     parameter.data.view(-1)[0] = torch.nan
-    assert first_fault(module, Step(batch, 1)).endswith(f"not finite in the weights.recalibration.{name}")
+    fault = first_fault(module, Step(batch, 1))
+    assert (fault.where, fault.stage, fault.place) == ("weights of", "recalibration", f"recalibration.{name}")
 
 
 def test_weights_that_overflow_inside_a_stage_name_the_layer():
@@ -87,20 +111,23 @@ def test_weights_that_overflow_inside_a_stage_name_the_layer():
     header[0].bias.data.fill_(3e38)
     header[2].weight.data.fill_(3e38)
     fault = first_fault(module, Step(training_batch(), 1))
-    assert fault.endswith("not finite in the result of gaussian_head.scale_header.2")
+    assert (fault.where, fault.place) == ("result of", "gaussian_head.scale_header.2")
 
 
-@pytest.mark.parametrize(("steepness", "place"), [(3e38, "the norm of the gradient"), (3e39, "depth_head.")])
-def test_a_gradient_that_overflows_is_named(steepness, place):
-    """Each value may be finite, and the root of the sum of their squares not."""
+def test_a_gradient_whose_norm_overflows_names_its_largest_part():
+    """Each value is finite, the root of the sum of their squares is not."""
     module = make_module("model=hull")
-    real, weights = module.losses, [next(module.model.depth_head.parameters())]
-    weights.append(next(module.model.gaussian_head.parameters()))
+    first = next(name for name, _ in module.model.depth_head.named_parameters())
+    real = module.losses
+    weight = module.model.depth_head.get_parameter(first)
+    other = next(module.model.gaussian_head.parameters())
 
     def steep(*inputs):
         total, values = real(*inputs)
-        moved = sum(weight.flatten()[0] - weight.flatten()[0].detach() for weight in weights)
-        return total + moved * 1e30 * (steepness / 1e30), values
+        parts = ((3e38, weight.flatten()[0]), (2e38, other.flatten()[0]))
+        return total + sum(slope * (value - value.detach()) for slope, value in parts), values
 
     module.losses = steep
-    assert place in first_fault(module, Step(training_batch(), 1))
+    fault = first_fault(module, Step(training_batch(), 1))
+    assert (fault.where, fault.stage) == ("gradient from", "depth_head")
+    assert fault.place == f"norm, largest of depth_head.{first}"

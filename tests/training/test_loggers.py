@@ -1,4 +1,4 @@
-"""What TensorBoard and the CSV get: tags, stages, memory, HParams; logs that continue."""
+"""What TensorBoard and the CSV get: tags, stages, memory, meshes, HParams; logs that continue."""
 
 import csv
 import importlib.util
@@ -17,6 +17,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.allocation import resident_bytes
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import Costs
+from ghgs_lit.training.clock import PARTS, StepClock
 from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,
@@ -44,7 +45,7 @@ def hparams(folder, tag) -> plugin_data_pb2.HParamsPluginData:
 
 def loggers(folder):
     return [
-        TensorBoardLog(folder, name="tensorboard", version="", default_hp_metric=False),
+        TensorBoardLog(folder, name="tensorboard", version=""),
         CsvLog(folder, name="csv", version="", flush_logs_every_n_steps=1),
     ]
 
@@ -87,8 +88,10 @@ def run(tmp_path_factory):
 def test_tags_are_grouped_by_what_they_are(run):
     """The tags are those that the documentation lists, no more and no fewer."""
     tags = set(events(run[0] / "tensorboard").Tags()["scalars"])
-    assert tags == {
-        "time_ms/step", "loss/total", "loss/render_l1", "loss/chamfer", "memory_mb/process",
+    stages = ("01_data", "02_interval", "03_encode", "04_depth", "07_gaussians", "09_render", "10_loss")
+    times = {f"time_ms/{part}" for part in (*stages, "11_backward", "12_optimizer", "step")}
+    assert tags == times | {
+        "loss/total", "loss/render_l1", "loss/chamfer", "memory_mb/process",
         "train/budget", "train/gaussians", "train/gradient_norm", "train/learning_rate",
         "train/skipped_steps",
         "val/psnr", "val/psnr_box", "val/ssim", "val/depth_error_mm", "hparam/psnr",
@@ -96,24 +99,32 @@ def test_tags_are_grouped_by_what_they_are(run):
 
 
 def test_the_numbers_are_those_of_the_steps(run):
-    """Values are logged at the steps taken."""
+    """Values are logged at the steps taken, and the parts of a step add up to its time."""
     found = events(run[0] / "tensorboard")
     rates = {e.step: e.value for e in found.Scalars("train/learning_rate")}
     assert sorted(rates) == [2, 4, 6, 8]
     assert rates[8] == pytest.approx(0.05 * Optimization(lr=0.05, end_factor=0.0).factor(7 / 8))
     assert [e.value for e in found.Scalars("train/budget")] == pytest.approx([1 / 8, 3 / 8, 5 / 8, 7 / 8])
-    assert all(event.value > 0 for event in found.Scalars("time_ms/step"))
+    parts = [tag for tag in found.Tags()["scalars"] if tag.startswith("time_ms/") and "step" not in tag]
+    for place, whole in enumerate(found.Scalars("time_ms/step")):
+        assert whole.value == pytest.approx(sum(found.Scalars(p)[place].value for p in parts), rel=1e-4)
     assert 10 < found.Scalars("memory_mb/process")[0].value < 1e6
 
 
-def test_pictures(run):
-    """Pictures are logged at every validation."""
+def test_pictures_and_clouds(run):
+    """Pictures and point clouds are logged at every validation, with all points of the body."""
     folder, _ = run
     found = events(folder / "tensorboard")
     steps = [e.step for e in found.Scalars("val/psnr")]
     assert [e.step for e in found.Images("sheet/p0")] == steps == [4, 8]
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["step_000004", "step_000008"]
     assert [e.step for e in found.Scalars("hparam/psnr")] == [8]
+    clouds = [tag for tag in found.Tags()["tensors"] if tag.startswith("p0/")]
+    kinds = {tag.removeprefix("p0/").removesuffix("_VERTEX").removesuffix("_COLOR") for tag in clouds}
+    assert {"points", "body", "points_and_body"} <= {kind.rstrip("_") for kind in kinds}
+    vertices = found.Tensors("p0/body_VERTEX")
+    assert [e.step for e in vertices] == steps
+    assert list(vertices[0].tensor_proto.tensor_shape.dim)[1].size == 20
 
 
 def test_the_session_says_what_the_run_is_and_that_it_ended(run):
@@ -124,6 +135,14 @@ def test_the_session_says_what_the_run_is_and_that_it_ended(run):
     assert start.hparams["lr"].number_value == 0.1
     assert hparams(folder, "_hparams_/session_end_info").session_end_info.status == 1
     assert events(folder).Scalars("hparam/psnr")[0].value == 30
+
+
+def test_nothing_of_the_clock_stays(run):
+    """After training the model has no hooks and the clock does not run: evaluation is not slowed down."""
+    _, subject = run
+    assert not subject.clock.running
+    assert not subject.model.encoder._forward_hooks
+    assert not subject.model.encoder._forward_pre_hooks
 
 
 def test_logs_resume_where_the_checkpoint_was(tmp_path):
@@ -193,6 +212,26 @@ def test_final_numbers_name_their_protocol():
         {"method": "model", "views": 4, "targets": "midway", "subjects": 2, "psnr": 28, "lpips": None},
     ]
     assert final_numbers(summary) == {"hparam/psnr": 30.0, "hparam_v4_midway/psnr": 28.0}
+
+
+def test_a_clock_gives_each_span_to_the_part_that_ends_it(monkeypatch):
+    """Times belong to the right part, and validations are not counted."""
+    now = iter([0.0, 1.0, 3.0, 3.5, 10.0, 10.0, 11.0, 11.0, 12.0, 20.0, 20.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(now))
+    clock = StepClock()
+    clock.mark("render")  # does not run yet: nothing to measure from
+    clock.start(torch.device("cpu"))
+    for part in ("data", "encode", "data"):
+        clock.mark(part)
+    clock.end_step()  # at 10.0
+    clock.mark("data")
+    clock.restart()  # a validation: not counted
+    clock.mark("data")
+    clock.end_step()
+    means = clock.means()
+    assert means == {"data": 1250.0, "encode": 1000.0, "optimizer": 7250.0, "step": 9500.0}
+    assert clock.means() == {}
+    assert list(means) == [p for p in PARTS if p in means] + ["step"]
 
 
 def test_memory_is_that_of_this_process():

@@ -193,7 +193,7 @@ def test_a_step_whose_scaled_gradient_overflows_is_skipped(tmp_path):
     assert norms == []
     assert subject.model.depth.item() == 2.5
     assert scaler.get_scale() == 2.0**125
-    with pytest.raises(DivergedError, match=r"step 0: expected a finite loss and gradient; .* NaN in"):
+    with pytest.raises(DivergedError, match=r"step 0: expected a finite loss and gradient; .* renderer"):
         scaled(tmp_path / "b", scale=1.0, renderer=infinitely_steep, render_l1=1.0)
 
 

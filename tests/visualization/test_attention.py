@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
-from ghgs_lit.visualization.attention import attention_sheet, middle_token
+from ghgs_lit.visualization.attention import attention_sheet, chosen_token
+from ghgs_lit.visualization.clouds import clouds
 from ghgs_lit.visualization.pictures import grid
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
@@ -41,7 +43,7 @@ def test_the_weights_are_those_of_the_forward(overrides):
     model, batch = make_model("skip=none", *overrides).eval(), make_batch(2, 3)
     (tokens, points), output, _ = seen(model, batch)
     block = model.recalibration.block
-    for query in [middle_token(tokens, points, element) for element in range(2)]:
+    for query in [chosen_token(tokens, points, element) for element in range(2)]:
         attention = attention_of(model.recalibration, tokens, points, query)
         assert torch.allclose(attention.weights.sum(-1), torch.ones(()), atol=1e-5)
         for layer, weights in enumerate(attention.weights):
@@ -71,14 +73,18 @@ def test_attention_on_other_parts_is_the_sum_over_tokens_one_by_one():
     assert not same.any()
 
 
-def test_the_middle_token_is_of_its_element_and_has_a_point():
-    """The query belongs to its subject; a token of the background has no attention."""
+def test_the_chosen_token_is_of_its_element_and_has_a_point():
+    """The query belongs to its subject, and a place outside the grid is refused."""
     model, batch = make_model("skip=none").eval(), make_batch(2, 3)
     (tokens, points), _, _ = seen(model, batch)
     for element in range(2):
-        query = middle_token(tokens, points, element)
+        query = chosen_token(tokens, points, element)
         assert int(tokens.image[query]) == element * 3
         assert points.tokens_valid[query]
+    query = chosen_token(tokens, points, 1, (2, 0, 0))  # nothing there: the nearest that has a point
+    assert int(tokens.image[query]) == 5
+    with pytest.raises(InputError, match=r"callbacks\.pictures\.token"):
+        chosen_token(tokens, points, 0, (3, 0, 0))
     background = int((~points.tokens_valid).nonzero()[0])
     assert attention_of(model.recalibration, tokens, points, background) is None
 
@@ -88,7 +94,7 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
     """Coloured patches are at the rows and columns of the neighbours."""
     model, batch = make_model(f"skip={skip}").eval(), make_batch(1, 3, height=56, width=70, zoom=0.5)
     (tokens, points), _, _ = seen(model, batch)
-    attention = attention_of(model.recalibration, tokens, points, middle_token(tokens, points, 0))
+    attention = attention_of(model.recalibration, tokens, points, chosen_token(tokens, points, 0))
     dark = dataclasses.replace(batch, images=torch.zeros_like(batch.images))
     picture = attention_sheet(dark, tokens, attention)
     scale, caption, gap = 4, 14, 2
@@ -104,6 +110,26 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
         for t in attention.neighbors.tolist()
     }
     assert drawn == named
+
+
+def test_clouds_are_the_subjects_points_and_its_body():
+    """Clouds belong to one subject, keep their colours and respect the limit."""
+    model, batch = make_model().eval(), make_batch(2, 3)
+    body = [torch.rand(9, 3), torch.rand(4, 3)]
+    batch = dataclasses.replace(batch, body_vertices=body)
+    _, _, prediction = seen(model, batch)
+    found = clouds(batch, prediction, 1, limit=50)
+    assert list(found) == ["points", "body", "points_and_body"]
+    positions, colors = found["points"]
+    assert 25 < len(positions) <= 50
+    assert positions.shape == colors.shape
+    valid = prediction.points.valid[1] & batch.masks[1]
+    assert torch.equal(positions[0], prediction.points.pixels[1][valid][0])
+    assert torch.equal(colors[0], batch.images[1].movedim(1, -1)[valid][0])
+    assert torch.equal(found["body"][0], body[1])
+    assert len(found["points_and_body"][0]) == len(positions) + 4
+    nothing = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), body_vertices=None)
+    assert clouds(nothing, prediction, 0) == {}
 
 
 def test_a_grid_is_as_wide_as_asked():

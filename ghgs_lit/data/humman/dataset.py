@@ -78,9 +78,11 @@ class HuMMan(DataSet):
         return len(self.sequences(phase)) > 0
 
     def reader(self, phase: str, strict: bool = True) -> HuMManReader:
+        names, limit = self.sequences(phase), self.limit.of(phase)
         model = None if self.smpl_model is None else Path(self.smpl_model).expanduser()
-        names = self.sequences(phase)
-        return HuMManReader(self.folder, names, range(*self.frames), self.masks, self.body, model, strict)
+        return HuMManReader(
+            self.folder, names, range(*self.frames), self.masks, self.body, model, limit, strict
+        )
 
     def inspections(self) -> Sequence[Callable[[], None]]:
         names = {name for phase in PHASES for name in self.sequences(phase)} if self.root else set()

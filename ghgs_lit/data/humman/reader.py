@@ -41,6 +41,7 @@ class HuMManReader(FrameReader):
         frames: numbers of frames; those that a sequence lacks are left out, and of a frame the cameras.
         body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
             cameras inside all masks; ``none``.
+        limit: number of frames in all, the first ones (None: all).
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class HuMManReader(FrameReader):
         masks: str = "kinect_mask",
         body: str = "none",
         smpl_model: Path | None = None,
+        limit: int | None = None,
         strict: bool = True,
     ) -> None:
         super().__init__(strict)
@@ -62,6 +64,7 @@ class HuMManReader(FrameReader):
         for name in self.existing(folder, sequences, "p000455_a000986"):
             with self.collecting():
                 self._add(folder / name, frames)
+        self.subjects = dict(list(self.subjects.items())[:limit])
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
         cameras = read_calibration(path / "cameras.json", "color")

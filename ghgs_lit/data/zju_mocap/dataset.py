@@ -55,5 +55,5 @@ class ZJUMoCap(DataSet):
         return self.cameras or _ALL
 
     def reader(self, phase: str, strict: bool = True) -> ZJUMoCapReader:
-        frames = self.split.of(phase)
-        return ZJUMoCapReader(self.folder, frames, self.cameras, self.undistorted, self.masks, strict)
+        frames, limit = self.split.of(phase), self.limit.of(phase)
+        return ZJUMoCapReader(self.folder, frames, self.cameras, self.undistorted, self.masks, limit, strict)

@@ -61,7 +61,7 @@ class ZJUMoCapReader(FrameReader):
     """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
 
     Missing sequences are left out (``ghgs prepare task=check`` counts them). InputError: all sequences are
-    missing, or annotations are bad.
+    missing, or annotations are bad. ``limit``: number of frames in all, the first ones (None: all).
     """
 
     def __init__(
@@ -71,6 +71,7 @@ class ZJUMoCapReader(FrameReader):
         cameras: int | None = 20,
         undistorted: bool = True,
         masks: Sequence[str] = ("mask_cihp",),
+        limit: int | None = None,
         strict: bool = True,
     ) -> None:
         super().__init__(strict)
@@ -81,6 +82,7 @@ class ZJUMoCapReader(FrameReader):
             if name in there:
                 with self.collecting():
                     self._add(folder / name, frames, cameras)
+        self.subjects = dict(list(self.subjects.items())[:limit])
 
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
         annotations = read_annotations(path / "annots.npy")

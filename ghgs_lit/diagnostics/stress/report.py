@@ -1,14 +1,16 @@
-"""The matrix as JSON and as tables."""
+"""The matrix as JSON, as tables and as a picture."""
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
-from ghgs_lit.diagnostics.output import document, texts
+from ghgs_lit.diagnostics.output import document, save_figure, texts
 from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row
 from ghgs_lit.diagnostics.stress.stages import STAGES
@@ -42,15 +44,16 @@ def bounded(error: float | None) -> str:
 
 
 def to_markdown(rows: Sequence[Row]) -> str:
-    """The worst errors, also by stage and family over the budget, budgets with reasons, and families."""
-    found, ratios = summary(rows), _matrix(frame_of(rows), "ratio", "max")
-    families, stages = list(ratios.columns), [STAGES[name] for name in ratios.index]
+    """The worst errors, the numbers of cases, budgets with their reasons, and what families are."""
+    found, cases = summary(rows), _matrix(pd.DataFrame(rows), "cases", "sum")
+    families, stages = list(cases.columns), [STAGES[name] for name in cases.index]
     worst = pd.DataFrame(found["worst"]).assign(error=[bounded(row["error"]) for row in found["worst"]])
     shown = dict.fromkeys(("stage", "dtype", "family", "error"), "{}") | {"budget": "{:g}"}
     budgets = [(stage.name, f"{stage.factor:g}", stage.reason) for stage in stages]
+    counts = cases.map(lambda count: "" if pd.isna(count) else f"{count:.0f}")
     tables = {
         "Worst errors": texts(worst, {name: (name, form) for name, form in shown.items()}),
-        "Worst error over budget": ratios.map("{:.2g}".format).replace("nan", "").reset_index(),
+        "Cases": counts.assign(all=cases.sum(axis=1).map("{:.0f}".format)).reset_index(),
         "Budgets": pd.DataFrame(budgets, columns=["stage", "factor", "reason"]),
         "Families": pd.DataFrame({"family": families, "inputs": [FAMILIES[f].says for f in families]}),
     }
@@ -71,9 +74,36 @@ def _matrix(frame: pd.DataFrame, values: str, how: str) -> pd.DataFrame:
     return table.reindex(index=stages, columns=families)
 
 
+def draw(rows: Sequence[Row]) -> Figure:
+    """The largest error over budget of each stage and family, over all dtypes."""
+    ratios = _matrix(frame_of(rows), "ratio", "max")
+    values = np.log10(ratios.clip(1e-6, 1e3)).to_numpy()
+    height, width = values.shape
+    figure = Figure(figsize=(3.2 + 0.3 * width, 2.4 + 0.3 * height), layout="constrained")
+    axes = figure.add_subplot()
+    colors = matplotlib.colormaps["RdYlGn_r"].copy()
+    colors.set_bad("0.93")
+    norm = matplotlib.colors.TwoSlopeNorm(vmin=-6, vcenter=0, vmax=3)
+    picture = axes.imshow(np.ma.masked_invalid(values), cmap=colors, norm=norm, aspect="auto")
+    for i, j in zip(*np.nonzero(values > 0), strict=True):
+        axes.text(j, i, "✗", ha="center", va="center", color="white", fontweight="bold")
+    axes.set_xticks(range(width), [f.replace("_", " ") for f in ratios.columns], rotation=90, fontsize=8)
+    axes.set_yticks(range(height), ratios.index, fontsize=8)
+    axes.set_xticks(np.arange(width + 1) - 0.5, minor=True)
+    axes.set_yticks(np.arange(height + 1) - 0.5, minor=True)
+    axes.grid(which="minor", color="white", linewidth=1)
+    axes.tick_params(which="minor", length=0)
+    found = summary(rows)
+    axes.set_title(f"Worst error over budget: {found['cases']} cases, {found['failures']} failures")
+    bar = figure.colorbar(picture, ax=axes, fraction=0.02, pad=0.01)
+    bar.set_ticks([-6, -4, -2, 0, 3], labels=["1e-6 or less", "1e-4", "1 %", "budget", "1000 or more"])
+    return figure
+
+
 def write(directory: Path, rows: Sequence[Row], source: dict[str, Any]) -> Path:
-    """Write ``stress.md`` and ``stress.json``; returns the path of the last."""
+    """Write ``stress.md``, ``stress.png`` and ``stress.json``; returns the path of the last."""
     write_text_atomically(directory / "stress.md", to_markdown(rows))
+    save_figure(draw(rows), directory / "stress.png")
     path = directory / "stress.json"
     text = json.dumps({**summary(rows), "provenance": source}, indent=1, allow_nan=False)
     write_text_atomically(path, text + "\n")

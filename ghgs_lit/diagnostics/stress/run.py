@@ -1,10 +1,11 @@
-"""All cases of a run, divided among processes."""
+"""All cases of a run: divided among processes, written as they end, and not computed twice."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
+from pathlib import Path
 
 import torch
 
@@ -12,6 +13,7 @@ from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
+from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.progress import track
 
 
@@ -22,6 +24,11 @@ class Task:
     stage: str
     family: str
     seeds: int
+
+    @property
+    def key(self) -> str:
+        """A name that no other task has."""
+        return "/".join((self.stage, self.family, str(self.seeds)))
 
     def run(self) -> list[Row]:
         """One row for each dtype."""
@@ -51,11 +58,16 @@ def _chosen(key: str, names: Sequence[str] | None, known: tuple[str, ...]) -> tu
     return known if names is None else tuple(names)
 
 
-def run_tasks(tasks: Sequence[Task], workers: int) -> list[Row]:
-    """The rows of all tasks. ``workers``: processes; 0: this one."""
+def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
+    """The rows of all tasks; those that ``journal`` has already are read from it. ``journal``: a file of one
+    line for each task, which is written as the tasks end. ``workers``: processes; 0: this one."""
+    done = Journal(journal)
+    done.say_done([task.key for task in tasks], "families")
+    left = [task for task in tasks if task.key not in done]
     with _mapping(workers) as map_tasks:
-        found = zip(track(tasks, "stages and families"), map_tasks(Task.run, tasks), strict=True)
-        return [row for _, rows in found for row in rows]
+        for task, rows in zip(track(left, "stages and families"), map_tasks(Task.run, left), strict=True):
+            done.add(task.key, rows)
+    return [row for task in tasks for row in done[task.key]]
 
 
 @contextmanager

@@ -55,7 +55,7 @@ class Stage:
     reference: Callable[[Values], Values] | None = None
     gradients: tuple[str, ...] = ()
     steady: tuple[str, ...] = ()
-    seeds: int = 136
+    seeds: int = 128
     quick: int = 3
     network: bool = False
     dtypes: tuple[str, ...] = DTYPES

@@ -6,7 +6,7 @@ from ghgs_lit.evaluation.tables.latex import PREAMBLE, to_latex
 from ghgs_lit.evaluation.tables.layouts import LAYOUTS, Table, TableOptions
 from ghgs_lit.evaluation.tables.others import read_others
 from ghgs_lit.evaluation.tables.records import read_sweep
-from ghgs_lit.evaluation.tables.writers import to_csv, to_markdown
+from ghgs_lit.evaluation.tables.writers import to_csv, to_markdown, to_terminal
 
 __all__ = [
     "LAYOUTS",
@@ -20,4 +20,5 @@ __all__ = [
     "to_csv",
     "to_latex",
     "to_markdown",
+    "to_terminal",
 ]

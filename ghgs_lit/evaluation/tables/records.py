@@ -18,6 +18,7 @@ from ghgs_lit.config.ablation import ABLATIONS, switches_of
 from ghgs_lit.config.keys import flatten, is_below, lookup
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.readers import read_yaml
+from ghgs_lit.runs.listing import files_below
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
 SETTING = ["data", "split", "targets", "protocol"]
@@ -216,16 +217,6 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
     return Planned(model_variant(config, str(path), by), data, seed, done)
 
 
-def _files_below(folders: Sequence[Path], name: str) -> list[Path]:
-    """The files of a name below folders, sorted in each; without those of Hydra. FileNotFoundError: a folder
-    is missing."""
-    for folder in folders:
-        if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a directory of runs; found none")
-    paths = [path for folder in folders for path in sorted(folder.rglob(name))]
-    return [path for path in paths if path.parent.name != ".hydra"]
-
-
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
     """All runs below some folders, finished or not.
 
@@ -236,8 +227,8 @@ def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
         FileNotFoundError: a folder is missing.
         InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``.
     """
-    runs = {str(path): _read_run(path, by) for path in _files_below(folders, "metrics.json")}
-    planned = [p for path in _files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
+    runs = {str(path): _read_run(path, by) for path in files_below(folders, "metrics.json")}
+    planned = [p for path in files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
     if not runs:
         names = ", ".join(map(str, folders))
         begun = f"{len(planned)} runs without one" if planned else "none"

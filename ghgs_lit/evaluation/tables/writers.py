@@ -1,15 +1,19 @@
-"""Tables as Markdown and as CSV."""
+"""Tables as Markdown, on a terminal and as CSV."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
+from tabulate import tabulate
 
 from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, decimals, title
 from ghgs_lit.evaluation.tables.notes import MARK
 from ghgs_lit.evaluation.tables.reported import data_title
 
+#: What a terminal shows bold and green.
+_BEST = "\033[1;32m{}\033[0m"
 COLUMNS = (
     "table", "kind", "method", "model", "encoder", "ablation", "unprojection", "semantic", "extra", "data",
     "split", "targets", "protocol", "views", "metric", "mean", "deviation", "seeds", "seeds_lacking",
@@ -65,6 +69,33 @@ def to_markdown(table: Table) -> str:
     frame = pd.DataFrame(rows, columns=pd.Index(names))
     text = frame.to_markdown(index=False, colalign=align, disable_numparse=True)
     return "\n\n".join((table.caption, text, *table.notes)) + "\n"
+
+
+def to_terminal(table: Table, width: int) -> str:
+    """The numbers for a terminal; groups stand below one another where the table is wider than ``width``."""
+
+    def write(number: str, tail: str, best: bool) -> str:
+        # What is in brackets stands below its number: beside it few tables would fit.
+        lines = re.sub(r" (?=[\[(])", "\n", number + tail).split("\n")
+        return "\n".join(_BEST.format(line) if best else line for line in lines)
+
+    numbers = texts(table, write)
+    whole = _terminal(table, numbers)
+    if max(map(len, re.sub(r"\033\[[\d;]*m", "", whole).splitlines())) <= width:
+        return whole
+    return "\n\n".join(_terminal(table, numbers[[group]]) for group in range(len(table.groups)))
+
+
+def _terminal(table: Table, numbers: pd.DataFrame) -> str:
+    short = {"3D Unproj.": "3D\nunp.", "Semantic Cons.": "sem.\ncons."}
+    names = [short.get(name, name) for name in table.stub]
+    names += [heading(table, *column, "\n") for column in numbers]
+    rows = []
+    for block in table.blocks:
+        mark = "† " if table.lines[block[0]].is_reported else ""
+        rows += [[mark + (stub := table.lines[i].stub)[0], *stub[1:], *numbers.loc[i]] for i in block]
+    align = ["center" if len(table.stub) > 1 else "left"] * len(table.stub) + ["right"] * numbers.shape[1]
+    return tabulate(rows, names, colalign=align, disable_numparse=True)
 
 
 def to_csv(tables: Sequence[Table]) -> str:

@@ -13,6 +13,7 @@ from ghgs_lit.bounds.agreement import trusted_views
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
 from ghgs_lit.geometry import projection, rotations, sampling, vectors
+from ghgs_lit.geometry.padding import Padding
 from ghgs_lit.metrics import functional
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.rendering import reference
@@ -92,6 +93,11 @@ DEFECTS = (
     Defect(
         "a window whose sum is not 1", functional._gaussian_window, "weights / weights.sum()", "weights",
         "L1 and SSIM", "ordinary",
+    ),
+    Defect(
+        "a border on the wrong side", Padding.pad_batch, "cropped(self.top, self.left,",
+        "cropped(self.top, -self.left,",
+        "padding", "ordinary",
     ),
     Defect(
         "a wrong mask that keeps its vote", trusted_views, "voting & ~", "voting | ~",

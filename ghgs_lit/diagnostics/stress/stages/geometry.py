@@ -1,17 +1,20 @@
-"""Bounds, projection, unprojection, token points, photo-consistency."""
+"""Bounds, projection, unprojection, token points, padding, photo-consistency, undistortion."""
 
 import torch
+from kornia.geometry.calibration import distort_points
 from torch import Generator, Tensor
 
 from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.rays import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, except_for
 from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
 from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps
@@ -212,6 +215,42 @@ def _tokens(v: Values) -> Values:
     }
 
 
+def _padding(v: Values) -> Values:
+    """Maps that were padded and cut, and a point's pixel in the padded camera, moved back."""
+    padding = pad_to_patches(v["masks"], 4)
+    padded = padding.pad_batch(batch_of(v))
+    cameras, images = padded.cameras, padding.cut(padded.images.movedim(2, -1)).movedim(-1, 2)
+    moved, _ = project(v["middle"][:, None].expand(-1, 2, -1), cameras.intrinsics, cameras.extrinsics)
+    corner = torch.tensor([padding.left, padding.top])
+    return {"images": images, "masks": padding.cut(padded.masks).to(images), "pixel": moved + corner}
+
+
+def _padding_slowly(v: Values) -> Values:
+    pixel, _ = project(v["middle"][:, None].expand(-1, 2, -1), *inputs.matrices(v["lenses"], v["poses"]))
+    return {"images": v["images"], "masks": v["masks"].to(v["images"]), "pixel": pixel}
+
+
+def _lens_inputs(family: str, g: Generator) -> Values:
+    distortion = inputs.uniform(g, -0.1, 0.1, 5)
+    return {"lens": _rig(family, g, size=16)["lenses"][0], "distortion": distortion}
+
+
+def _lens(v: Values) -> Values:
+    pairs = zip(inputs.intrinsics(v["lens"]).numpy(), v["distortion"].numpy(), strict=True)
+    return {"grid": torch.cat([undistorting_grid(k, d, 16, 16) for k, d in pairs])}
+
+
+def _lens_slowly(v: Values) -> Values:
+    """OpenCV's model by kornia at the same knots."""
+    knots = torch.linspace(0.5, 15.5, 3, dtype=torch.float64)
+    rows, columns = torch.meshgrid(knots, knots, indexing="ij")
+    pixels = torch.stack((columns, rows), -1).flatten(0, 1).expand(len(v["lens"]), 9, 2)
+    grid = 2 * distort_points(pixels, inputs.intrinsics(v["lens"]), v["distortion"]) / 16 - 1
+    grid = grid.mT.unflatten(-1, (3, 3))
+    dense = torch.nn.functional.interpolate(grid, (16, 16), mode="bilinear", align_corners=True)
+    return {"grid": dense.permute(0, 2, 3, 1)}
+
+
 _OUTSIDE_FRAME = {"wide": "the subject is smaller than a pixel", "degenerate": "nothing is in the frame"}
 _HOLDS = "a sum of a few products a coordinate; each rounds once, and the inputs' rounding is in kappa"
 
@@ -256,5 +295,15 @@ STAGES = (
         "token points", ("depths", "masks"), _tokens_inputs, _tokens, 50,
         "means of 16 and of 144 values", gradients=("depth", "far"),
         silent="relative depths are read inside the mask only",
+    ),
+    Stage(
+        "padding", ("cameras", "images", "masks"), lambda family, g: scene(family, g, 2, 18), _padding, 10,
+        "copies, and a principal point that moves by whole pixels", _padding_slowly,
+        gradients=("images",), steady=("truth", "poses"),
+    ),
+    Stage(
+        "undistortion", ("cameras",), _lens_inputs, _lens, 50,
+        "a polynomial of degree 7 and its division by the focal length", _lens_slowly,
+        dtypes=FLOAT32_ONLY,
     ),
 )  # fmt: skip

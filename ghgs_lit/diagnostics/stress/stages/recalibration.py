@@ -1,10 +1,12 @@
-"""Neighbours, cosines and attention among them."""
+"""Neighbours, cosines and attention among them, and the encoder's compiled attention."""
 
 import torch
 from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, case_by_case, except_for
+from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case, except_for
+from ghgs_lit.encoder.cpu.attention import attend as attend_heads
+from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.recalibration.neighbors import Neighbors
 from ghgs_lit.recalibration.recalibration import neighbor_cosines
@@ -108,10 +110,26 @@ def _products(v: Values) -> Tensor:
     return torch.maximum(q, k) * value
 
 
+def _head_inputs(family: str, g: Generator) -> Values:
+    """Of two heads, equal ones but for huge features."""
+    shape = (2, 20, 64) if family == "huge_features" else (20, 64)
+    features = {name: _attention_features(family, g, *shape) for name in ("q", "k", "v")}
+    return {name: value.expand(2, 20, 64).clone() for name, value in features.items()}
+
+
+def _head_kernel(v: Values) -> Values:
+    return {"attended": attend_heads(v["q"], v["k"], v["v"])}
+
+
+def _heads_slowly(v: Values) -> Values:
+    weights = (v["q"] @ v["k"].mT / 8).softmax(-1)
+    return {"attended": (weights @ v["v"]).transpose(1, 2)}
+
+
 _HUGE = "queries and keys 30 times as large as ordinary ones: they follow a LayerNorm"
 _INFINITE = "an infinite logit is a weight of 1"
 
-STAGES = (
+STAGES = [
     Stage(
         "neighbours", ("cameras", "points", "neighbors"), _point_inputs, case_by_case(_distances), 20,
         "distances of differences: three squares and a root", case_by_case(_distances_slowly), seeds=48,
@@ -128,4 +146,10 @@ STAGES = (
         case_by_case(_attention_slowly), gradients=("q", "k", "v"), seeds=48, sizes=_products,
         silent=f"{_INFINITE}, and a token that nobody attends to has no effect",
     ),
-)  # fmt: skip
+]  # fmt: skip
+if "avx512f" in processor_features():
+    STAGES.append(Stage(
+        "encoder kernel", ("features",), _head_inputs, _head_kernel, 100,
+        f"logits of sums of 64 products; exponentials by a polynomial. {_HUGE}", _heads_slowly,
+        dtypes=FLOAT32_ONLY, silent=_INFINITE,
+    ))  # fmt: skip
