@@ -77,7 +77,8 @@ def _run_live(cfg: DictConfig) -> None:
     recording = None if config["out"] is None else Recording(Path(config["out"]).expanduser().resolve())
     print(f"waiting for an instant in {config['images']}", flush=True)
     page = partial(_opened, cfg, layers=False)
-    show_live(frames, pause, crop, predicted, page, recording, cfg.seconds or math.inf)
+    until, delay = cfg.seconds or math.inf, cfg.delay or math.inf
+    show_live(frames, pause, crop, predicted, page, recording, until, delay)
 
 
 def _opened(cfg: DictConfig, content: Content, layers: bool = True) -> Viewer:
