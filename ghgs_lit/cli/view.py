@@ -34,6 +34,8 @@ def run(cfg: DictConfig) -> None:
     Ctrl-C ends it."""
     has_source = cfg.live or any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
     require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
+    is_folder = not isinstance(cfg.images, DictConfig)
+    require(cfg.live or is_folder, "images", "a folder, or live=true beside cameras", cfg.images)
     if cfg.path is None and cfg.checkpoint is None:
         cfg.checkpoint = SHIPPED
     if cfg.live:

@@ -227,6 +227,14 @@ def test_what_cannot_be_shown_live_is_one_line(tmp_path, capsys, arguments, mess
     assert f"ghgs view: {message}" in capsys.readouterr().err
 
 
+def test_cameras_are_shown_live_alone(tmp_path, capsys):
+    arguments = ("images={cam0: 0, cam1: 1}", "cameras=c.json", f"hydra.run.dir={tmp_path}")
+    assert ghgs("view", *arguments) == 1
+    assert "images: expected a folder, or live=true beside cameras; found" in capsys.readouterr().err
+    assert ghgs("view", "live=true", *arguments) == 1
+    assert "ghgs view: c.json: expected" in capsys.readouterr().err
+
+
 def test_photographs_need_no_checkpoint(tmp_path, capsys, monkeypatch):
     def refuse(cfg):
         raise InputError(f"predicts with {cfg.checkpoint}")
