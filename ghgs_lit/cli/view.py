@@ -34,6 +34,8 @@ def run(cfg: DictConfig) -> None:
     Ctrl-C ends it."""
     has_source = cfg.live or any(cfg.get(key) is not None for key in ("path", "checkpoint", "images"))
     require(has_source, "path", "a directory of ghgs predict or a PLY, or checkpoint=<file>", None)
+    is_folder = not isinstance(cfg.images, DictConfig)
+    require(cfg.live or is_folder, "images", "a folder, or live=true beside cameras", cfg.images)
     if cfg.path is None and cfg.checkpoint is None:
         cfg.checkpoint = SHIPPED
     if cfg.live:
@@ -77,7 +79,8 @@ def _run_live(cfg: DictConfig) -> None:
     recording = None if config["out"] is None else Recording(Path(config["out"]).expanduser().resolve())
     print(f"waiting for an instant in {config['images']}", flush=True)
     page = partial(_opened, cfg, layers=False)
-    show_live(frames, pause, crop, predicted, page, recording, cfg.seconds or math.inf)
+    until, delay = cfg.seconds or math.inf, cfg.delay or math.inf
+    show_live(frames, pause, crop, predicted, page, recording, until, delay)
 
 
 def _opened(cfg: DictConfig, content: Content, layers: bool = True) -> Viewer:

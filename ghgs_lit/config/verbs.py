@@ -137,6 +137,9 @@ class Predict(Photographs, Measured):
 class View(Predict):
     """A page in the browser with Gaussians, cameras, photographs, point cloud and visual hull."""
 
+    images: Path | Annotated[dict, Words("a folder or a mapping of cameras to devices")] | None = None
+    """As for ``ghgs predict``; with live also {camera: number of a device, or address of a stream}, which
+    OpenCV opens."""
     path: Path | None = None
     """A directory of ``ghgs predict`` (its formats ply and inputs), or a PLY; null: predict first."""
     checkpoint: Path | None = None
@@ -150,8 +153,11 @@ class View(Predict):
     seconds: Positive | None = None
     """The page is closed after so long; null: never."""
     live: bool = False
-    """Show the newest instant of images again and again: of a folder that is being written, or of videos at
-    their rate. Cameras are not checked, auto refines nothing, and out gets sequence/0000.ply and so on."""
+    """Show the newest instant of images again and again: of a folder that is being written, of videos at
+    their rate, or of cameras. Their calibration is not checked, auto refines nothing, and out gets
+    sequence/0000.ply and so on."""
+    delay: Positive | None = None
+    """Of live: seconds between an instant and its picture after which it is dropped; null: none is."""
 
 
 class Doctor(Photographs):

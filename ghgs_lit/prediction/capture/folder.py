@@ -23,7 +23,7 @@ from ghgs_lit.prediction.capture.calibration import (
 )
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
-from ghgs_lit.prediction.capture.frames import VideoFrame, find_frames, has_videos
+from ghgs_lit.prediction.capture.frames import Frame, Source, VideoFrame, find_frames, has_videos
 from ghgs_lit.prediction.capture.masks import mask_path, matte_of_background, matte_of_file, segmenter
 from ghgs_lit.prediction.capture.photographs import (
     Pixels,
@@ -47,7 +47,7 @@ class CaptureFolder:
 
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each instant; or of
-            videos named after their cameras.
+            videos named after their cameras. Or the frames of one instant by camera, as decoded.
         cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`, or read.
         masks: folder of masks, laid out and named as the photographs; None: ``backgrounds``, ``segment``,
             masks beside the photographs (``<name>_mask.png``) or named by the calibration, alpha channels.
@@ -62,7 +62,7 @@ class CaptureFolder:
         InputError: a folder or file is missing or wrong.
     """
 
-    images: str | Path
+    images: str | Path | Mapping[str, Frame]
     cameras: str | Path | CameraFile
     masks: str | Path | None = None
     backgrounds: str | Path | None = None
@@ -104,9 +104,11 @@ class CaptureFolder:
         return self.file.convention.told(vars(self._said))
 
     @functools.cached_property
-    def _found(self) -> tuple[dict[str, dict[str, Path | VideoFrame]], str]:
+    def _found(self) -> tuple[dict[str, dict[str, Source]], str]:
         """The photographs of all instants, and a line about what is left over."""
         folder, cameras, part = self.images, self.file.cameras, self._part
+        if isinstance(folder, Mapping):
+            return {"": dict(folder)}, ""
         # Numbers, too, are names of cameras.
         names = {composed(str(key)): composed(str(name)) for key, name in (self._said.names or {}).items()}
         if has_videos(folder, cameras, names):
@@ -120,7 +122,7 @@ class CaptureFolder:
         return self._found[1]
 
     @functools.cached_property
-    def paths(self) -> dict[str, dict[str, Path | VideoFrame]]:
+    def paths(self) -> dict[str, dict[str, Source]]:
         """``{instant: {camera: path or frame}}`` of the instants that ``sequence`` selects."""
         found, part = self._found[0], self._part
         names = list(found)[part.start : part.stop : part.step]
@@ -198,9 +200,9 @@ class CaptureFolder:
         }
         pool.shutdown(wait=False)
 
-    def _view(self, name: str, path: Path | VideoFrame) -> tuple[StoredCamera, Pixels, np.ndarray]:
+    def _view(self, name: str, path: Source) -> tuple[StoredCamera, Pixels, np.ndarray]:
         camera = self.file.cameras[name]
-        pixels = path.pixels() if isinstance(path, VideoFrame) else read_pixels(path)
+        pixels = read_pixels(path) if isinstance(path, Path) else path.pixels()
         matte = self._matte(name, camera, path, pixels)
         problem = implausible(matte > 127)
         if problem is not None:
@@ -225,10 +227,10 @@ class CaptureFolder:
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
         return Photograph(name, image, matte, calibration.intrinsics, calibration.extrinsics)
 
-    def _matte(self, name: str, camera: StoredCamera, path: Path | VideoFrame, pixels: Pixels) -> np.ndarray:
+    def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
         masks = self.images if self.masks is None else self.masks
-        mask = path.mask if isinstance(path, VideoFrame) else mask_path(path, self.images, masks)
+        mask = mask_path(path, self.images, masks) if isinstance(path, Path) else path.mask
         if self.masks is not None:
             require(mask is not None, f"{self.masks}", f"a mask of {path}", "none")
         elif self.backgrounds is not None:

@@ -28,6 +28,21 @@ _DIGITS = 6
 
 
 @dataclass(frozen=True, slots=True)
+class Frame:
+    """A photograph [h, w, 3] uint8 RGB that is decoded already, and what took it; ``mask``: as below."""
+
+    origin: str
+    image: np.ndarray
+    mask: None = None
+
+    def __str__(self) -> str:
+        return self.origin
+
+    def pixels(self) -> Pixels:
+        return Pixels(self.image, None, 0)
+
+
+@dataclass(frozen=True, slots=True)
 class VideoFrame:
     """A photograph, or a mask, that is a frame of a video; ``mask``: that of the photograph, where known."""
 
@@ -48,6 +63,10 @@ class VideoFrame:
         expected = f"the size of its video, {pixels.size} (height, width)"
         require(grey.shape == pixels.size, str(self.video.video.path), expected, grey.shape)
         return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
+
+
+#: Where a photograph comes from.
+Source = Path | Frame | VideoFrame
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:

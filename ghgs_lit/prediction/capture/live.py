@@ -1,58 +1,79 @@
-"""Captures of what goes on: instants of a folder that is being written, or videos at their own rate."""
+"""Captures of what goes on: instants of a folder that is being written, videos at their rate, or cameras."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ghgs_lit.config.nodes import Sequence
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.folder import CaptureFolder
-from ghgs_lit.prediction.capture.formats import read_cameras
-from ghgs_lit.prediction.capture.photographs import composed, counted, images_in
+from ghgs_lit.prediction.capture.devices import newest_frames, opened
+from ghgs_lit.prediction.capture.folder import ENOUGH, CaptureFolder
+from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
+from ghgs_lit.prediction.capture.frames import Frame
+from ghgs_lit.prediction.capture.photographs import by_camera, composed, counted, images_in
 from ghgs_lit.prediction.capture.videos import SUFFIXES
 
 #: Seconds after which a folder is looked at again.
 _POLL = 0.02
 
 
+class Arrived(NamedTuple):
+    """A capture, how many were dropped since the one before, and when it came, as the clock says."""
+
+    capture: Capture
+    dropped: int
+    taken: float
+
+
 def live_frames(
-    images: str | Path,
+    images: str | Path | Mapping[str, int | str],
     cameras: str | Path,
     masks: str | Path | None = None,
     idle: float | None = None,
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     **options: Any,
-) -> Iterator[tuple[Capture, int]]:
-    """The newest capture whenever one is asked for, and how many were dropped since the one before.
+) -> Iterator[Arrived]:
+    """The newest capture whenever one is asked for.
 
     Dropped is what comes while the one before is in use, and what cannot be read.
 
     Args:
         images: a folder of videos, which are shown at their own rate; or of instants, each a folder that
-            counts once it has a photograph of every camera and none of its files grows any more.
+            counts once it has a photograph of every camera and none of its files grows any more. Or what
+            OpenCV opens by camera: numbers of devices, addresses of streams; ``options`` then says where
+            masks come from, and ``ENOUGH`` cameras go on without the others.
         masks: a folder laid out as ``images``.
         idle: seconds without a new instant after which a folder of instants ends; None: never.
         clock, sleep: tells seconds, and lets some pass.
         options: as for :class:`CaptureFolder`.
 
     Raises:
-        InputError: the calibration, a video or the folder is missing or wrong.
+        InputError: the calibration, a video, a camera or the folder is missing or wrong.
     """
-    folder = Path(images).expanduser()
-    require(folder.is_dir(), str(images), "a folder", "no such folder")
-    if images_in(folder, SUFFIXES):
-        return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
-    part = options.get("sequence", {})
-    expected = "all instants of a folder that is being written"
+    said, part = options.get("calibration", {}), options.get("sequence", {})
+    if is_folder := not isinstance(images, Mapping):
+        folder = Path(images).expanduser()
+        require(folder.is_dir(), str(images), "a folder", "no such folder")
+        if images_in(folder, SUFFIXES):
+            return _played(CaptureFolder(folder, cameras, masks, **options), clock, sleep)
+    expected = f"all instants of {'a folder that is being written' if is_folder else 'cameras'}"
     require(Sequence.read(part, "sequence") == Sequence(), "sequence", expected, part)
-    said = options.get("calibration", {})
-    names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}
     stored = read_cameras(cameras, said.get("format") or "auto")
+    if not is_folder:
+        devices = by_camera(
+            Path("images"), {str(n): device for n, device in images.items()}, stored.cameras, {}
+        )
+        expected = "backgrounds=<folder> or segment=rembg for masks of cameras"
+        is_told = masks is None and (options.get("backgrounds") or options.get("segment"))
+        require(bool(is_told), "masks", expected, masks)
+        least = min(ENOUGH, len(devices))
+        return _watched(newest_frames(opened(devices), least, clock, sleep), stored, options)
+    names = {composed(str(key)): composed(str(name)) for key, name in (said.get("names") or {}).items()}
     places = [folder] if masks is None else [folder, Path(masks).expanduser()]
 
     def read(name: str) -> Capture:
@@ -65,9 +86,27 @@ def live_frames(
     return _arriving(places, is_whole, read, idle, clock, sleep)
 
 
+def _watched(
+    frames: Iterator[tuple[dict[str, Frame], int, float]], stored: CameraFile, options: Mapping[str, Any]
+) -> Iterator[Arrived]:
+    number, dropped, said = -1, 0, ""
+    for images, passed, taken in frames:
+        number, dropped = number + passed + 1, dropped + passed
+        try:
+            capture = Capture(f"{number:06d}", CaptureFolder(images, stored, **options).photographs(""))
+        except InputError as error:
+            dropped += 1
+            if str(error) != said:
+                said = str(error)
+                print(f"instant {number:06d} is left out: {said}", flush=True)
+            continue
+        yield Arrived(capture, dropped, taken)
+        dropped = 0
+
+
 def _played(
     folder: CaptureFolder, clock: Callable[[], float], sleep: Callable[[float], None]
-) -> Iterator[tuple[Capture, int]]:
+) -> Iterator[Arrived]:
     names = folder.instants
     first = next(iter(folder.paths[names[0]].values())).video.video
     # Instants are named by the frame of the first camera.
@@ -83,7 +122,7 @@ def _played(
             dropped += 1
             continue
         sleep(max(float(due[newest]) - (clock() - begin), 0.0))
-        yield capture, dropped
+        yield Arrived(capture, dropped, begin + float(due[newest]))
         dropped = 0
 
 
@@ -94,7 +133,7 @@ def _arriving(
     idle: float | None,
     clock: Callable[[], float],
     sleep: Callable[[float], None],
-) -> Iterator[tuple[Capture, int]]:
+) -> Iterator[Arrived]:
     done, before, unread, last = [], {}, {}, clock()
     while idle is None or clock() - last < idle:
         folders = (path.name for path in places[0].iterdir() if path.is_dir() and path.name[0] != ".")
@@ -110,7 +149,9 @@ def _arriving(
             unread[newest] = sizes[newest]
             continue
         done, last = counted(newest), clock()
-        yield capture, sum(counted(name) < done for name in sizes)
+        files = [path for place in places if (place / newest).is_dir() for path in (place / newest).iterdir()]
+        age = max(time.time() - max(path.stat().st_ctime for path in files), 0.0)
+        yield Arrived(capture, sum(counted(name) < done for name in sizes), last - age)
 
 
 def _sizes(folder: Path) -> dict[str, int]:

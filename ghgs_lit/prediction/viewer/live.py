@@ -10,6 +10,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from pathlib import Path
 
 from ghgs_lit.prediction.capture.capture import Capture
+from ghgs_lit.prediction.capture.live import Arrived
 from ghgs_lit.prediction.export.ply import write_ply
 from ghgs_lit.prediction.export.reports import begin_files, end_files
 from ghgs_lit.prediction.export.subject import ExportedSubject
@@ -57,29 +58,35 @@ class Pause:
 
 
 def show_live(
-    frames: Iterator[tuple[Capture, int]],
+    frames: Iterator[Arrived],
     pause: Pause,
     crop: Callable[[Capture], Batch],
     predict: Callable[[Batch], ExportedSubject],
     open_page: Callable[[Content], Viewer],
     recording: Recording | None = None,
     seconds: float = math.inf,
+    delay: float = math.inf,
 ) -> None:
     """Show the newest capture again and again until no more come or ``seconds`` are over. However it ends,
     the page is closed and a summary printed.
 
     Args:
-        frames: captures, and how many were dropped before each; it waits by ``pause``, which ends here.
+        frames: captures as they come; it waits by ``pause``, which ends here.
         crop: gives what the model sees; of the next capture in a thread while one is predicted.
         predict: gives what is shown.
         open_page: called with the first content.
+        delay: seconds between a capture and its picture after which it is dropped.
     """
-    page, shown, dropped, line, times = None, 0, 0, "0 shown", {}
+    page, shown, dropped, late, line, times = None, 0, 0, 0, "0 shown", {}
     try:
         with contextlib.closing(_read_ahead(frames, pause, crop, seconds)) as batches:
-            for batch, missed, reading in batches:
-                begin = time.perf_counter()
-                subject = predict(batch)
+            for batch, missed, taken, reading in batches:
+                begin, due, dropped = time.perf_counter(), taken + delay, dropped + missed
+                subject = predict(batch) if time.monotonic() <= due else None
+                if time.monotonic() > due:
+                    late, dropped = late + 1, dropped + 1
+                    line = f"{shown} shown, {dropped} dropped, {late} of them later than {delay:g} s"
+                    continue
                 seen = dataclasses.replace(batch, cameras=subject.cameras[None].to("cpu"))
                 content = Content(subject.stored.to("cpu"), subject.up.cpu(), seen)
                 predicted = time.perf_counter()
@@ -91,14 +98,15 @@ def show_live(
                 if recording is not None:
                     recording.add(subject)
                 now = time.perf_counter()
-                shown, dropped = shown + 1, dropped + missed
+                shown += 1
                 stages = {"read and crop": reading, "predict": predicted - begin, "show": now - opened}
                 for name, value in {"all": now - last, **stages}.items():
                     before = times.get(name, 0.0)
                     times[name] = before + (value - before) / min(shown, _RECENT)
                 last = now
                 rates = ", ".join(f"{name} {1 / times[name]:.3g}" for name in stages)
-                line = f"{shown} shown, {dropped} dropped, {1 / times['all']:.3g} a second ({rates})"
+                lost = f"{dropped} dropped" + (f", {late} of them later than {delay:g} s" if late else "")
+                line = f"{shown} shown, {lost}, {1 / times['all']:.3g} a second ({rates})"
                 text.content = f"instant {subject.name}: {line}"
     finally:
         if page is not None:
@@ -109,14 +117,15 @@ def show_live(
 
 
 def _read_ahead(
-    frames: Iterator[tuple[Capture, int]], pause: Pause, crop: Callable[[Capture], Batch], seconds: float
-) -> Iterator[tuple[Batch, int, float]]:
-    """Batches, how many captures were dropped before each, and the seconds of reading it without pauses."""
+    frames: Iterator[Arrived], pause: Pause, crop: Callable[[Capture], Batch], seconds: float
+) -> Iterator[tuple[Batch, int, float, float]]:
+    """Batches, how many captures were dropped before each and when it came, and the seconds of reading it
+    without pauses."""
 
-    def following() -> tuple[Batch, int, float] | None:
+    def following() -> tuple[Batch, int, float, float] | None:
         begin = time.perf_counter() - pause.seconds
-        for capture, dropped in frames:
-            return crop(capture), dropped, time.perf_counter() - pause.seconds - begin
+        for capture, *known in frames:
+            return crop(capture), *known, time.perf_counter() - pause.seconds - begin
         return None
 
     end = time.monotonic() + seconds

@@ -74,7 +74,7 @@ def test_an_instant_counts_when_it_is_whole(source):
     time = Time(put(source, "000", *half), wait, wait, put(source, "000", "cam3.png"), wait, wait)
     time.plans += [cut(source, "000", "cam3.png"), put(source, "000")]
     frames = arriving(source, time)
-    capture, dropped = next(frames)
+    capture, dropped, _ = next(frames)
     assert (capture.name, dropped, len(capture.photographs)) == ("000", 0, 4)
     assert not time.plans
     assert list(frames) == []  # nothing comes any more
@@ -88,16 +88,16 @@ def test_instants_that_come_while_one_is_in_use_are_dropped(source):
     assert next(frames)[0].name == "8"
     for instant in ("9", "10", "11"):
         put(source, instant)()
-    capture, dropped = next(frames)
+    capture, dropped, _ = next(frames)
     assert (capture.name, dropped) == ("11", 2)
     cut(source, "12", "cam1.png")()
     assert list(frames) == []
     shutil.copy(source / "again.json", source / "cameras.json")
     frames = arriving(source, Time())
-    capture, dropped = next(frames)
+    capture, dropped, _ = next(frames)
     assert (capture.name, dropped) == ("11", 3)
     put(source, "13")()
-    capture, dropped = next(frames)
+    capture, dropped, _ = next(frames)
     assert (capture.name, dropped) == ("13", 1)
 
 
@@ -112,13 +112,13 @@ def test_videos_play_at_their_rate(source):
         source / "videos", source / "cameras.json", source / "masks", clock=time.clock, sleep=time.sleep
     )
     for number in range(2):
-        capture, dropped = next(frames)
+        capture, dropped, _ = next(frames)
         assert (capture.name, dropped) == (f"{number:06d}", 0)
         assert time.now == pytest.approx(number / 10)
     time.now = 0.42  # the prediction took long
-    capture, dropped = next(frames)
+    capture, dropped, _ = next(frames)
     assert (capture.name, dropped, number_of(capture.photographs[0].image)) == ("000004", 2, 4)
-    assert [(c.name, d) for c, d in frames] == [("000005", 0)]
+    assert [(c.name, d) for c, d, _ in frames] == [("000005", 0)]
     assert time.now == pytest.approx(0.5)
 
 

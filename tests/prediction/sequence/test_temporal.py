@@ -165,3 +165,38 @@ def test_a_mask_that_loses_a_part_is_predicted_anew_and_so_is_what_comes_next():
         found = temporal(batch)
     assert [int(b.masks.sum()) for b in asked] == [int(whole[n].masks.sum()) for n in (0, 2, 3)]
     assert quality(found, steps(5)[4]) > quality(at_true_depth(whole[4]), steps(5)[4]) - 1.0
+
+
+def test_a_person_who_leaves_and_comes_back():
+    """Nobody is no Gaussians, once; who comes back elsewhere is predicted anew and followed again."""
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    back = [motion((0.3 + 0.005 * n, 0.0, -0.2)) for n in range(3)]
+    here, there = [instant(moved) for moved in steps(2)], [instant(moved) for moved in back]
+    gone = dataclasses.replace(
+        here[0],
+        images=torch.zeros_like(here[0].images),
+        masks=torch.zeros_like(here[0].masks),
+        depths=torch.zeros_like(here[0].depths),
+    )
+    found = [temporal(batch) for batch in (*here, gone, gone, *there)]
+    assert [len(prediction.gaussians) > 0 for prediction in found] == [True] * 2 + [False] * 2 + [True] * 3
+    assert [int(b.masks.sum()) for b in asked] == [int(b.masks.sum()) for b in (here[0], gone, there[0])]
+    assert quality(found[-1], back[-1]) > quality(at_true_depth(there[-1]), back[-1]) - 1.0
+
+
+def test_a_camera_that_is_black_for_three_instants():
+    """Although its masks say nothing of it. They are predicted from what there is, and so is what comes next;
+    nothing of them is handed on."""
+    predict, asked = counted()
+    temporal = Temporal(predict, 99, RENDERER)
+    batches = [instant(moved) for moved in steps(8)]
+    for number in (2, 3, 4):
+        images = batches[number].images.clone()
+        images[:, 1] = 0
+        batches[number] = dataclasses.replace(batches[number], images=images)
+    for batch in batches:
+        found = temporal(batch)
+    numbers = [[torch.equal(one.images, b.images) for one in batches].index(True) for b in asked]
+    assert numbers == [0, 2, 3, 5, 6]
+    assert quality(found, steps(8)[7]) > quality(at_true_depth(batches[7]), steps(8)[7]) - 1.0

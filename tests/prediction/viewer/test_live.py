@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import math
 import threading
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -13,7 +15,7 @@ import torch
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.live import live_frames
+from ghgs_lit.prediction.capture.live import Arrived, live_frames
 from ghgs_lit.prediction.capture.predict import predict
 from ghgs_lit.prediction.export import OutputOptions
 from ghgs_lit.prediction.export.ply import ply_bytes, read_ply
@@ -42,8 +44,8 @@ def predicted(batch):
     return exported_subject(batch, prediction, Renderer(), OutputOptions())
 
 
-def instants(*names, dropped=0):
-    return iter([(Capture(name, ()), dropped) for name in names])
+def instants(*names, dropped=0, taken=math.inf):
+    return iter([Arrived(Capture(name, ()), dropped, taken) for name in names])
 
 
 class Page:
@@ -113,6 +115,30 @@ def test_the_next_capture_is_read_and_cropped_meanwhile(capsys):
     assert page.seen == [1, 2]
     assert page.text.content.startswith("instant 2: 2 shown, 0 dropped, ")
     assert capsys.readouterr().out in page.text.content + "\n"
+
+
+def test_what_is_older_than_the_delay_is_dropped_counted_and_said(capsys, monkeypatch):
+    """Before it is predicted, or after where that takes too long; what comes in time is shown."""
+    clock, page, asked = SimpleNamespace(now=100.0), Page(), []
+    times = SimpleNamespace(monotonic=lambda: clock.now, perf_counter=time.perf_counter)
+    monkeypatch.setattr("ghgs_lit.prediction.viewer.live.time", times)
+
+    def slowly(batch):
+        asked.append(batch.subjects[0])
+        clock.now += 1.0
+        return predicted(batch)
+
+    frames = [*instants("30", taken=97.9), *instants("40", taken=98.5)]
+    frames += instants("50", taken=99.5, dropped=3)
+    show_live(iter(frames), Pause(), crop, slowly, lambda _: page, delay=2.0)
+    assert asked == ["40", "50"]
+    assert capsys.readouterr().out == "0 shown, 6 dropped, 3 of them later than 2 s\n"
+    clock.now = 100.0
+    show_live(iter(frames[::2]), Pause(), crop, slowly, lambda _: page, delay=2.0)
+    assert page.seen == [50]
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith("1 shown, 4 dropped, 1 of them later than 2 s, ")
+    assert page.text.content == f"instant 50: {line}"
 
 
 def endless(pause):
@@ -199,6 +225,14 @@ def test_videos_are_shown_as_they_are_predicted(tmp_path, capsys, monkeypatch):
 def test_what_cannot_be_shown_live_is_one_line(tmp_path, capsys, arguments, message):
     assert ghgs("view", "live=true", *arguments, f"hydra.run.dir={tmp_path}") == 1
     assert f"ghgs view: {message}" in capsys.readouterr().err
+
+
+def test_cameras_are_shown_live_alone(tmp_path, capsys):
+    arguments = ("images={cam0: 0, cam1: 1}", "cameras=c.json", f"hydra.run.dir={tmp_path}")
+    assert ghgs("view", *arguments) == 1
+    assert "images: expected a folder, or live=true beside cameras; found" in capsys.readouterr().err
+    assert ghgs("view", "live=true", *arguments) == 1
+    assert "ghgs view: c.json: expected" in capsys.readouterr().err
 
 
 def test_photographs_need_no_checkpoint(tmp_path, capsys, monkeypatch):
