@@ -181,6 +181,7 @@ NUMBERS = [
     ("prepare data.render.samples=99", 1, "data.render.samples: expected", "<= 16", "found 99"),
     ("prepare data.render.quality=0", 1, "data.render.quality: expected", "found 0"),
     ("prepare check.min_iou=2", 1, "check.min_iou: expected", "<= 1", "found 2"),
+    ("train data=thuman2 data.limit.val=0", 1, "data.limit.val: expected an integer >= 1 or null; found 0"),
     (
         "train 'data.evaluation_positions=[[a]]'",
         1,
@@ -212,6 +213,7 @@ NUMBERS = [
     ("train evaluation.pictures=-1", 1, "evaluation.pictures: expected an integer >= 0; found -1"),
     ("train callbacks.pictures.subjects=-1", 1, "callbacks.pictures.subjects: expected", "found -1"),
     ("train callbacks.last.minutes=0", 1, "callbacks.last.minutes: expected", "found 0"),
+    ("train callbacks.pictures.token=[1]", 1, "callbacks.pictures.token: expected a list of 3 values"),
     (
         "predict checkpoint=x turntable.frames=-1",
         1,
