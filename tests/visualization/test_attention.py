@@ -46,6 +46,11 @@ def test_the_weights_are_those_of_the_forward(overrides):
     for query in [chosen_token(tokens, points, element) for element in range(2)]:
         attention = attention_of(model.recalibration, tokens, points, query)
         assert torch.allclose(attention.weights.sum(-1), torch.ones(()), atol=1e-5)
+        used, block.similarity = block.similarity, "none"
+        plain = attention_of(model.recalibration, tokens, points, query).weights
+        block.similarity = used
+        assert torch.equal(attention.plain, plain)
+        assert torch.equal(attention.plain, attention.weights) == (used == "none")
         for layer, weights in enumerate(attention.weights):
             x = tokens.latent[layer]
             v = block.v_proj(block.norm1(x[attention.neighbors])).unflatten(-1, (block.num_heads, -1))
@@ -100,6 +105,8 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
     scale, caption, gap = 4, 14, 2
     width, height = 70 * scale, 56 * scale
     first = picture[caption : caption + height, : 3 * width + 2 * gap]  # the neighbours
+    layers = 2 * len(attention.weights)  # with consistency and for s = 1
+    assert picture.size >= (1 + layers) * first.size
     drawn = set()
     for view in range(3):
         tile = first[:, view * (width + gap) : view * (width + gap) + width].astype(int).sum(-1)
