@@ -22,7 +22,7 @@ Person:       $out/person/viewer.html (in a browser), gaussians.ply, sheet.png (
 Table:        $out/table/table.md
               Its rows are equal but for chance, and cannot differ yet: a token of these small photographs is wider
               than an arm, the features were not taught parts of the body, and logits are so near to 0 that s in
-              Eq. 3, which multiplies them, moves no attention. Longer trainings: docs/evidence/ablation.md
+              Eq. 3, which multiplies them, hardly moves attention. Longer trainings: docs/evidence/ablation.md
 Attention:    $full/pictures/step_*/*_attention.png (of an elbow, by layer, with s and with s = 1)
 Pictures:     $out/*/pictures
 Splat:        ghgs predict checkpoint=$full/checkpoints/last.ckpt
