@@ -15,54 +15,43 @@ from ghgs_lit.types import Points, Tokens
 class TokenAttention:
     """Token ``query``, its neighbours (nearest first), and the weight of each in every layer and head.
 
-    ``query`` and ``neighbors`` are indices of packed tokens.
+    ``query`` and ``neighbors`` are indices of packed tokens. ``plain``: the weights if s were 1.
     """
 
     query: int
     neighbors: Int[Tensor, " k"]
     weights: Float[Tensor, "L a k"]
+    plain: Float[Tensor, "L a k"]
 
 
 @torch.no_grad()
 def attention_of(
     recalibration: Recalibration, tokens: Tokens, points: Points, query: int
 ) -> TokenAttention | None:
-    """Attention weights of each layer and head from one token to its neighbours (Eqs. 3 to 5).
-
-    Args:
-        recalibration: the stage.
-        tokens, points: as in the stage's forward.
-        query: index of a packed token.
-
-    Returns:
-        None where that token takes no part in the recalibration.
-    """
+    """Attention of the packed token ``query`` (Eqs. 3 to 5); None where it takes no part. ``tokens``,
+    ``points``: as in the stage's forward."""
     takes_part = recalibration.takes_part(points)
     if not takes_part[query]:
         return None
     element = tokens.image // tokens.grid[1]
     chosen = (takes_part & (element == element[query])).nonzero()[:, 0]
     row = int((chosen == query).nonzero())
-    near, weights = _weights(recalibration, tokens, points, chosen, slice(row, row + 1))
+    stage = (recalibration, tokens, points, chosen, slice(row, row + 1))
+    (near, weights), (_, plain) = _weights(*stage), _weights(*stage, plain=True)
     valid = near.valid[row]
-    return TokenAttention(query, chosen[near.index[row][valid]], weights[:, 0, valid].mT)
+    return TokenAttention(
+        query, chosen[near.index[row][valid]], weights[:, 0, valid].mT, plain[:, 0, valid].mT
+    )
 
 
 @torch.no_grad()
 def attention_on_other_parts(
     recalibration: Recalibration, tokens: Tokens, points: Points, part: Int[Tensor, " N"]
 ) -> Float[Tensor, "m L"]:
-    """Share of each token's attention, mean over heads, on tokens that show another part of the body.
-
-    Args:
-        recalibration: the stage.
-        tokens, points: as in the stage's forward.
-        part: number of the part that a token shows; -1: unknown. Such tokens are no queries, and what they
-            get is no part of the share.
-
-    Returns:
-        In each layer, of the tokens that take part and whose part is known.
-    """
+    """Share of each token's attention, mean over heads, on tokens that show another part of the body: in each
+    layer, of the tokens that take part and whose part is known. ``tokens``, ``points``: as in the stage's
+    forward. ``part``: number of the part that a token shows; -1: unknown. Such tokens are no queries, and
+    what they get is no part of the share."""
     takes_part, element, found = recalibration.takes_part(points), tokens.image // tokens.grid[1], []
     for number in range(tokens.grid[0]):
         chosen = (takes_part & (element == number)).nonzero()[:, 0]
@@ -74,9 +63,15 @@ def attention_on_other_parts(
 
 
 def _weights(
-    recalibration: Recalibration, tokens: Tokens, points: Points, chosen: Int[Tensor, " n"], rows: slice
+    recalibration: Recalibration,
+    tokens: Tokens,
+    points: Points,
+    chosen: Int[Tensor, " n"],
+    rows: slice,
+    plain: bool = False,
 ) -> tuple[Neighbors, Float[Tensor, "L m k a"]]:
-    """Neighbours of the ``chosen`` tokens of one element, as indices among them, and the weights of rows."""
+    """Neighbours of the ``chosen`` tokens of one element, as indices among them, and the weights of rows;
+    ``plain``: if s were 1."""
     places = recalibration.places(tokens)
     near = nearest_neighbors(
         recalibration.positions(tokens, points)[chosen],
@@ -85,6 +80,7 @@ def _weights(
         None if places is None else places[chosen],
     )
     block = recalibration.block
-    cosines = neighbor_cosines(tokens.semantic[chosen], near) if block.similarity != "none" else None
+    plain |= block.similarity == "none"
+    cosines = None if plain else neighbor_cosines(tokens.semantic[chosen], near)
     each = [block.attention_weights(layer[chosen], rows, near, cosines) for layer in tokens.latent]
     return near, torch.stack(each)

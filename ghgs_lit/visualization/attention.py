@@ -8,7 +8,7 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.recalibration.inspection import TokenAttention
 from ghgs_lit.types import Batch, Points, Tokens
-from ghgs_lit.visualization.pictures import grid, palette, row, to_uint8
+from ghgs_lit.visualization.pictures import palette, row, stack, to_uint8
 
 _SIDE = 224  # minimum height of a tile in pixels
 _QUERY = (255, 60, 220)
@@ -38,8 +38,9 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     """Draw the query (outlined) and its neighbours on the views of its subject.
 
     The first row shows the neighbours, the nearest brightest; captions give their number in each view. One
-    row for each layer follows with the weights, averaged over heads, the largest brightest; captions give the
-    share of each view. ``batch``: gives the photographs, padded to whole patches.
+    row for each layer follows with the weights, averaged over heads, the largest brightest, and beside them
+    those for s = 1, where they differ; captions give the share of each view. ``batch``: gives the
+    photographs, padded to whole patches.
     """
     views = tokens.grid[1]
     element = int(tokens.image[attention.query]) // views
@@ -50,11 +51,18 @@ def attention_sheet(batch: Batch, tokens: Tokens, attention: TokenAttention) -> 
     near = tokens.image[attention.neighbors] % views
     captions = [f"{name}: {int((near == v).sum())}/{count}" for v, name in enumerate(names)]
     rows = [row(_tiles(images, tokens, attention, ranks), captions)]
-    for layer, weights in enumerate(attention.weights.float().mean(1).cpu()):
-        shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
-        captions = [f"layer {layer}: {100 * share:.0f}%" for share in shares]
-        rows.append(row(_tiles(images, tokens, attention, weights / weights.max()), captions))
-    return grid(rows)
+    kinds = {"": attention.weights, ", s = 1": attention.plain}
+    if torch.equal(attention.weights, attention.plain):
+        del kinds[", s = 1"]
+    for layer in range(len(attention.weights)):
+        tiles, captions = [], []
+        for said, all_weights in kinds.items():
+            weights = all_weights[layer].float().mean(0).cpu()
+            shares = [float(weights[(near == v).cpu()].sum()) for v in range(views)]
+            captions += [f"layer {layer}{said}: {100 * share:.0f}%" for share in shares]
+            tiles += _tiles(images, tokens, attention, weights / weights.max())
+        rows.append(row(tiles, captions))
+    return stack(rows)
 
 
 def _tiles(

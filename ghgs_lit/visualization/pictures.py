@@ -83,23 +83,6 @@ def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.pad(r, ((0, _GAP), (0, width - r.shape[1]), (0, 0))) for r in rows])
 
 
-def grid(tiles: Sequence[np.ndarray], aspect: float = 1.5) -> np.ndarray:
-    """Pictures of one size in rows and columns, about ``aspect`` times as wide as high."""
-    height, width = tiles[0].shape[:2]
-
-    def mismatch(columns: int) -> float:
-        rows = -(-len(tiles) // columns)
-        return abs(np.log(columns * width / (rows * height) / aspect))
-
-    columns = min(range(1, len(tiles) + 1), key=mismatch)
-    gap = np.full((height, 4 * _GAP, 3), 255, np.uint8)
-    rows = []
-    for start in range(0, len(tiles), columns):
-        parts = [part for tile in tiles[start : start + columns] for part in (tile, gap)]
-        rows.append(np.concatenate(parts[:-1], axis=1))
-    return stack(rows)
-
-
 def _depth_rows(
     batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
 ) -> list[np.ndarray]:

@@ -10,7 +10,6 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.recalibration.inspection import attention_of, attention_on_other_parts
 from ghgs_lit.visualization.attention import attention_sheet, chosen_token
 from ghgs_lit.visualization.clouds import clouds
-from ghgs_lit.visualization.pictures import grid
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch
 
@@ -46,6 +45,11 @@ def test_the_weights_are_those_of_the_forward(overrides):
     for query in [chosen_token(tokens, points, element) for element in range(2)]:
         attention = attention_of(model.recalibration, tokens, points, query)
         assert torch.allclose(attention.weights.sum(-1), torch.ones(()), atol=1e-5)
+        used, block.similarity = block.similarity, "none"
+        plain = attention_of(model.recalibration, tokens, points, query).weights
+        block.similarity = used
+        assert torch.equal(attention.plain, plain)
+        assert torch.equal(attention.plain, attention.weights) == (used == "none")
         for layer, weights in enumerate(attention.weights):
             x = tokens.latent[layer]
             v = block.v_proj(block.norm1(x[attention.neighbors])).unflatten(-1, (block.num_heads, -1))
@@ -100,6 +104,9 @@ def test_attention_is_drawn_on_the_tokens_it_names(skip):
     scale, caption, gap = 4, 14, 2
     width, height = 70 * scale, 56 * scale
     first = picture[caption : caption + height, : 3 * width + 2 * gap]  # the neighbours
+    # A row for each layer, with consistency and, beside it, for s = 1.
+    rows = 1 + len(attention.weights)
+    assert picture.shape[:2] == (rows * (height + caption + gap), 6 * width + 5 * gap)
     drawn = set()
     for view in range(3):
         tile = first[:, view * (width + gap) : view * (width + gap) + width].astype(int).sum(-1)
@@ -130,14 +137,3 @@ def test_clouds_are_the_subjects_points_and_its_body():
     assert len(found["points_and_body"][0]) == len(positions) + 4
     nothing = dataclasses.replace(batch, masks=torch.zeros_like(batch.masks), body_vertices=None)
     assert clouds(nothing, prediction, 0) == {}
-
-
-def test_a_grid_is_as_wide_as_asked():
-    """Tiles are in reading order and none is lost."""
-    tiles = [np.full((100, 40, 3), n, np.uint8) for n in range(5)]
-    wide, square = grid(tiles), grid(tiles, aspect=0.6)
-    assert wide.shape[:2] == (102, 5 * 40 + 4 * 8)
-    assert square.shape[:2] == (204, 3 * 40 + 2 * 8)
-    assert square[5, [5, 53, 101], 0].tolist() == [0, 1, 2]
-    assert square[107, [5, 53, 101], 0].tolist() == [3, 4, 0]
-    assert np.array_equal(grid(tiles[:1])[:100], tiles[0])
