@@ -41,7 +41,7 @@ def main(folder: str) -> None:
     for against in ("full", "best"):
         options = TableOptions(LAYOUTS["ablation"], test=PairedTest(against=against))
         for half, rows in halves(sweep.rows):
-            for table in build_tables(Sweep(rows, [], {}), [], options):
+            for table in build_tables(Sweep(rows, [], sweep.configs), [], options):
                 marked = table.cells["marked"]
                 compared = [test for test in table.cells["test"] if test is not None and test.p is not None]
                 tables.append(bool(marked.any()))
