@@ -231,7 +231,7 @@ NUMBERS = [
     ("train -m seed=1,x", 1, "seed: expected an integer", "found 'x'"),
     ("train -m seed=1,2 data.batch_size=0", 1, "data.batch_size: expected", "found 0"),
     ("train sweep=table2 dry_run=true encoder.width=0", 1, "encoder.width: expected", "found 0"),
-    ("train hydra.mode=all", 1, "hydra.mode=all: expected", "RUN, MULTIRUN"),
+    ("train hydra.mode=all", 1, "hydra.mode=all: expected", "RUN", "MULTIRUN"),
 ]
 
 NAMES = [

@@ -48,7 +48,7 @@ def test_the_rest_is_rendered_in_another_process(begun):
     process = beside._running[root]
     beside.render_beside(*arguments)
     assert beside._running[root] is process
-    process.join(60)
+    process.join(300)
     assert process.exitcode == 0
     layout, subjects = joining(root)
     assert list(subjects) == NAMES

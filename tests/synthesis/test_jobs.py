@@ -151,7 +151,7 @@ def test_workers_end_with_the_process_that_started_them(scans, tmp_path):
     log = tmp_path / "log"
     process = PREPARED.Process(target=render_stuck, args=(tmp_path / "out", scans, log))
     process.start()
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 300
     while not (log.exists() and len(log.read_text().split()) == 2) and time.monotonic() < limit:
         time.sleep(0.05)
     workers = [int(pid) for pid in log.read_text().split()]
