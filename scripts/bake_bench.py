@@ -1,11 +1,12 @@
-"""Write the thumbnails of the frozen people of ``data=synthetic split=bench`` into the package.
+"""Write the thumbnails of the frozen people of ``data=synthetic`` into the package.
 
-    python scripts/bake_bench.py
+    python scripts/bake_bench.py bench
 
-Only after ``version`` in ``ghgs_lit/synthesis/bench/definition.json`` went up: results on the old version can
-not be compared with those on the new one. Takes a few minutes.
+for one of their splits. Only after ``version`` in ``ghgs_lit/synthesis/bench/<split>.json`` went up: results
+on the old version can not be compared with those on the new one. Takes a few minutes.
 """
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -13,36 +14,38 @@ import numpy as np
 
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.sampling import RING_VIEW
+from ghgs_lit.errors import choice
 from ghgs_lit.synthesis import bench
 from ghgs_lit.synthesis.jobs import RenderOptions, SyntheticSource, everything, render_people
 from ghgs_lit.synthesis.rig import Rig
 
 
-def main() -> None:
-    data = bench.definition()["data"]
-    seed, rig = data["people_seed"], Rig(height=data["rig"]["height"])
-    wanted = data["render"]
+def main(split: str) -> None:
+    choice("split", split, bench.SPLITS)
+    made, names, positions = bench.definition(split), bench.names(split), bench.POSITIONS
+    seed, rig = made["data"]["people_seed"], Rig(height=made["data"]["rig"]["height"])
+    wanted = made["data"]["render"]
     settings = RenderOptions(
-        size=bench.definition()["size"],
-        positions=bench.POSITIONS,
+        size=made["size"],
+        positions=positions,
         views=(RING_VIEW,),
         samples=wanted["samples"],
         quality=wanted["quality"],
     )
-    bench.check_settings({"people_seed": seed, **everything(rig, settings)})
+    bench.check_settings(split, {"people_seed": seed, **everything(rig, settings)})
     with tempfile.TemporaryDirectory() as folder:
-        root, people = Path(folder), {bench.SPLIT: bench.names()}
-        render_people(root, people, SyntheticSource(seed), rig, settings, seed)
-        reader = Layout(root, bench.SPLIT, bench.names())
+        root = Path(folder)
+        render_people(root, {split: names}, SyntheticSource(seed), rig, settings, seed)
+        reader = Layout(root, split, names)
         found = [
             [
                 bench.thumbnail(reader.read_view(name, position, RING_VIEW, False))
                 for position in bench.POSITIONS
             ]
-            for name in bench.names()
+            for name in names
         ]
-    np.savez_compressed(bench.FOLDER / "thumbnails.npz", thumbnails=np.array(found))
+    np.savez_compressed(bench.FOLDER / f"{split}.npz", thumbnails=np.array(found))
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

@@ -108,6 +108,6 @@ class EvaluationOptions(Options):
     """Names of files in conf/targets, each with its own values (the paper's: release). The one that targets=
     selects has the values of this configuration. Of tables, null: all that were measured."""
     split: Text = "val"
-    """val: unseen in training | train | bench: frozen people of data=synthetic."""
+    """val: unseen in training | train | bench, sealed: frozen people of data=synthetic."""
     pictures: Index = 4
     """Number of subjects of each protocol that are drawn into pictures/."""

@@ -200,8 +200,8 @@ class Benchmark(Measured):
     knobs: Annotated[dict | None, Words("a mapping of lists or null")] = None
     """Lists of values by key, such as {recalibration.k: [4, 8]}: each preset is measured with every
     combination."""
-    split: Literal["train", "val", "bench"] = "val"
-    """bench: frozen people of data=synthetic."""
+    split: Literal["train", "val", "bench", "sealed"] = "val"
+    """bench, sealed: frozen people of data=synthetic."""
     subjects: Count | None = 4
     """Number of subjects, the first of the split; null: all."""
     timing: Timing = Timing()

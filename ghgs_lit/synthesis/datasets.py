@@ -132,31 +132,32 @@ class _Generated(_Renderable):
 
     @property
     def split_names(self) -> tuple[str, ...]:
-        return (*PHASES, bench.SPLIT)
+        return (*PHASES, *bench.SPLITS)
 
     def split_facts(self, split: str) -> dict[str, str]:
-        return super().split_facts(split) | (bench.facts() if split == bench.SPLIT else {})
+        return super().split_facts(split) | (bench.facts(split) if split in bench.SPLITS else {})
 
     @property
     def source_of_people(self) -> SyntheticSource:
         return SyntheticSource(_PEOPLE_SEED)
 
     def subject_names(self, phase: str) -> list[str]:
-        if phase == bench.SPLIT:
-            return bench.names()
+        if phase in bench.SPLITS:
+            return bench.names(phase)
         first = 0 if phase == "train" else FIRST_VAL
         numbers = (("p", getattr(self.people, phase)), (ACTIVE, getattr(self.active, phase)))
         return [f"{kind}{first + i:07d}" for kind, count in numbers for i in range(count)]
 
     def prepare(self, splits: Sequence[str] = PHASES) -> None:
-        """Render the people of ``splits`` that the cache lacks. InputError: the people of ``bench`` are not
-        those of its definition (:mod:`.bench`)."""
-        if bench.SPLIT in splits:
+        """Render the people of ``splits`` that the cache lacks. InputError: frozen people are not those
+        of their definition (:mod:`.bench`)."""
+        frozen = [split for split in splits if split in bench.SPLITS]
+        for split in frozen:
             made_with = everything(self.camera_rig(), self.render)
-            bench.check_settings({"people_seed": _PEOPLE_SEED, **made_with})
+            bench.check_settings(split, {"people_seed": _PEOPLE_SEED, **made_with})
         self.render_first({phase: self.subject_names(phase) for phase in splits})
-        if bench.SPLIT in splits:
-            bench.check_photographs(self.reader(bench.SPLIT))
+        for split in frozen:
+            bench.check_photographs(split, self.reader(split))
 
     def render_first(self, names: Mapping[str, Sequence[str]]) -> None:
         """Render these people, by phase."""

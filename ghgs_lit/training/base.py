@@ -107,3 +107,5 @@ class BudgetedModule(L.LightningModule):
         """Add plain data only, so that the file loads with ``torch.load(weights_only=True)``."""
         checkpoint["format_version"] = FORMAT_VERSION
         checkpoint["config"] = self.config
+        parameters = self.model.named_parameters()
+        checkpoint["frozen"] = [f"model.{name}" for name, p in parameters if not p.requires_grad]

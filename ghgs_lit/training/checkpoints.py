@@ -15,6 +15,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from ghgs_lit.config.options import Index, Options, Positive, Text
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
+from ghgs_lit.weights import frozen
 
 _PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")
 
@@ -36,19 +37,25 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     Lightning's own class writes into the system's temporary folder and *moves* the file: between file
     systems that copies over the previous checkpoint, and a run that is killed meanwhile has lost both.
+    Weights that do not train are written once, beside them (:mod:`ghgs_lit.weights.frozen`).
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._frozen = frozen.Frozen()
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any | None = None
     ) -> None:
         """Replace the file at ``path`` as a whole; ``storage_options`` are not used."""
-        write_atomically(path, lambda temporary: torch.save(checkpoint, temporary))
+        content = self._frozen.stored(checkpoint, Path(path).absolute().parent)
+        write_atomically(path, lambda temporary: torch.save(content, temporary))
 
     def load_checkpoint(
         self, path: str | os.PathLike, map_location: Any = "cpu", weights_only: bool | None = True
     ) -> dict[str, Any]:
         """Tensors and plain data only, whatever the default of the installed PyTorch is."""
-        content = torch.load(path, map_location=map_location, weights_only=True)
+        content = frozen.joined(path, torch.load(path, map_location=map_location, weights_only=True))
         content.setdefault("pytorch-lightning_version", L.__version__)
         return content
 
@@ -141,10 +148,13 @@ class Checkpoints(ModelCheckpoint):
         def here(path: str) -> str:
             return str(folder / Path(path).name) if path else path
 
-        for path in map(Path, state["best_k_models"]):
+        best = [Path(path) for path in state["best_k_models"]]
+        # Frozen weights before the checkpoints that refer to them.
+        shared = {file for path in best for file in path.parent.glob(frozen.PATTERN)}
+        for path in [*shared, *best]:
             target = folder / path.name
             if path.exists() and not target.exists():
                 write_atomically(target, lambda temporary, source=path: shutil.copyfile(source, temporary))
         moved = {name: here(state.get(name, "")) for name in _PATHS}
-        best = {here(path): score for path, score in state["best_k_models"].items()}
-        return {**state, **moved, "best_k_models": best, "dirpath": self.dirpath}
+        scores = {here(path): score for path, score in state["best_k_models"].items()}
+        return {**state, **moved, "best_k_models": scores, "dirpath": self.dirpath}

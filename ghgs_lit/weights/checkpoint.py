@@ -12,10 +12,11 @@ from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
+from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import file_of, open_file
 
-#: Version of the checkpoints that are written; earlier ones are read too.
+#: Version of checkpoints that are whole by themselves; earlier ones are read too.
 FORMAT_VERSION = 2
 
 #: Prefix of the model's tensors in the state of a LightningModule.
@@ -27,7 +28,7 @@ _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
-    """Read a checkpoint of this package.
+    """Read a checkpoint of this package, with frozen weights that it shares with others (:mod:`.frozen`).
 
     Args:
         path: the file; its tensors are mapped from the disk, not read.
@@ -35,7 +36,8 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        InputError: the file is not a checkpoint of this package; names what was expected and found.
+        InputError: the file is not a checkpoint of this package, or its frozen weights are missing; names
+            what was expected and found.
     """
     _check_sums(path, whole)
     checkpoint = open_file(path)
@@ -47,11 +49,12 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
                 f"{path}: expected a checkpoint with {key!r}; found {describe(checkpoint)}{hint}"
             )
     version = checkpoint["format_version"]
-    if not 1 <= version <= FORMAT_VERSION:
-        newer = ", of a newer version of this package" if version > FORMAT_VERSION else ""
-        raise InputError(f"{path}: expected format_version 1 to {FORMAT_VERSION}; found {version}{newer}")
+    if not 1 <= version <= SHARING:
+        newer = ", of a newer version of this package" if version > SHARING else ""
+        raise InputError(f"{path}: expected format_version 1 to {SHARING}; found {version}{newer}")
+    checkpoint = joined(path, checkpoint, whole)
     _check_content(path, checkpoint)
-    return dict(checkpoint)
+    return checkpoint
 
 
 def _check_content(path: str | Path, checkpoint: Mapping[str, Any]) -> None:

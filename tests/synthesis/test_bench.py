@@ -13,30 +13,35 @@ from ghgs_lit.synthesis import bench, datasets
 from ghgs_lit.synthesis.jobs import RenderOptions, SyntheticSource, render_people
 from ghgs_lit.synthesis.rig import Rig
 
-#: The first and the last of them.
-SOME = (bench.names()[0], bench.names()[-1])
+#: The first and the last of each split.
+SOME = {split: (bench.names(split)[0], bench.names(split)[-1]) for split in bench.SPLITS}
 
 
-def render(root, size):
+def render(root, split, size):
     """Some of the people, as defined."""
     settings = RenderOptions(size=size, positions=bench.POSITIONS, views=(0,))
-    render_people(root, {"bench": SOME}, SyntheticSource(0), Rig(height=None), settings, 0, workers=0)
-    return root
+    names = {split: SOME[split]}
+    render_people(root, names, SyntheticSource(0), Rig(height=None), settings, 0, workers=0)
+    return Layout(root, split, SOME[split])
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    return render(tmp_path_factory.mktemp("bench"), bench.definition()["size"])
+    root = tmp_path_factory.mktemp("bench")
+    render(root, "bench", bench.definition("bench")["size"])
+    return root
 
 
-def test_the_people_look_as_they_were_published(rendered):
+def test_the_people_look_as_they_were_published(rendered, tmp_path):
     """If this fails, the people have changed: results on them need another version of the definition."""
-    bench.check_photographs(Layout(rendered, "bench", SOME))
+    bench.check_photographs("bench", Layout(rendered, "bench", SOME["bench"]))
+    bench.check_photographs("sealed", render(tmp_path, "sealed", bench.definition("sealed")["size"]))
 
 
-def test_other_sizes_are_the_same_people(tmp_path):
-    """The set is measured at 140 and 252 pixels, and tried at fewer."""
-    bench.check_photographs(Layout(render(tmp_path, bench.LEAST), "bench", SOME))
+@pytest.mark.parametrize("split", bench.SPLITS)
+def test_other_sizes_are_the_same_people(tmp_path, split):
+    """The sets are measured at 140 and 252 pixels, and tried at fewer."""
+    bench.check_photographs(split, render(tmp_path, split, bench.LEAST))
 
 
 def test_another_person_is_refused_by_name(rendered, tmp_path):
@@ -45,19 +50,38 @@ def test_another_person_is_refused_by_name(rendered, tmp_path):
     shutil.copytree(rendered, root)
     for kind in ("img", "mask"):
         folder = root / "bench" / kind
-        shutil.rmtree(folder / position_name(SOME[1], 8))
-        shutil.copytree(folder / position_name(SOME[0], 8), folder / position_name(SOME[1], 8))
-    with pytest.raises(InputError, match=f"expected {SOME[1]} of split=bench"):
-        bench.check_photographs(Layout(root, "bench", SOME))
+        first, last = (folder / position_name(name, 8) for name in SOME["bench"])
+        shutil.rmtree(last)
+        shutil.copytree(first, last)
+    with pytest.raises(InputError, match=f"expected {SOME['bench'][1]} of split=bench"):
+        bench.check_photographs("bench", Layout(root, "bench", SOME["bench"]))
 
 
-def test_nobody_trains_on_them():
-    """Their numbers are beyond those of any training or validation person; forty different ones."""
-    assert len(set(bench.names())) == len(bench.thumbnails()) == 40
-    assert int(bench.names()[0][1:]) >= 2 * datasets.FIRST_VAL
-    flat = bench.thumbnails().reshape(40, -1).astype(float)
+@pytest.mark.parametrize(("split", "count"), [("bench", 40), ("sealed", 16)])
+def test_the_people_are_different_ones(split, count):
+    """So many, told apart by what is stored of them."""
+    assert len(set(bench.names(split))) == len(bench.thumbnails(split)) == count
+    flat = bench.thumbnails(split).reshape(count, -1).astype(float)
     apart = np.sqrt(np.square(flat[:, None] - flat).mean(-1))
-    assert apart[~np.eye(40, dtype=bool)].min() > 1.3 * bench.OTHER_SIZE
+    assert apart[~np.eye(count, dtype=bool)].min() > 1.3 * bench.OTHER_SIZE
+
+
+@pytest.mark.parametrize("name", ["synthetic", "people_in_rig"])
+def test_nobody_trains_on_them(name):
+    """The greatest numbers of people that a configuration allows reach neither set, nor one set the other."""
+    most = datasets.FIRST_VAL - 1
+    data = datasets.Synthetic if name == "synthetic" else datasets.PeopleInRig
+    data = data.model_construct(
+        people=datasets.People(train=most, val=most),
+        active=datasets.ActivePeople(train=most, val=most),
+        motion=0,
+    )
+    last = max(int(person[1:]) for phase in ("train", "val") for person in data.subject_names(phase))
+    sets = [{int(person[1:]) for person in bench.names(split)} for split in bench.SPLITS]
+    assert last < min(set.union(*sets))
+    assert not set.intersection(*sets)
+    with pytest.raises(InputError, match=r"train: expected .* < 1000000"):
+        datasets.People.read({"train": datasets.FIRST_VAL}, "data.people")
 
 
 def synthetic(tmp_path, *overrides):
@@ -83,22 +107,23 @@ def test_another_definition_is_refused_before_anything_is_rendered(tmp_path, ove
     assert not list(tmp_path.iterdir())
 
 
-def test_only_the_split_that_is_measured_is_rendered(tmp_path, monkeypatch):
+@pytest.mark.parametrize("split", bench.SPLITS)
+def test_only_the_split_that_is_measured_is_rendered(tmp_path, monkeypatch, split):
     """Forty people take minutes, sixty-four of the training more; the size is free."""
     asked = []
     monkeypatch.setattr(datasets, "render_people", lambda root, names, *rest: asked.append(names))
-    monkeypatch.setattr(bench, "check_photographs", lambda reader: None)
+    monkeypatch.setattr(bench, "check_photographs", lambda split, reader: None)
     monkeypatch.setattr(datasets.Synthetic, "reader", lambda self, phase: None)
     data = synthetic(tmp_path, "data.size=252")
-    data.prepare_data(["bench"])
+    data.prepare_data([split])
     data.prepare_data(["val"])
     data.prepare_data()
-    assert [list(names) for names in asked] == [["bench"], ["val"], ["train", "val"]]
-    assert asked[0]["bench"] == bench.names()
+    assert [list(names) for names in asked] == [[split], ["val"], ["train", "val"]]
+    assert asked[0][split] == bench.names(split)
     with pytest.raises(InputError, match=r"split: expected .*bench"):
         data.prepare_data(["bensch"])
-    assert "version 1" in data.dataset.split_facts("bench")["bench"]
-    assert "bench" not in data.dataset.split_facts("val")
+    assert "version 1" in data.dataset.split_facts(split)[split]
+    assert split not in data.dataset.split_facts("val")
 
 
 def test_thumbnails_are_means_of_photograph_and_mask():

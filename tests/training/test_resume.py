@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 
 import lightning.pytorch as L
@@ -17,6 +18,8 @@ from ghgs_lit.training.loggers import CsvLog, TensorBoardLog
 from ghgs_lit.training.loggers import resume as resume_logs
 from ghgs_lit.training.start import check_resume, check_start, differences
 from ghgs_lit.training.validation_pictures import PicturesOptions
+from ghgs_lit.weights import frozen
+from ghgs_lit.weights.checkpoint import read_checkpoint
 from tests.helpers.losses import losses_of
 from tests.helpers.training import Standin, StepData, _Steps, flat_renderer
 
@@ -52,7 +55,7 @@ def module() -> GHGSModule:
     return GHGSModule(Standin(), flat_renderer, losses, optimization, CONFIG)
 
 
-def fit(folder, cut: Cut, resume=None, every=3, more=(), **options):
+def fit(folder, cut: Cut, resume=None, every=3, more=(), subject=None, **options):
     torch.manual_seed(11 if resume else 12)  # what the process drew before must not matter
     best = CheckpointOptions(filename="best", monitor="val/psnr").build()
     last = CheckpointOptions(filename="last", every_n_train_steps=every).build()
@@ -67,7 +70,7 @@ def fit(folder, cut: Cut, resume=None, every=3, more=(), **options):
     )  # fmt: skip
     if resume is not None:
         resume_logs(trainer.loggers, torch.load(resume, weights_only=True)["global_step"])
-    subject = module()
+    subject = subject or module()
     trainer.fit(subject, StepData(), ckpt_path=resume)
     return subject
 
@@ -167,6 +170,36 @@ def test_a_run_that_resumes_elsewhere_takes_its_best_along(whole, tmp_path):
         fit(tmp_path / "a", Cut(13))
     fit(tmp_path / "b", Cut(), resume=tmp_path / "a" / "checkpoints" / "last.ckpt")
     assert score(tmp_path / "b") == score(folder)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_run_with_frozen_weights_resumes_from_one_file_of_them(tmp_path, monkeypatch, elsewhere):
+    """Killed and resumed, also in another folder when the first is gone: weights as of a run in one piece."""
+
+    def half_frozen():
+        subject = module()
+        subject.model.depth.requires_grad_(False)
+        return subject
+
+    monkeypatch.setattr(frozen, "OWN", 0)
+    expected = fit(tmp_path / "whole", Cut(), subject=half_frozen())
+    with pytest.raises(PowerCut):
+        fit(tmp_path / "a", Cut(10), subject=half_frozen())
+    last = tmp_path / "a" / "checkpoints" / "last.ckpt"
+    assert list(torch.load(last, weights_only=True)["state_dict"]) == ["model.shift"]
+    target = tmp_path / ("b" if elsewhere else "a")
+    subject = fit(target, Cut(), resume=last, subject=half_frozen())
+    assert torch.equal(subject.model.shift, expected.model.shift)
+    assert torch.equal(subject.model.depth, module().model.depth)
+    if elsewhere:
+        shutil.rmtree(tmp_path / "a")
+    (kept,) = (target / "checkpoints").glob(frozen.PATTERN)
+    assert torch.load(kept, weights_only=True) == {"model.depth": subject.model.depth.detach()}
+    for name in ("best", "last"):
+        assert read_checkpoint(target / "checkpoints" / f"{name}.ckpt", whole=True)["state_dict"].keys() == {
+            "model.depth",
+            "model.shift",
+        }
 
 
 def test_time_that_was_used_stays_used(tmp_path):

@@ -16,6 +16,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION
+from ghgs_lit.weights.frozen import SHARING
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import make_batch
 
@@ -68,7 +69,7 @@ class Foreign:
         ({"config": None}, "'config'"),
         ({"state_dict": None}, "'state_dict'"),
         ({"format_version": None}, "'format_version'"),
-        ({"format_version": FORMAT_VERSION + 1}, "of a newer version"),
+        ({"format_version": SHARING + 1}, "of a newer version"),
         ({"format_version": 0}, "format_version 1 to"),
         ({"config": {"encoder": {}}}, "bounds"),
         (

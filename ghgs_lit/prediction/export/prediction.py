@@ -25,7 +25,7 @@ from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, e
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
-from ghgs_lit.types import Batch, Prediction
+from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
 
 #: The picture to look at.
@@ -63,7 +63,7 @@ class Format:
 
 
 def _converted(name: str) -> Format:
-    contents = _one(lambda s: converted(ply_bytes(s.for_other_renderers), name))
+    contents = _of_viewers(lambda gaussians: converted(ply_bytes(gaussians), name))
     return Format((f"gaussians.{CONVERTED[name]}",), contents, "gaussforge")
 
 
@@ -72,11 +72,18 @@ def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubje
     return lambda subject: [partial(content, subject)]
 
 
+def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubject], list]:
+    """The same of the Gaussians for other viewers, which are made once, before any thread begins."""
+    return lambda subject: [partial(content, subject.for_other_renderers)]
+
+
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
     **{name: _converted(name) for name in CONVERTED},
-    "splat": Format(("gaussians.splat",), _one(lambda s: to_records(s.for_other_renderers).tobytes())),
-    "glb": Format(("gaussians.glb",), _one(lambda s: glb_bytes(s.for_other_renderers, s.up)), "pygltflib"),
+    "splat": Format(("gaussians.splat",), _of_viewers(lambda g: to_records(g).tobytes())),
+    "glb": Format(
+        ("gaussians.glb",), lambda s: [partial(glb_bytes, s.for_other_renderers, s.up)], "pygltflib"
+    ),
     "html": Format(
         ("viewer.html",),
         _one(lambda s: page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()),

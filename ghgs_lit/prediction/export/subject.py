@@ -14,6 +14,7 @@ from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
+from ghgs_lit.prediction.refinement import Change, Descent
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
@@ -23,6 +24,12 @@ from ghgs_lit.visualization.turntable import center_of, pixel_size, subject_poin
 VIEWER_LOW_PASS = 0.3
 #: The least standard deviation of a Gaussian in pixels.
 _SMALLEST = 1e-3
+#: How Gaussians for other viewers are brought nearer to ours: what may change, steps, and cameras around the
+#: subject beside the inputs, of which two take part in a step.
+_FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
+_FIT_STEPS, _AROUND, _AT_ONCE = 32, 8, 2
+#: Of L1, 1 - SSIM, which would take half of the time, and the silhouette.
+_WEIGHTS = (1.0, 0.0, 0.1)
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,25 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     return dataclasses.replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
 
 
+def fitted(
+    gaussians: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer
+) -> Gaussians:
+    """``gaussians`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
+
+    ``cameras``: sets of cameras [n], which take part in turn.
+    """
+    drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
+    search = Descent(gaussians, None, _FIT)
+    for step in range(_FIT_STEPS):
+        lap, among = divmod(step, len(cameras))
+        seen, wanted = cameras[among], drawn[among]
+        count = seen.extrinsics.shape[0]
+        # Far apart, so that the two see different sides.
+        views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
+        search.step(renderer, wanted.image[:, views], wanted.alpha[:, views], seen[views][None], _WEIGHTS)
+    return search.gaussians
+
+
 @dataclass(frozen=True)
 class ExportedSubject:
     """One subject. Lengths are in the unit of the cameras; ``up`` is the unit vector that points up.
@@ -124,10 +150,15 @@ class ExportedSubject:
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
-        """The Gaussians as files hold them that cannot say what image they were made for."""
+        """The Gaussians as files hold them that cannot say what image they were made for: brought nearer to
+        what ours draws from the inputs and from all around."""
         if self.options.smooth:
             return self.stored
-        return for_other_renderers(self.gaussians, self.pixel)
+        converted = for_other_renderers(self.gaussians, self.pixel)
+        if converted is self.gaussians or not len(converted):
+            return converted
+        around = turntable(self.cameras, _AROUND, self.body)
+        return fitted(converted, self.gaussians, (self.cameras, around), self.renderer)
 
     @cached_property
     def body(self) -> Float[Tensor, "n 3"]:

@@ -1,6 +1,6 @@
 """Seconds of optimisation through the rasterizer, from a prediction."""
 
 from ghgs_lit.prediction.refinement.cameras import CameraRefinement, pixels_moved
-from ghgs_lit.prediction.refinement.refinement import Change, Refinement, Report
+from ghgs_lit.prediction.refinement.refinement import Change, Descent, Refinement, Report
 
-__all__ = ["CameraRefinement", "Change", "Refinement", "Report", "pixels_moved"]
+__all__ = ["CameraRefinement", "Change", "Descent", "Refinement", "Report", "pixels_moved"]

@@ -68,16 +68,18 @@ class Descent:
 
     Args:
         gaussians: predicted from ``batch``, each at a pixel of an input.
+        batch: None where ``means`` are not changed.
         changes: what may change, as of :class:`Refinement`.
 
     Raises:
-        InputError: Gaussians that belong to no pixel.
+        InputError: means that belong to no pixel.
     """
 
-    def __init__(self, gaussians: Gaussians, batch: Batch, changes: Mapping[str, Change]):
-        require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
+    def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
         self.start, self.changes = gaussians.detach(), changes
-        self._footprint = _footprints(self.start, batch)
+        if "means" in changes:
+            require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
+            self._footprint = _footprints(self.start, batch)
         self._raw = {
             name: torch.zeros_like(getattr(self.start, name), requires_grad=True) for name in changes
         }
@@ -100,7 +102,7 @@ class Descent:
         weights: Weights = WEIGHTS,
     ) -> Rendering:
         """One step towards photographs on black and silhouettes; the renders that it follows from."""
-        with exact(self._footprint.device.type), torch.enable_grad():
+        with exact(self.start.means.device.type), torch.enable_grad():
             drawn = renderer(self._changed(), cameras, background=0.0)
             self._optimizer.zero_grad()
             _loss(drawn, photographs, silhouettes, weights).backward()

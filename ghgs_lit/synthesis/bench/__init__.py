@@ -1,10 +1,12 @@
-"""The people of ``data=synthetic split=bench``: nobody trains on them, and everybody measures the same ones.
+"""Frozen people of ``data=synthetic``: nobody trains on them, and everybody measures the same ones.
 
-``definition.json`` has what they are made from: numbers of the people, seed, cameras, lights, rays. The code
-that makes people may change, so ``thumbnails.npz`` has what they look like: 16 x 16 pixels of two photographs
-and masks of each person. These are compared within a tolerance, since processors round rays and JPEG files
-differently and people can be rendered at any size; a digest of the photographs would not hold. Whoever
-changes how people are made, so that these look different, bakes another version (``scripts/bake_bench.py``).
+``split=bench`` compares methods while they are made; ``split=sealed`` is for published figures: nothing is
+chosen by it. ``<split>.json`` has what they are made from: numbers of the people, seed, cameras, lights,
+rays. The code that makes people may change, so ``<split>.npz`` has what they look like: 16 x 16 pixels of two
+photographs and masks of each person. These are compared within a tolerance, since processors round rays and
+JPEG files differently and people can be rendered at any size; a digest of the photographs would not hold.
+Whoever changes how people are made, so that these look different, bakes another version
+(``scripts/bake_bench.py``).
 """
 
 import hashlib
@@ -23,7 +25,9 @@ from ghgs_lit.data.sampling import RING_VIEW
 from ghgs_lit.data.view import View
 from ghgs_lit.errors import InputError, require
 
-SPLIT = "bench"
+SPLITS = ("bench", "sealed")
+#: First letter of the names of people who stand or walk, and of those in poses of sport and dance.
+KINDS = {"people": "p", "active": "a"}
 FOLDER = Path(__file__).parent
 #: Ring positions of the photographs that are compared: front and back.
 POSITIONS = (0, 8)
@@ -36,38 +40,41 @@ LEAST = 56
 
 
 @cache
-def definition() -> dict[str, Any]:
-    """What the people are made from, as plain data."""
-    return json.loads((FOLDER / "definition.json").read_text())
+def definition(split: str) -> dict[str, Any]:
+    """What the people of one of ``SPLITS`` are made from, as plain data."""
+    return json.loads((FOLDER / f"{split}.json").read_text())
 
 
-def names() -> list[str]:
+def names(split: str) -> list[str]:
     """The subjects."""
-    first = definition()["first"]
-    return [f"p{first + i:07d}" for i in range(definition()["people"])]
+    made = definition(split)
+    return [
+        f"{letter}{made['first'] + i:07d}" for kind, letter in KINDS.items() for i in range(made.get(kind, 0))
+    ]
 
 
 @cache
-def thumbnails() -> np.ndarray:
+def thumbnails(split: str) -> np.ndarray:
     """[people, positions, SIDE, SIDE, 4] uint8: colours, and the mask."""
-    return np.load(FOLDER / "thumbnails.npz")["thumbnails"]
+    return np.load(FOLDER / f"{split}.npz")["thumbnails"]
 
 
 @cache
-def facts() -> dict[str, str]:
+def facts(split: str) -> dict[str, str]:
     """Version and digest, for results."""
-    digest = hashlib.sha256(json.dumps(definition(), sort_keys=True).encode() + thumbnails().tobytes())
-    return {"bench": f"version {definition()['version']}, {digest.hexdigest()[:12]}"}
+    made = json.dumps(definition(split), sort_keys=True).encode()
+    digest = hashlib.sha256(made + thumbnails(split).tobytes()).hexdigest()
+    return {split: f"version {definition(split)['version']}, {digest[:12]}"}
 
 
-def check_settings(settings: Mapping[str, Any]) -> None:
+def check_settings(split: str, settings: Mapping[str, Any]) -> None:
     """Refuse other settings than those of the definition. ``settings``: of ``data``, by key; those that the
     definition does not name are free, such as the size. InputError: names the first key that differs."""
     found = flatten(json.loads(json.dumps(settings)))  # tuples to lists
     size = max(settings["render"]["size"])
-    require(size >= LEAST, "data.size", f"{LEAST} pixels or more with split={SPLIT}", size)
-    for key, expected in flatten(definition()["data"]).items():
-        text = f"{expected}, with which split={SPLIT} (version {definition()['version']}) is defined"
+    require(size >= LEAST, "data.size", f"{LEAST} pixels or more with split={split}", size)
+    for key, expected in flatten(definition(split)["data"]).items():
+        text = f"{expected}, with which split={split} (version {definition(split)['version']}) is defined"
         require(found.get(key) == expected, f"data.{key}", text, found.get(key))
 
 
@@ -79,18 +86,18 @@ def thumbnail(view: View) -> np.ndarray:
     return np.stack([np.asarray(band) for band in bands], -1)
 
 
-def check_photographs(reader: Reader) -> None:
+def check_photographs(split: str, reader: Reader) -> None:
     """Refuse photographs of other people than those of the definition. ``reader``: of all of :func:`names`,
     or of some. InputError: names the first person whose photographs differ."""
-    known = dict(zip(names(), thumbnails(), strict=True))
+    made, known = definition(split), dict(zip(names(split), thumbnails(split), strict=True))
     for name in reader.subjects:
         for position, expected in zip(POSITIONS, known[name], strict=True):
             view = reader.read_view(name, position, RING_VIEW, depth=False)
             difference = float(np.sqrt(np.square(thumbnail(view).astype(float) - expected).mean()))
-            tolerance = SAME_SIZE if set(view.mask.shape) == {definition()["size"]} else OTHER_SIZE
+            tolerance = SAME_SIZE if set(view.mask.shape) == {made["size"]} else OTHER_SIZE
             if difference > tolerance:
                 raise InputError(
-                    f"{reader.place(name, position, RING_VIEW)}: expected {name} of split={SPLIT} (version "
-                    f"{definition()['version']}), up to {tolerance:g} of 255 levels; found {difference:.1f} "
+                    f"{reader.place(name, position, RING_VIEW)}: expected {name} of split={split} (version "
+                    f"{made['version']}), up to {tolerance:g} of 255 levels; found {difference:.1f} "
                     "(this version of the package makes other people, or the cache was changed: delete it)"
                 )

@@ -1,0 +1,95 @@
+"""Weights that do not train: the checkpoints of a run share one file of them, which lies beside them."""
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_atomically
+from ghgs_lit.weights.reading import file_of, open_file
+
+#: Bytes of frozen weights up to which each checkpoint holds its own, and so is whole by itself.
+OWN = 1 << 26
+#: Version of checkpoints that share a file: what reads version 2 alone would miss their tensors.
+SHARING = 3
+#: Names of the files.
+PATTERN = "frozen-*.pt"
+
+
+def digest_of(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of names, kinds and bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+class Frozen:
+    """Takes frozen tensors out of the checkpoints of a run, whose key ``frozen`` has their names."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[str, int, int]] = []
+        self._digest = ""
+
+    def stored(self, checkpoint: dict[str, Any], folder: Path) -> dict[str, Any]:
+        """``checkpoint`` with a reference in place of these tensors, which are then in a file in ``folder``;
+        as it is where they are few."""
+        state = checkpoint["state_dict"]
+        tensors = {name: state[name] for name in checkpoint.get("frozen", ())}
+        if sum(tensor.nbytes for tensor in tensors.values()) <= OWN:
+            return checkpoint
+        known = [(name, tensor.data_ptr(), tensor._version) for name, tensor in tensors.items()]
+        if known != self._known:  # they are digested again only where something wrote to them
+            self._known, self._digest = known, digest_of(tensors)
+        path = folder / PATTERN.replace("*", self._digest[:16])
+        if not path.exists():
+            _write(path, tensors)
+        return {
+            **checkpoint,
+            "state_dict": {name: value for name, value in state.items() if name not in tensors},
+            "frozen_file": {"name": path.name, "sha256": self._digest},
+            "format_version": SHARING,
+        }
+
+
+def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write the file, or link that of another run beside this one, as of a sweep."""
+    for twin in path.parent.parent.parent.glob(f"*/{path.parent.name}/{path.name}"):
+        with contextlib.suppress(OSError):  # some file systems have no links
+            return write_atomically(path, partial(os.link, twin))
+    write_atomically(path, partial(torch.save, dict(tensors)))
+
+
+def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
+    """``checkpoint``, which was read at ``path``, with the tensors of the file that it refers to, if any.
+
+    ``whole``: read every byte of these and refuse others than those that were written. InputError: there is
+    no such file beside the checkpoint, or it holds something else.
+    """
+    if "frozen_file" not in checkpoint:
+        return dict(checkpoint)
+    place, reference = f"{path}: frozen_file", checkpoint["frozen_file"]
+    fits = isinstance(reference, Mapping) and all(
+        isinstance(reference.get(k), str) for k in ("name", "sha256")
+    )
+    require(fits, place, "a mapping of name and sha256", reference)
+    name, sha256 = reference["name"], reference["sha256"]
+    require(Path(name).name == name, place, "the name of a file beside the checkpoint", name)
+    file = file_of(path).resolve().with_name(name)
+    if not file.is_file():
+        advice = "`ghgs export inference=<file>` makes one file of both"
+        raise InputError(f"{place}: expected its frozen weights {name} beside it ({advice}); found none")
+    tensors = open_file(file)
+    fits = isinstance(tensors, Mapping) and all(isinstance(value, Tensor) for value in tensors.values())
+    if not fits or list(tensors) != checkpoint.get("frozen") or (whole and digest_of(tensors) != sha256):
+        raise InputError(f"{place}: expected {file} with SHA-256 {sha256[:16]}... of weights; found others")
+    return {**checkpoint, "state_dict": {**tensors, **checkpoint["state_dict"]}}
