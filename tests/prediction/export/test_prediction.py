@@ -245,8 +245,8 @@ def test_other_viewers_draw_what_ours_draws(tmp_path):
 
 
 def test_other_viewers_see_the_inputs_as_ours_does():
-    """Better than scales and opacities alone make it; between the inputs these discs, whose colours are drawn at
-    random, lose less than 1 dB; places and rotations stay."""
+    """Better than scales and opacities alone make it; between the inputs these discs, whose colours are
+    drawn at random, lose less than 1 dB; places and rotations stay."""
     batch, prediction = made_for_thin_pixels()
     ours = prediction.gaussians
     subject = exported_subject(batch, prediction, Renderer(), OutputOptions())
