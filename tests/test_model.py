@@ -43,7 +43,7 @@ class GivenTokens(nn.Module):
         image, row, column = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         self.tokens = Tokens(latent, inputs["dino"].flatten(0, 1), image, row, column, (1, 3, 5, 5), 14)
 
-    def forward(self, images, masks, bounds, cache, kept):
+    def forward(self, images, masks, bounds, kept):
         return self.tokens
 
 

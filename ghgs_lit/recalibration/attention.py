@@ -207,7 +207,7 @@ class SemanticAttention(nn.Module):
 
     def _factor_and_bias(self, cosines: Float[Tensor, "m k"] | None) -> tuple[Tensor, Tensor]:
         """What logits are multiplied by, and what is added to them."""
-        one = torch.ones((), device=cosines.device if cosines is not None else None)
+        one = torch.ones((), device=self.q_proj.weight.device)
         if cosines is None:
             return one, one * 0
         if self.similarity == "log":

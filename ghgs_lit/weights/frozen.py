@@ -43,7 +43,7 @@ class Frozen:
     def stored(self, checkpoint: dict[str, Any], folder: Path) -> dict[str, Any]:
         """``checkpoint`` with a reference in place of these tensors, which are then in a file in ``folder``;
         as it is where they are few."""
-        state = checkpoint["state_dict"]
+        state = checkpoint.get("state_dict", {})
         tensors = {name: state[name] for name in checkpoint.get("frozen", ())}
         if sum(tensor.nbytes for tensor in tensors.values()) <= OWN:
             return checkpoint

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from ghgs_lit.encoder import cpu
-from ghgs_lit.kernels.watching import Watcher
+from ghgs_lit.kernels.watching import Inputs, Watcher
 
 #: PyTorch's attention on a CPU, which its own counter does not know.
 _CPU_ATTENTION = {
@@ -35,7 +35,7 @@ class FlopsProbe(Watcher):
         self._open: list[int] = []
         self._stack = ExitStack()
 
-    def begin(self, stage: str) -> None:
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
         self._open.append(self._so_far())
 
     def end(self, stage: str, result: Any = None) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from ghgs_lit.kernels.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
-from ghgs_lit.kernels.watching import Watcher
+from ghgs_lit.kernels.watching import Inputs, Watcher
 
 
 class PeakProbe(Watcher):
@@ -21,7 +21,7 @@ class PeakProbe(Watcher):
         self._open: list[str] = []
         self._base = 0
 
-    def begin(self, stage: str) -> None:
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
         if self.is_available:
             if self._open:
                 self._note()
