@@ -1,9 +1,7 @@
 """An interrupted run resumes to the same weights, logs and best checkpoint; its files stay complete."""
 
 import csv
-import os
 import shutil
-import signal
 
 import lightning.pytorch as L
 import pytest
@@ -225,40 +223,6 @@ def test_time_that_was_used_stays_used(tmp_path):
     assert seen[-1] == pytest.approx((STEPS - 1) / STEPS)
 
 
-def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
-    """A kill in the middle of writing costs neither the previous checkpoint nor disk space."""
-    path, files = tmp_path / "last.ckpt", AtomicCheckpointIO()
-    files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
-    child = os.fork()
-    if child == 0:
-
-        def half(content, path):
-            path.write_bytes(b"half a checkpoint")
-            os.kill(os.getpid(), signal.SIGKILL)
-
-        monkeypatch.setattr(torch, "save", half)
-        files.save_checkpoint({"step": 2}, path)
-        os._exit(0)
-    _, status = os.waitpid(child, 0)
-    assert os.WIFSIGNALED(status)
-    assert os.WTERMSIG(status) == signal.SIGKILL
-    assert files.load_checkpoint(path)["step"] == 1
-    monkeypatch.undo()
-    files.save_checkpoint({"step": 3}, path)
-    assert files.load_checkpoint(path)["step"] == 3
-    assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
-
-
-def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
-    """After a power cut the file has its content: it is synced before it gets its name."""
-    calls = []
-    for name in ("fsync", "replace"):
-        real = getattr(os, name)
-        monkeypatch.setattr(os, name, lambda *a, _n=name, _r=real: (calls.append(_n), _r(*a)))
-    AtomicCheckpointIO().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
-    assert calls == ["fsync", "replace", "fsync"]
-
-
 def test_a_checkpoint_of_another_model_is_refused_by_its_tensor(tmp_path):
     """Resuming needs the same model and the state of the optimizer; changed settings are reported."""
 
@@ -386,13 +350,6 @@ def test_one_way_to_start(tmp_path):
     check_start({"resume": None, "init_from": "a.ckpt"}, tmp_path)
 
 
-@pytest.mark.parametrize("minutes", [0, -1.0])
-def test_minutes_are_positive(minutes):
-    """An impossible interval is refused with its key."""
-    with pytest.raises(InputError, match="minutes"):
-        CheckpointOptions(filename="last", minutes=minutes)
-
-
 @pytest.mark.parametrize(
     ("minutes", "steps", "saved"), [(1e-6, 1000, STEPS), (1000, 5, 15), (1000, 1000, None)]
 )
@@ -402,17 +359,3 @@ def test_minutes_and_steps_both_count(tmp_path, minutes, steps, saved):
     fit(tmp_path, Cut(), every=1000, more=[by_both])
     path = tmp_path / "checkpoints" / "both.ckpt"
     assert (torch.load(path, weights_only=True)["global_step"] if path.exists() else None) == saved
-
-
-def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):
-    """Its score would keep every later one from being written."""
-    path = tmp_path / "best.ckpt"
-    before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
-    before.dirpath = after.dirpath = str(tmp_path)
-    before.best_model_path, before.best_model_score = str(path), torch.tensor(30.0)
-    before.best_k_models = {str(path): torch.tensor(30.0)}
-    after.load_state_dict(before.state_dict())
-    assert (after.best_model_path, after.best_model_score, after.best_k_models) == ("", None, {})
-    path.touch()
-    after.load_state_dict(before.state_dict())
-    assert (after.best_model_path, after.best_model_score) == (str(path), 30)

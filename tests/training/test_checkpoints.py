@@ -1,0 +1,65 @@
+"""Checkpoints as files: written whole or not at all, when they are due, and which is the best."""
+
+import os
+import signal
+
+import pytest
+import torch
+
+from ghgs_lit.errors import InputError
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO, CheckpointOptions
+
+
+def test_kill_while_writing_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    """A kill in the middle of writing costs neither the previous checkpoint nor disk space."""
+    path, files = tmp_path / "last.ckpt", AtomicCheckpointIO()
+    files.save_checkpoint({"step": 1, "weights": torch.arange(1000.0)}, path)
+    child = os.fork()
+    if child == 0:
+
+        def half(content, path):
+            path.write_bytes(b"half a checkpoint")
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        monkeypatch.setattr(torch, "save", half)
+        files.save_checkpoint({"step": 2}, path)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    assert files.load_checkpoint(path)["step"] == 1
+    monkeypatch.undo()
+    files.save_checkpoint({"step": 3}, path)
+    assert files.load_checkpoint(path)["step"] == 3
+    assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_the_rename_comes_after_the_disk_has_all(tmp_path, monkeypatch):
+    """After a power cut the file has its content: it is synced before it gets its name."""
+    calls = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, _n=name, _r=real: (calls.append(_n), _r(*a)))
+    AtomicCheckpointIO().save_checkpoint({"step": 1}, tmp_path / "a.ckpt")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+@pytest.mark.parametrize("minutes", [0, -1.0])
+def test_minutes_are_positive(minutes):
+    """An impossible interval is refused with its key."""
+    with pytest.raises(InputError, match="minutes"):
+        CheckpointOptions(filename="last", minutes=minutes)
+
+
+def test_a_best_checkpoint_that_is_gone_is_found_again(tmp_path):
+    """Its score would keep every later one from being written."""
+    path = tmp_path / "best.ckpt"
+    before, after = (CheckpointOptions(filename="best", monitor="val/psnr").build() for _ in range(2))
+    before.dirpath = after.dirpath = str(tmp_path)
+    before.best_model_path, before.best_model_score = str(path), torch.tensor(30.0)
+    before.best_k_models = {str(path): torch.tensor(30.0)}
+    after.load_state_dict(before.state_dict())
+    assert (after.best_model_path, after.best_model_score, after.best_k_models) == ("", None, {})
+    path.touch()
+    after.load_state_dict(before.state_dict())
+    assert (after.best_model_path, after.best_model_score) == (str(path), 30)
