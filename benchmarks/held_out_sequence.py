@@ -122,7 +122,7 @@ class Measured:
     ) -> list[np.ndarray]:
         """The columns [n, 8] of a held-out camera, for each of some ``every`` of :class:`Temporal`."""
         known: dict[str, tuple[Prediction, float]] = {}
-        spent = 0.0
+        rig, spent = self.kept("shared", self.shared)[1], 0.0
 
         def predict(batch: Batch) -> Prediction:
             """As in the run before, with the seconds that it took there."""
@@ -143,7 +143,7 @@ class Measured:
                 anew, begin, spent = temporal.anew, time.process_time(), before
                 others = [other for other in range(batch.images.shape[1]) if other != view]
                 seen = batch.of_views(others)
-                gaussians = temporal(self.divided(seen) if gains == "once" else seen).gaussians
+                gaussians = temporal(with_gains_of(rig, seen) if gains == "once" else seen).gaussians
                 seconds = time.process_time() - begin + spent
                 drawn = self.renderer(gaussians, _halved(lenses[view], batch, view, truth))
                 values, pair = compared(drawn.image[0, 0].clamp(0, 1), drawn.alpha[0, 0], truth)
@@ -151,12 +151,6 @@ class Measured:
                 rows.append([*values, np.nan, np.nan, temporal.anew - anew, seconds])
             found.append(with_flicker(rows, errors))
         return found
-
-    def divided(self, batch: Batch) -> Batch:
-        """Photographs divided by the rig's gains, whose mean over these cameras is 1."""
-        rig = self.kept("shared", self.shared)[1]
-        logs = np.log([rig.gains[name] for name in batch.views[0]])
-        return divided(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
 
     def black(self, view: int) -> np.ndarray:
         rows, errors = [], []
@@ -166,6 +160,15 @@ class Measured:
             errors.append((*pair, truth["mask"]))
             rows.append([*values, np.nan, np.nan, np.nan, np.nan])
         return with_flicker(rows, errors)
+
+
+def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
+    """Photographs divided by the rig's gains, whose mean over these cameras is 1; as they are where it has
+    none."""
+    if not rig or not rig.gains:
+        return batch
+    logs = np.log([rig.gains[name] for name in batch.views[0]])
+    return divided(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
 
 
 def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> tuple[list[float], tuple]:
