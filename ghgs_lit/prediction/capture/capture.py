@@ -62,6 +62,5 @@ class Capture:
             views=(tuple(crop.name for crop in crops),),
         )
         gains = [crop.gains for crop in crops]
-        if any(values is None for values in gains):
-            return batch
-        return divided(batch, torch.from_numpy(np.log(gains)).float()[None])
+        known = all(values is not None for values in gains)
+        return divided(batch, torch.from_numpy(np.log(gains)).float()[None]) if known else batch

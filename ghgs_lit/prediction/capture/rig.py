@@ -63,9 +63,8 @@ class Rig:
         return dataclasses.replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
 
     def _zoomed(self, name: str, intrinsics: np.ndarray) -> np.ndarray:
-        intrinsics = intrinsics.copy()
-        intrinsics[[0, 1], [0, 1]] *= self.zoom.get(name, 1.0)
-        return intrinsics
+        zoom = self.zoom.get(name, 1.0)
+        return intrinsics * [zoom, zoom, 1.0]
 
     def calibrations(
         self, folder: CaptureFolder, captures: Sequence[Capture]
