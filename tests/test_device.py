@@ -9,6 +9,7 @@ from lightning.pytorch.accelerators import Accelerator
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch.utils.data import DataLoader
 
+from benchmarks import device as device_counts
 from ghgs_lit.cli import predict
 from ghgs_lit.config import conf_dir
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
@@ -269,3 +270,26 @@ def test_a_planted_defect_is_caught(defect, said):
             model, batch = model.to(DEVICE), batch.to(DEVICE)
             with pytest.raises((RuntimeError, TypeError), match=said):
                 model(batch)
+
+
+def test_calls_and_waits_are_counted_by_stage(monkeypatch, capsys):
+    """The counts of a prediction and of a training step that the guide of GPUs shows."""
+    small = [
+        "device.py",
+        "model=recurrent",
+        "rounds.slopes=true",
+        "--batches",
+        "1",
+        "--views",
+        "2",
+        "--size",
+        "28",
+    ]
+    monkeypatch.setattr("sys.argv", small)
+    device_counts.main()
+    rows = {
+        line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line.strip()
+    }
+    for stage in ("bounds", "encoder", "depth_head", "gaussian_head", "rounds", "backward", "optimizer"):
+        calls, launches, _ = map(int, rows[stage])
+        assert calls > launches > 0
