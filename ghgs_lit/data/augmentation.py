@@ -6,11 +6,12 @@ A batch is a function of (seed, step, index) alone, as its samples are, so that 
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from ghgs_lit.config import options
@@ -26,6 +27,8 @@ _SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
 HOLE = 0.12
 
 Size = tuple[int, int]
+Stops = Annotated[float, Field(ge=0, le=16)]
+Pixels = Annotated[float, Field(ge=0, le=64)]
 
 
 class Augmentation(Options):
@@ -44,16 +47,16 @@ class Augmentation(Options):
     data.target_size, as photographs that are enlarged teach blur."""
     chance: Share = 1.0
     """Share of the steps whose inputs are imperfect in the ways below."""
-    exposure: Amount = 0.0
-    """Stops: greatest deviation of single cameras."""
-    white_balance: Amount = 0.0
+    exposure: Stops = 0.0
+    """Stops: greatest deviation of single cameras; 16 are from black to white."""
+    white_balance: Stops = 0.0
     """Stops: greatest deviation of red and of blue of single cameras."""
-    mask_offset: Amount = 0.0
-    """Pixels that masks grow or shrink by at most; inputs are then black outside their masks."""
-    mask_ragged: Amount = 0.0
+    mask_offset: Pixels = 0.0
+    """Pixels that masks grow or shrink by at most; inputs are then black outside them."""
+    mask_ragged: Pixels = 0.0
     """Pixels: greatest height of bumps of the outlines of masks."""
-    mask_hole_chance: Amount = 0.0
-    """How often a piece of a mask is missing, of a diameter of up to 0.12 of the subject's height, 0 to 1."""
+    mask_hole_chance: Share = 0.0
+    """How often a piece of a mask is missing, of a diameter of up to 0.12 of the subject's height."""
     background: Share = 0.0
     """Share of samples with wrong masks that were taken before a background, which a mask that is too large
     shows; behind the others it is black."""
