@@ -104,6 +104,8 @@ class StoredCamera:
         expected = f"{', '.join(map(str, counts))} distortion coefficients"
         require(len(self.distortion) in counts, self.origin, expected, len(self.distortion))
         require(bool(np.isfinite(self.distortion).all()), self.origin, "finite distortion", "NaN or infinity")
+        positive = self.size is None or min(self.size) > 0
+        require(positive, self.origin, "a width and a height above 0", self.size)
 
 
 @dataclass(frozen=True)
@@ -153,9 +155,19 @@ def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
     """World to camera [4, 4] with OpenCV axes, of a stored pose."""
     if convention.extrinsics == "camera_to_world":
         pose = np.linalg.inv(pose)
-    extrinsics = _FLIP @ pose if convention.axes == "opengl" else pose.copy()
+    extrinsics = _FLIP @ _rigid(pose) if convention.axes == "opengl" else _rigid(pose)
     extrinsics[:3, 3] *= convention.unit
     return extrinsics
+
+
+def _rigid(pose: np.ndarray) -> np.ndarray:
+    """World to camera with the nearest rotation about the camera's centre: of a rotation of seven digits the
+    transpose is no inverse, and 100 km from the origin centres would be centimetres off."""
+    u, _, v = np.linalg.svd(pose[:3, :3])
+    rigid = pose.copy()
+    rigid[:3, :3] = u @ v
+    rigid[:3, 3] = u @ v @ np.linalg.solve(pose[:3, :3], pose[:3, 3])
+    return rigid
 
 
 def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
