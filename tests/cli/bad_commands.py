@@ -19,6 +19,8 @@ USAGE = [
     ("train --config-dir {yaml} views=cut", 1, "{yaml}/views/cut.yaml, line 3: expected YAML of plain data"),
     ("train --config-dir {yaml} views=tagged", 1, "{yaml}/views/tagged.yaml, line 1: expected YAML of plain"),
     ("predict images=a cameras=b out={loop}/x", 1, "{loop}/x", "found Too many levels of symbolic"),
+    ("train +bounds._target_=os.system", 1, "bounds key: expected one of", "found '_target_'"),
+    ("train --config-dir {yaml} bounds=calls", 1, "bounds key: expected one of", "found '_target_'"),
     ("train resume={loop}/x", 1, "{loop}/x: expected a path; found links in a loop"),
     ("train --config-name trian", 1, "--config-name", "'trian'"),
     ("train seed", 1, "seed: expected key=value"),
@@ -93,6 +95,7 @@ MISSING = [
         1,
         "{empty}",
     ),
+    ("doctor", 1, "images: expected images=<folder", "task=machine or task=selfcheck; found None"),
     ("evaluate", 1, "data: expected data=<option>"),
     ("evaluate data=synthetic", 1, "checkpoint: expected a checkpoint or baselines=[...]; found neither"),
     (
