@@ -156,6 +156,11 @@ BAD = {
         lambda p: {"calibration": {"axes": "maya"}},
         "calibration.axes: expected one of opencv, opengl",
     ),
+    "absurd unit": (
+        lambda p: {"calibration": {"unit": 1e300}},
+        "calibration.unit: expected a number above 0, from 1e-9 to 1e9",
+        "1e+300",
+    ),
     "no such option": (
         lambda p: {"calibration": {"axis": "y"}},
         "calibration key: expected one of",
