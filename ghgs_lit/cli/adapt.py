@@ -12,12 +12,11 @@ from ghgs_lit.cli.inputs import build_data, build_renderer, choices, load_model,
 from ghgs_lit.cli.photographs import capture_folder
 from ghgs_lit.cli.runtime import announce, output_dir
 from ghgs_lit.cli.train import run_job, train
-from ghgs_lit.config import resolve
+from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.prediction.capture.calibration import calibrate
-from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import read_cameras
 from ghgs_lit.prediction.export.maps import camera_entry
 from ghgs_lit.runs.results import read_results
@@ -42,26 +41,45 @@ def run(cfg: DictConfig) -> float | str | None:
 
 
 def with_rig(config: dict[str, Any]) -> dict[str, Any]:
-    """``config`` whose people stand in the rig of ``cameras`` and are seen by all of it, where
-    ``views.training_counts`` is not said. InputError: the calibration, or a photograph, is missing or
-    wrong."""
-    if config["images"] is None:
-        entries, fill = _cameras_of_file(config), config["data"]["fill"]
+    """``config`` whose people stand in the rig of ``cameras``, or of the data set that ``data`` names, and
+    are seen by all of it, where ``views.training_counts`` is not said. InputError: the calibration, a
+    photograph or the data set is missing or wrong."""
+    people = config["data"]
+    if people["kind"] != "people_in_rig":
+        people = resolve(compose("adapt"))["data"]
+        entries, fill = _cameras_of_data(config)
+    elif config["images"] is None:
+        entries, fill = _cameras_of_file(config), people["fill"]
     else:
         folder = capture_folder(config)
         photographs = folder.photographs(folder.instants[0])
         entries = {p.name: camera_entry(p.intrinsics, p.extrinsics, p.mask.shape) for p in photographs}
-        fill = _fill_of(photographs)
+        fill = _fill_of([p.mask for p in photographs])
     count = len(entries)
     require(2 <= count <= 8, "cameras", "2 to 8 cameras, those of the photographs in images=", count)
     trained = config["views"]["training_counts"] if "views.training_counts" in said() else [count]
     views = {**config["views"], "training_counts": trained, "evaluation_count": count}
     return {
         **config,
-        "data": {**config["data"], "cameras": entries, "fill": fill},
+        "data": {**people, "cameras": entries, "fill": fill},
         "views": views,
         "evaluation": {**config["evaluation"], "views": [count]},
     }
+
+
+def _cameras_of_data(config: dict[str, Any]) -> tuple[dict[str, dict[str, Any]], list[float]]:
+    """The input cameras of the first subject that the data set is measured on, and how tall it is in them."""
+    for name in ("images", "cameras"):
+        require(config[name] is None, name, "null beside data=<data set>, which has cameras", config[name])
+    data = build_data(config)
+    data.prepare_data()
+    subjects = list(data.subjects("val"))
+    require(subjects != [], "data", "a subject in the split val", subjects)
+    batch = data.evaluation_batch(subjects[0])
+    cameras, masks = batch.cameras[0], batch.masks[0].numpy()
+    pairs = zip(cameras.intrinsics.numpy(), cameras.extrinsics.numpy(), strict=True)
+    entries = {f"camera_{i}": camera_entry(*pair, masks.shape[1:]) for i, pair in enumerate(pairs)}
+    return entries, _fill_of(masks)
 
 
 def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -76,9 +94,9 @@ def _cameras_of_file(config: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _fill_of(photographs: Sequence[Photograph]) -> list[float]:
+def _fill_of(masks: Sequence[np.ndarray]) -> list[float]:
     """[least, greatest] share of their photograph's height that people take, about that of the subject."""
-    tallest = max(np.ptp(np.nonzero(p.mask.any(1))[0]) / len(p.mask) for p in photographs)
+    tallest = max(np.ptp(np.nonzero(mask.any(1))[0]) / len(mask) for mask in masks)
     return [float(np.clip(tallest * (1 + side * _SPREAD), 0.05, 0.99)) for side in (-1, 1)]
 
 

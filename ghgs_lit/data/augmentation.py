@@ -15,8 +15,16 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from ghgs_lit.config import options
-from ghgs_lit.config.options import Amount, Options, Positive, Share
-from ghgs_lit.data.imperfections import backgrounds, color_gains, imperfect_mask, miscalibrated
+from ghgs_lit.config.options import Amount, Count, Options, Positive, Share
+from ghgs_lit.data.cuts import cut
+from ghgs_lit.data.imperfections import (
+    backgrounds,
+    color_gains,
+    imperfect_mask,
+    miscalibrated,
+    tone_powers,
+    toned,
+)
 from ghgs_lit.data.matting import refined_matte
 from ghgs_lit.types import Batch, Cameras
 
@@ -34,8 +42,9 @@ Pixels = Annotated[float, Field(ge=0, le=64)]
 class Augmentation(Options):
     """What varies in training; null and 0: nothing. Pixels are those of the inputs at their drawn size.
 
-    Targets keep their colours and their true cameras, depth maps the z-depths in the true cameras: the loss
-    on depth asks for the distance of the surface, not for one that makes up for the error of a camera.
+    Targets keep their colours and their cameras, whose principal points alone move where subjects are cut;
+    depth maps keep the z-depths in the true cameras: the loss on depth asks for the distance of the surface,
+    not for one that makes up for the error of a camera.
     """
 
     group = "augmentation"
@@ -47,10 +56,16 @@ class Augmentation(Options):
     data.target_size, as photographs that are enlarged teach blur."""
     chance: Share = 1.0
     """Share of the steps whose inputs are imperfect in the ways below."""
+    exact_from: Count | None = None
+    """Step of training from which all inputs are exact: the last part of a run; null: never."""
     exposure: Stops = 0.0
     """Stops: greatest deviation of single cameras; 16 are from black to white."""
     white_balance: Stops = 0.0
     """Stops: greatest deviation of red and of blue of single cameras."""
+    gamma: Amount = 0.0
+    """Greatest natural logarithm of the power to which single cameras raise colours: their tone curves."""
+    cut: Share = 0.0
+    """Share of the samples whose feet or legs are outside the frame: in all photographs, or in some."""
     mask_offset: Pixels = 0.0
     """Pixels that masks grow or shrink by at most; inputs are then black outside them."""
     mask_ragged: Pixels = 0.0
@@ -90,7 +105,8 @@ class Augmentation(Options):
     def imperfect(self, batch: Batch, seed: int, step: int, indices: Sequence[int]) -> Batch:
         """The batch of a training step, as imperfect captures show it in a share ``chance`` of the steps.
         ``indices``: numbers of the samples in the run."""
-        if np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
+        is_last = self.exact_from is not None and step >= self.exact_from
+        if is_last or np.random.default_rng([seed, _CHANCE, step]).uniform() >= self.chance:
             return batch
         return self.imperfections(
             batch, [np.random.default_rng([seed, _IMPERFECTIONS, step, index]) for index in indices]
@@ -100,12 +116,17 @@ class Augmentation(Options):
         """The batch as imperfect captures show it: images in [0, 1], no mask emptied. ``batch``: with at
         least two views. ``rngs``: random numbers of each element. Whether one thing varies changes nothing
         about another."""
-        streams = [rng.spawn(4) for rng in rngs]
+        streams = [rng.spawn(6) for rng in rngs]
+        if self.cut:
+            batch = cut(batch, self.cut, [s[4] for s in streams])
         images, masks, cameras, alpha = batch.images, batch.masks, batch.cameras, batch.alpha
         if self.exposure or self.white_balance:
             views = masks.shape[1]
             gains = [color_gains(views, self.exposure, self.white_balance, s[0]) for s in streams]
             images = (images * torch.from_numpy(np.stack(gains)).to(images)[..., None, None]).clamp(0, 1)
+        if self.gamma:
+            powers = np.stack([tone_powers(masks.shape[1], self.gamma, s[5]) for s in streams])
+            images = toned(images, alpha, torch.from_numpy(powers).to(images))
         if self.calibration:
             wrong = [
                 miscalibrated(cameras[b], masks[b], self.calibration, s[1]) for b, s in enumerate(streams)

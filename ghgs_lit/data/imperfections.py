@@ -12,6 +12,7 @@ from scipy.ndimage import zoom
 from torch import Tensor
 
 from ghgs_lit.errors import require
+from ghgs_lit.geometry.mattes import unmultiplied
 from ghgs_lit.geometry.motion import after_motions, motions_between, without_common
 from ghgs_lit.geometry.outlines import signed_distance
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
@@ -40,6 +41,26 @@ def color_gains(
     deviation /= np.maximum(1, np.abs(deviation).max(0))
     red, green, blue = (deviation * (white_balance, exposure, white_balance)).T
     return 2 ** (np.stack((green + red, green, green + blue), -1) / _GAMMA)
+
+
+def tone_powers(views: int, gamma: float, rng: np.random.Generator) -> Float[np.ndarray, " V"]:
+    """What each camera raises stored colours to; the geometric mean over the cameras is 1.
+    ``gamma``: greatest natural logarithm of a power."""
+    deviation = rng.uniform(-1, 1, views)
+    deviation -= deviation.mean()
+    return np.exp(gamma * deviation / max(1, np.abs(deviation).max()))
+
+
+def toned(
+    images: Float[Tensor, "B V 3 h w"], alpha: Float[Tensor, "B V h w"] | None, powers: Float[Tensor, "B V"]
+) -> Float[Tensor, "B V 3 h w"]:
+    """Photographs whose surfaces' colours are raised to a power of each view. ``alpha``: mattes by which they
+    are multiplied; None: there are none."""
+    powers = powers[..., None, None, None]
+    if alpha is None:
+        return images**powers
+    shares = alpha[:, :, None]
+    return unmultiplied(images, shares) ** powers * shares
 
 
 def imperfect_mask(

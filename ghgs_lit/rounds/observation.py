@@ -1,12 +1,16 @@
 """Values of the photographs and the render at each Gaussian's present position, without a gradient."""
 
+import dataclasses
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.geometry.mattes import coverage
+from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.geometry.rotations import rotate
+from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render
@@ -19,10 +23,53 @@ _BEHIND = 0.05
 #: Values of a Gaussian in a view: photograph minus its own colour (3), photograph minus render (3), mask,
 #: alpha, how far it lies behind the rendered surface, whether the view can see it, whether it is from there.
 CHANNELS = 11
+#: Values of :func:`slopes`: of a mean along its ray and along its own axes, of scales, opacity and color.
+SLOPES = 1 + 3 + 3 + 1 + 3
+# Slopes are bounded from about a quarter on: of most Gaussians they are less than a tenth.
+_STEEP = 4.0
+
+
+@torch.inference_mode(False)
+def slopes(
+    gaussians: Gaussians, batch: Batch, directions: Float[Tensor, "N 3"], footprints: Float[Tensor, "N 1"]
+) -> tuple[Rendering, Float[Tensor, "N s"]]:
+    """The inputs as rendered, and the gradient of their squared error with respect to each Gaussian.
+
+    Colours and mattes count alike. Means move by pixels, scales and opacities by logarithms and logits. The
+    values are bounded; no gradient flows through them. ``directions``: of the Gaussians' rays.
+    ``footprints``: the size of a pixel where a Gaussian is.
+    """
+    # Copies, as what was made in inference mode can never have a gradient.
+    means, scales, opacities, colors = leaves = [
+        getattr(gaussians, name).detach().clone().requires_grad_()
+        for name in ("means", "scales", "opacities", "colors")
+    ]
+    quaternions = gaussians.quaternions.detach().clone()
+    cameras = dataclasses.replace(
+        batch.cameras,
+        intrinsics=batch.cameras.intrinsics.clone(),
+        extrinsics=batch.cameras.extrinsics.clone(),
+    )
+    shown = dataclasses.replace(
+        gaussians, means=means, scales=scales, quaternions=quaternions, opacities=opacities, colors=colors
+    )
+    with exact(means.device.type), torch.enable_grad():
+        drawn = render(shown, cameras)
+        wrong = (drawn.image - on_black(batch)).square().sum()
+        wrong = wrong + (drawn.alpha - coverage(batch)[:, :, None]).square().sum()
+        of_means, of_scales, of_opacities, of_colors = torch.autograd.grad(wrong / 2, leaves)
+    with torch.no_grad():
+        of_means = of_means * footprints
+        along = (of_means * directions).sum(-1, keepdim=True) / directions.norm(dim=-1, keepdim=True)
+        across = rotate(unit(quaternions * quaternions.new_tensor([1, -1, -1, -1])), of_means)
+        logits = of_opacities * opacities * (1 - opacities)
+        values = torch.cat((along, across, of_scales * scales, logits[:, None], of_colors), -1)
+        parts = (drawn.image.detach(), drawn.alpha.detach(), drawn.depth.detach())
+        return Rendering(*parts), torch.tanh(_STEEP * values)
 
 
 @torch.no_grad()
-def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
+def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = None) -> Float[Tensor, "N V c"]:
     """:data:`CHANNELS` values of each input view at each Gaussian of its element.
 
     The first view is that of the Gaussian's own image; the others follow in their order, from the last to the
@@ -30,7 +77,7 @@ def observe(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "N V c"]:
     cameras.
     """
     with exact(gaussians.means.device.type):
-        return _compare(gaussians, batch, render(gaussians, batch.cameras))
+        return _compare(gaussians, batch, rendering or render(gaussians, batch.cameras))
 
 
 def _compare(gaussians: Gaussians, batch: Batch, rendering: Rendering) -> Float[Tensor, "N V c"]:

@@ -30,7 +30,7 @@ from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rounds import cpu
 from ghgs_lit.rounds.exchange import Exchange, Windows
 from ghgs_lit.rounds.gains import equalized
-from ghgs_lit.rounds.observation import CHANNELS, observe
+from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
 from ghgs_lit.types import Batch, DepthMaps, Gaussians, Points, Prediction
 
 #: Gaussians whose views go through the network at once.
@@ -124,6 +124,9 @@ class RoundsOptions(Options):
     exchange: Width | None = 16
     """Channels in which Gaussians of neighbouring pixels tell each other what they know; null: none."""
 
+    slopes: bool = False
+    """Whether a round is shown the gradient of the inputs' error with respect to each Gaussian."""
+
     def build(self, channels: int) -> "Rounds":
         return Rounds(self, channels)
 
@@ -148,7 +151,7 @@ class Rounds(nn.Module):
             nn.ReLU(inplace=True),
         )
         self.start = nn.Linear(channels, hidden)
-        inputs = 4 * hidden + depths + _PLACE + 3
+        inputs = 4 * hidden + depths + _PLACE + 3 + (SLOPES if options.slopes else 0)
         self.update = nn.Sequential(
             nn.Linear(inputs, 2 * hidden),
             nn.ReLU(inplace=True),
@@ -186,9 +189,13 @@ class Rounds(nn.Module):
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """New depths and changes of raw attributes, and what the next round remembers."""
         gaussians = state.gaussians.detach()
-        each = observe(gaussians, batch)
+        drawn, more = None, []
+        if self.options.slopes:
+            drawn, steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
+            more = [steep]
+        each = observe(gaussians, batch, drawn)
         search = self._search(state, batch, rays, size * REACH)
-        rows = (each, torch.cat((search.matches, search.place, gaussians.colors), -1), memory)
+        rows = (each, torch.cat((search.matches, search.place, gaussians.colors, *more), -1), memory)
         memory, change = self._looked(*rows, windows)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step
@@ -241,6 +248,14 @@ class Rounds(nn.Module):
         high = torch.maximum(high, depth)
         matches = consistency_of(batch, rays.place, low, high, self.options.depths)
         return Search(matches, torch.stack((share, thickness), -1), depth - low, high - depth)
+
+
+@torch.no_grad()
+def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
+    """Sizes [N, 1] of the pixels where the Gaussians are, in the unit of the world."""
+    focal = at_least_float32(batch.cameras.intrinsics.flatten(0, 1)).diagonal(dim1=-2, dim2=-1)[:, :2]
+    depth = at_least_float32(state.depth_maps.depth).flatten()[rays.place]
+    return (depth / focal.prod(-1).sqrt()[state.raw.image])[:, None]
 
 
 def _moved(

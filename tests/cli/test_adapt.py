@@ -8,15 +8,17 @@ import torch
 
 from ghgs_lit.cli import adapt
 from ghgs_lit.cli.adapt import _fill_of, with_rig
+from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.readers import read_yaml
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.synthesis import jobs
 from ghgs_lit.synthesis.rig import Rig
+from scripts.miniatures import zju_mocap
+from tests.helpers.captures import make_miniature
 from tests.helpers.people import box_person
 from tests.helpers.verbs import ghgs
 
@@ -103,8 +105,31 @@ def test_people_are_as_large_as_the_subject_of_the_photographs():
     """A tenth less to a tenth more than where it is tallest, least first."""
     mattes = np.zeros((2, 100, 80), np.uint8)
     mattes[0, 20:71], mattes[1, 30:61] = 255, 255
-    photographs = [Photograph("c", np.zeros((100, 80, 3), np.uint8), m, np.eye(3), np.eye(4)) for m in mattes]
-    assert _fill_of(photographs) == pytest.approx([0.45, 0.55])
+    assert _fill_of(mattes) == pytest.approx([0.45, 0.55])
+
+
+def test_a_data_set_lends_its_cameras(tmp_path):
+    """The inputs of its protocol, in the size of its photographs; people are as tall as its subject."""
+    make_miniature(zju_mocap, tmp_path / "zju", ["386", "313"], 112, seed=3, frames=2)
+    data = ["data=zju_mocap", f"data.root={tmp_path / 'zju'}", "data.size=112", "data.workers=0"]
+    data += [
+        f"data.split.{p}=[{{sequences: [{s}], frames: [0, 2, 1]}}]" for p, s in (("train", 386), ("val", 313))
+    ]
+    config = with_rig(resolve(compose("adapt", data)))
+    zju = build_data(resolve(compose("adapt", data)))
+    batch = zju.evaluation_batch(next(iter(zju.subjects("val"))))
+    assert config["data"]["kind"] == "people_in_rig"
+    assert config["data"]["people"] == compose("adapt").data.people
+    cameras = list(config["data"]["cameras"].values())
+    assert len(cameras) == config["views"]["evaluation_count"] == 4
+    for name in ("intrinsics", "extrinsics"):
+        torch.testing.assert_close(torch.tensor([c[name] for c in cameras]), getattr(batch.cameras[0], name))
+    assert {(c["height"], c["width"]) for c in cameras} == {(112, 112)}
+    rows = batch.masks[0].any(2).sum(1)
+    low, high = config["data"]["fill"]
+    assert low < rows.max() / 112 < high
+    with pytest.raises(InputError, match="cameras: expected null beside data=<data set>"):
+        with_rig(resolve(compose("adapt", [*data, "cameras=x.json"])))
 
 
 def test_numbers_of_views_can_be_said(calibration, tmp_path, monkeypatch):

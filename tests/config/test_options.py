@@ -77,7 +77,7 @@ UNLIMITED = {
         evaluation_positions positions views evaluation_count training_counts per_subject per_step layers
         token sequences""",
     "how seldom something comes": """
-        every every_n_train_steps log_every_n_steps val_check_interval""",
+        every every_n_train_steps log_every_n_steps val_check_interval exact_from""",
     "the end of a run or epoch comes first, or Ctrl-C": """
         max_steps steps_per_epoch accumulate_grad_batches skip_nonfinite""",
     "of a list": "devices",

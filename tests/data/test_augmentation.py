@@ -7,13 +7,15 @@ import torch
 from ghgs_lit.config import compose
 from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
+from ghgs_lit.data.cuts import cut
 from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.types import Batch
 from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
 
 RANDOM = V4 | {"training_counts": [3, 4, 5], "training": "uneven"}
 IMPERFECT = {
-    "exposure": 0.5, "white_balance": 0.2, "mask_offset": 1.5, "mask_ragged": 1.0,
+    "exposure": 0.5, "white_balance": 0.2, "gamma": 0.3, "mask_offset": 1.5, "mask_ragged": 1.0,
     "mask_hole_chance": 0.5, "calibration": 2.0,
 }  # fmt: skip
 EVERYTHING = IMPERFECT | {"sizes": [28, [42, 28]], "target_scale": [0.7, 2.0]}
@@ -128,6 +130,15 @@ def test_a_share_of_the_steps_is_imperfect(root):
     assert equal(steps[changed[0]][1], every.training_batch(changed[0]))
 
 
+def test_the_last_part_of_a_run_is_exact(root):
+    """From the step on that is named, to the bit; all before as without it."""
+    clean, always, first = (
+        module(root, augmentation=a) for a in ({}, IMPERFECT, IMPERFECT | {"exact_from": 2})
+    )
+    for step in range(4):
+        assert equal(first.training_batch(step), (always if step < 2 else clean).training_batch(step))
+
+
 def differing(a, b) -> set[str]:
     """Names of the fields in which two batches differ."""
     cameras = {
@@ -145,6 +156,7 @@ def differing(a, b) -> set[str]:
     [
         (("exposure",), {"images"}),
         (("white_balance",), {"images"}),
+        (("gamma",), {"images"}),
         (("mask_offset",), {"images", "masks", "alpha"}),
         (("mask_ragged",), {"images", "masks", "alpha"}),
         (("mask_hole_chance",), {"images", "masks", "alpha"}),
@@ -203,6 +215,51 @@ def test_refined_masks_are_those_of_a_capture(root):
     assert equal(found.targets, clean.targets)
 
 
+def test_tone_curves_raise_the_surface_to_a_power(root):
+    """One power for each camera; powers differ, their geometric mean is 1; black and mattes stay."""
+    clean, toned = (module(root, augmentation=a).training_batch(1) for a in ({}, {"gamma": 0.3}))
+    one, other = (surface_colors(batch).double() for batch in (clean, toned))
+    sure = ((clean.alpha > 0.5)[:, :, None] & (one > 0.1) & (one < 0.9)).expand_as(one)
+    powers = torch.where(sure, other.log() / one.log(), torch.nan).flatten(2)
+    for b, v in np.ndindex(*powers.shape[:2]):
+        values = powers[b, v][~powers[b, v].isnan()]
+        torch.testing.assert_close(values, values.median().expand_as(values), rtol=1e-3, atol=1e-3)
+    logs = powers.nanmedian(-1).values.log()
+    assert logs.abs().max() < 0.301
+    assert (logs.amax(1) - logs.amin(1) > 0.05).all()
+    torch.testing.assert_close(logs.mean(1), torch.zeros(len(logs)).double(), rtol=0, atol=1e-3)
+
+
+def test_a_cut_moves_photographs_and_cameras_together(root):
+    """A point of the world shows what it showed, until it leaves the frame; wholes are whole in some view."""
+    clean = module(root).training_batch(1)
+    kinds = set()
+    for seed in range(12):
+        rngs = [np.random.default_rng([seed, b]) for b in range(2)]
+        batch = cut(clean, 1.0, rngs)
+        rows = batch.cameras.intrinsics[..., 1, 2] - clean.cameras.intrinsics[..., 1, 2]
+        lower = batch.targets.cameras.intrinsics[..., 1, 2] - clean.targets.cameras.intrinsics[..., 1, 2]
+        for name in ("images", "masks", "depths", "alpha"):
+            before, after = getattr(clean, name), getattr(batch, name)
+            for b, v in np.ndindex(*rows.shape):
+                down = int(rows[b, v])
+                assert torch.equal(
+                    after[b, v][..., down:, :], before[b, v][..., : before.shape[-2] - down, :]
+                )
+                assert not after[b, v][..., :down, :].any()
+        left = batch.masks.sum((2, 3)) / clean.masks.sum((2, 3))
+        assert (left > 0.2).all()
+        for b in range(2):
+            everywhere = bool((lower[b] > 0).any())
+            kinds.add(everywhere)
+            assert bool((rows[b] > 0).all()) == everywhere
+            assert bool((lower[b] > 0).all()) == everywhere
+            assert (rows[b] > 0).any()
+            assert everywhere or (left[b] == 1).any()
+    assert kinds == {True, False}
+    assert equal(cut(clean, 0.0, [np.random.default_rng(b) for b in range(2)]), clean)
+
+
 def test_imperfections_do_not_depend_on_batch_mates(root):
     """Two elements together are as each alone."""
     batch = module(root).training_batch(0)
@@ -212,7 +269,7 @@ def test_imperfections_do_not_depend_on_batch_mates(root):
         return augmentation.imperfections(one, [np.random.default_rng(seed) for seed in seeds])
 
     def element(one, b):
-        return Batch(one.images[[b]], one.masks[[b]], one.cameras[[b]])
+        return Batch(one.images[[b]], one.masks[[b]], one.cameras[[b]], alpha=one.alpha[[b]])
 
     both = imperfect(batch, (3, 4))
     for b, seed in enumerate((3, 4)):
@@ -248,6 +305,7 @@ def test_shipped_variation_is_built():
         ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
         ({"chance": 1.5}, "augmentation.chance: expected a number >= 0 and <= 1; found 1.5"),
         ({"background": 2}, "augmentation.background: expected a number >= 0 and <= 1; found 2"),
+        ({"cut": 2}, "augmentation.cut: expected a number >= 0 and <= 1; found 2"),
         ({"calibration": -1}, "augmentation.calibration: expected a number >= 0; found -1"),
         ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole_chance"),
     ],

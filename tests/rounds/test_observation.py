@@ -1,15 +1,18 @@
 """What photographs show of Gaussians."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
+from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import observation
-from ghgs_lit.rounds.observation import CHANNELS, observe
-from ghgs_lit.types import Gaussians
+from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
+from ghgs_lit.types import Batch, Gaussians
 from tests.helpers.scenes import make_batch, with_soft_rims
 
 
@@ -127,3 +130,77 @@ def test_errors_are_the_photograph_minus_the_render(monkeypatch, kernel):
     assert expected.mean() > 0.05
     torch.testing.assert_close(each[:, 0, 3:6], expected, rtol=0, atol=1e-3)
     torch.testing.assert_close(each[:, 0, :3], dark.colors, rtol=0, atol=1e-3)
+
+
+def slanted(batch):
+    """Splats that do not fit: moved, of three sizes, half transparent."""
+    gaussians = splats(batch)
+    generator = torch.Generator().manual_seed(3)
+    moved = 0.01 * torch.randn(gaussians.means.shape, generator=generator)
+    sizes = 0.01 * (1 + torch.rand(gaussians.scales.shape, generator=generator))
+    turns = torch.randn(gaussians.quaternions.shape, generator=generator)
+    return dataclasses.replace(
+        gaussians,
+        means=gaussians.means + moved,
+        scales=sizes,
+        quaternions=turns / turns.norm(dim=-1, keepdim=True),
+        opacities=gaussians.opacities / 2,
+    )
+
+
+def test_slopes_say_by_how_much_the_error_changes():
+    """Against differences of the rendered error as means move along rays, scales grow, colours change."""
+    batch = make_batch(1, 3, 28, 28)
+    gaussians = slanted(batch)
+    n = len(gaussians)
+    rays = torch.nn.functional.normalize(
+        torch.randn(n, 3, generator=torch.Generator().manual_seed(5)), dim=-1
+    )
+    footprints = torch.full((n, 1), 0.02)
+    drawn, steep = slopes(gaussians, batch, 3 * rays, footprints)
+    torch.testing.assert_close(drawn.image, render(gaussians, batch.cameras).image)
+    assert steep.shape == (n, SLOPES)
+    assert not steep.requires_grad
+    steep = torch.atanh(steep.double()) / 4
+
+    def error(**changes):
+        shown = render(dataclasses.replace(gaussians, **changes), batch.cameras)
+        wrong = (shown.image - on_black(batch)).double().square().sum()
+        return (wrong + (shown.alpha - coverage(batch)[:, :, None]).double().square().sum()) / 2
+
+    def rise(step, change):
+        """Of the error, over a step of 1 of what changes."""
+        return (error(**change(step)) - error(**change(-step))) / (2 * step)
+
+    logits = gaussians.opacities.logit()
+    along = rise(1e-3, lambda t: {"means": gaussians.means + t * 0.02 * rays})
+    wider = rise(1e-3, lambda t: {"scales": gaussians.scales * math.exp(t)})
+    opaque = rise(1e-3, lambda t: {"opacities": (logits + t).sigmoid()})
+    brighter = rise(1e-3, lambda t: {"colors": gaussians.colors + t})
+    expected = torch.stack((along, wider, opaque, brighter))
+    found = torch.stack((steep[:, 0], *(part.sum(-1) for part in steep[:, 4:].split((3, 1, 3), -1)))).sum(-1)
+    torch.testing.assert_close(
+        found, expected, rtol=0.1, atol=0.01 * float(expected.abs().max())
+    )  # splats are cut off
+    # Slopes along a Gaussian's own axes make up that along the ray.
+    own = quaternion_to_matrix(gaussians.quaternions).double()
+    across = (own @ steep[:, 1:4, None])[..., 0]
+    torch.testing.assert_close((across * rays).sum(-1), steep[:, 0], rtol=1e-3, atol=1e-4)
+
+
+def test_slopes_of_inference_are_those_of_training():
+    """To the bit, in inference mode and for an element beside another."""
+    batch = make_batch(2, 3, 28, 28)
+    gaussians = slanted(batch)
+    n = len(gaussians)
+    arguments = gaussians, batch, torch.ones(n, 3), torch.full((n, 1), 0.02)
+    _, expected = slopes(*arguments)
+    with torch.inference_mode():
+        _, found = slopes(
+            *(value.clone() if isinstance(value, torch.Tensor) else value for value in arguments)
+        )
+    assert torch.equal(found, expected)
+    first = gaussians.select(torch.arange(gaussians.splits[0]), gaussians.splits[:1])
+    one = Batch(batch.images[:1], batch.masks[:1], batch.cameras[:1])
+    _, alone = slopes(first, one, torch.ones(len(first), 3), torch.full((len(first), 1), 0.02))
+    torch.testing.assert_close(alone, expected[: len(first)], rtol=1e-4, atol=1e-6)
