@@ -25,6 +25,8 @@ PIXEL_CENTERS = ("half", "integer")
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
 _CODED, _SHOWN = 1088, 1080
+# Distance from the origin beyond which a rotation's seventh digit moves a centre by more than 0.1 mm.
+_FAR = 1e3
 # Sides of a photograph and of its calibration have one ratio up to the rounding of a resize, in pixels.
 _ROUNDING = 1.5
 
@@ -155,14 +157,14 @@ def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
     """World to camera [4, 4] with OpenCV axes, of a stored pose."""
     if convention.extrinsics == "camera_to_world":
         pose = np.linalg.inv(pose)
-    extrinsics = _FLIP @ _rigid(pose) if convention.axes == "opengl" else _rigid(pose)
+    extrinsics = _FLIP @ pose if convention.axes == "opengl" else pose.copy()
     extrinsics[:3, 3] *= convention.unit
-    return extrinsics
+    return _rigid(extrinsics) if np.abs(extrinsics[:3, 3]).max() > _FAR else extrinsics
 
 
 def _rigid(pose: np.ndarray) -> np.ndarray:
     """World to camera with the nearest rotation about the camera's centre: of a rotation of seven digits the
-    transpose is no inverse, and 100 km from the origin centres would be centimetres off."""
+    transpose is no inverse, and 100 km from the origin the centre that follows is a centimetre off."""
     u, _, v = np.linalg.svd(pose[:3, :3])
     rigid = pose.copy()
     rigid[:3, :3] = u @ v

@@ -35,8 +35,7 @@ def some_rig(figure):
 def same(one, other):
     for first, second in zip(one.photographs, other.photographs, strict=True):
         np.testing.assert_allclose(first.intrinsics, second.intrinsics, atol=1e-9)
-        # Rotations of float32 are made rigid where they are read.
-        np.testing.assert_allclose(first.extrinsics, second.extrinsics, atol=1e-7)
+        np.testing.assert_allclose(first.extrinsics, second.extrinsics, atol=1e-9)
 
 
 @pytest.mark.parametrize("orientation", [1, 6])
