@@ -127,15 +127,14 @@ def check_yaml(text: str, aliases: bool = True) -> None:
 
 
 def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
-    """What ``parse`` makes of a file of text; arguments and errors as for :func:`read_json`. ``parse`` raises
-    ValueError for what it cannot read."""
+    """What ``parse`` makes of a file of text; other arguments and errors as for :func:`read_json`."""
     try:
         value = parse(read_text(path, expected))
         if _levels(value) > DEEPEST:
             raise ValueError(f"more than {DEEPEST} levels")
     except InputError:
         raise
-    except (ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise InputError(f"{path}: expected {expected}; found {error}") from error
     return value
 

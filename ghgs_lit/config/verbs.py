@@ -5,15 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
-from ghgs_lit.config.nodes import (
-    Check,
-    PairedTest,
-    PerScene,
-    Sequence,
-    Texts,
-    Timing,
-    Turntable,
-)
+from ghgs_lit.config.nodes import Check, PairedTest, PerScene, Sequence, Texts, Timing, Turntable
 from ghgs_lit.config.options import (
     Count,
     CropSize,

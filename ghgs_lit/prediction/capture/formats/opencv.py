@@ -108,10 +108,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         # OpenCV writes "%YAML:1.0", which is not a directive of YAML.
         text = re.sub(r"\A%YAML[^\n]*\n", "", text)
         check_yaml(text)
-        try:
-            return yaml.load(text, _Loader)
-        except (KeyError, TypeError) as error:
-            raise ValueError(error) from error
+        return yaml.load(text, _Loader)
 
     return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
 
