@@ -3,15 +3,16 @@
     python benchmarks/held_out_sequence.py photographs cameras.json --out held_out_sequence
 
 Cameras are corrected with all photographs (the calibration is theirs), in each instant or once, as
-`ghgs predict` does. Prints for each way, over all instants and cameras, PSNR of the photograph on black,
-whole and in the box of the subject; in the box of masks that the background mended; and there of the
-photograph as it is, the render before the background, which asks no mask. Flicker in place (thousandths of
-white) of the first and of the last; the share of instants that were predicted anew; CPU seconds of an
-instant without the rig's. A black render has the flicker of the photographs. What is done stays in --out,
-and is not done again.
+`ghgs predict` does; so are colour gains, with a mean of 1 over those that predict. Prints for each way, over
+all instants and cameras, PSNR of the photograph on black, whole and in the box of the subject; in the box of
+masks that the background mended; and there of the photograph as it is, the render before the background,
+which asks no mask. Flicker in place (thousandths of white) of the first and of the last; the share of
+instants that were predicted anew; CPU seconds of an instant without the rig's. A black render has the flicker
+of the photographs. What is done stays in --out, and is not done again.
 """
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -36,18 +37,23 @@ from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
 from ghgs_lit.prediction.refinement import CameraRefinement
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras, Prediction
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.reading import file_of
 
-#: Which masks and which cameras, and of how many instants one is predicted anew.
+#: Which masks, cameras and colour gains, and of how many instants one is predicted anew.
 WAYS = {
-    "cameras as given": ("given", "given", 1),
-    "rig once": ("given", "once", 1),
-    "rig once, temporal": ("given", "once", 8),
-    "rig once, backgrounds": ("mended", "once", 1),
-    "rig once, backgrounds, temporal": ("mended", "once", 8),
-    "each instant by itself": ("given", "each", 1),
+    "cameras as given": ("given", "given", "each", 1),
+    "cameras once": ("given", "once", "each", 1),
+    "cameras once, temporal": ("given", "once", "each", 8),
+    "cameras once, backgrounds": ("mended", "once", "each", 1),
+    "cameras once, backgrounds, temporal": ("mended", "once", "each", 8),
+    "cameras and gains once": ("given", "once", "once", 1),
+    "cameras and gains once, temporal": ("given", "once", "once", 8),
+    "cameras and gains once, backgrounds": ("mended", "once", "once", 1),
+    "cameras and gains once, backgrounds, temporal": ("mended", "once", "once", 8),
+    "each instant by itself": ("given", "each", "each", 1),
 }
 COLUMNS = ("whole", "box", "mended", "photograph", "flicker", "flicker_photograph", "anew", "seconds")
 
@@ -88,7 +94,8 @@ class Measured:
         def batch(name: str) -> tuple[Batch, np.ndarray, float]:
             capture, begin = Capture(name, self.folder.photographs(name)), time.process_time()
             capture = backgrounds.applied(capture) if masks == "mended" else capture
-            capture = rig.applied(capture) if cameras == "once" and rig else capture
+            if cameras == "once" and rig:
+                capture = dataclasses.replace(rig, gains={}).applied(capture)
             given = found = capture.batch(self.size, ENOUGH if doubt_of_masks(capture, self.size) else 0)
             if cameras == "each" and doubt_of_cameras(capture, given):
                 found = CameraRefinement(ENOUGH, self.model, self.renderer)(given)
@@ -110,10 +117,12 @@ class Measured:
         return found
 
     @torch.no_grad()
-    def rows(self, masks: str, cameras: str, view: int, everies: tuple[int, ...]) -> list[np.ndarray]:
+    def rows(
+        self, masks: str, cameras: str, gains: str, view: int, everies: tuple[int, ...]
+    ) -> list[np.ndarray]:
         """The columns [n, 8] of a held-out camera, for each of some ``every`` of :class:`Temporal`."""
         known: dict[str, tuple[Prediction, float]] = {}
-        spent = 0.0
+        rig, spent = self.kept("shared", self.shared)[1], 0.0
 
         def predict(batch: Batch) -> Prediction:
             """As in the run before, with the seconds that it took there."""
@@ -133,7 +142,8 @@ class Measured:
             for (batch, lenses, before), truth in zip(self.batches(masks, cameras), truths, strict=True):
                 anew, begin, spent = temporal.anew, time.process_time(), before
                 others = [other for other in range(batch.images.shape[1]) if other != view]
-                gaussians = temporal(batch.of_views(others)).gaussians
+                seen = batch.of_views(others)
+                gaussians = temporal(with_gains_of(rig, seen) if gains == "once" else seen).gaussians
                 seconds = time.process_time() - begin + spent
                 drawn = self.renderer(gaussians, _halved(lenses[view], batch, view, truth))
                 values, pair = compared(drawn.image[0, 0].clamp(0, 1), drawn.alpha[0, 0], truth)
@@ -150,6 +160,15 @@ class Measured:
             errors.append((*pair, truth["mask"]))
             rows.append([*values, np.nan, np.nan, np.nan, np.nan])
         return with_flicker(rows, errors)
+
+
+def with_gains_of(rig: Rig | None, batch: Batch) -> Batch:
+    """Photographs divided by the rig's gains, whose mean over these cameras is 1; as they are where it has
+    none."""
+    if not rig or not rig.gains:
+        return batch
+    logs = np.log([rig.gains[name] for name in batch.views[0]])
+    return divided(batch, torch.from_numpy(logs - logs.mean(0)).to(batch.images)[None])
 
 
 def compared(image: Tensor, alpha: Tensor, truth: dict[str, Tensor]) -> tuple[list[float], tuple]:
@@ -208,18 +227,18 @@ def main() -> None:
     print(
         line("black", [measured.kept(f"rows_black_{view}", partial(measured.black, view)) for view in views])
     )
-    for both in dict.fromkeys(way[:2] for way in WAYS.values()):
-        named = {name: way[2] for name, way in WAYS.items() if way[:2] == both}
+    for kind in dict.fromkeys(way[:3] for way in WAYS.values()):
+        named = {name: way[3] for name, way in WAYS.items() if way[:3] == kind}
         found = [
             measured.kept(
-                f"rows_{'_'.join(both)}_{view}", partial(measured.rows, *both, view, tuple(named.values()))
+                f"rows_{'_'.join(kind)}_{view}", partial(measured.rows, *kind, view, tuple(named.values()))
             )
             for view in views
         ]
         for name, rows in zip(named, zip(*found, strict=True), strict=True):
             print(line(name, rows), flush=True)
     rig, seconds = measured.kept("shared", measured.shared)[1:]
-    print(f"rig: {seconds:.0f} s; moved by {rig and rig.moved} pixels")
+    print(f"rig: {seconds:.0f} s; moved by {rig and rig.moved} pixels, gains {rig and rig.gains}")
 
 
 def line(name: str, rows: Sequence[np.ndarray]) -> str:

@@ -130,7 +130,9 @@ class Batch(_TensorStruct):
 
     ``body_vertices`` are points of the body's surface in metres, ``depths`` true z-depths in metres (0 where
     there is none), ``alpha`` soft mattes: the share of each pixel that shows the subject, by which its colour
-    is multiplied; None where the data set has none. ``views`` names the photographs of each subject.
+    is multiplied; None where the data set has none. ``log_gains``: logarithms of the gains of cameras, by
+    which photographs are divided already; None where they are not known. ``views`` names the photographs of
+    each subject.
     """
 
     images: Float[Tensor, "B V 3 H W"]
@@ -140,13 +142,14 @@ class Batch(_TensorStruct):
     body_vertices: list[Float[Tensor, "_ 3"]] | None = None
     depths: Float[Tensor, "B V H W"] | None = None
     alpha: Float[Tensor, "B V H W"] | None = None
+    log_gains: Float[Tensor, "B V 3"] | None = None
     subjects: tuple[str, ...] = ()
     views: tuple[tuple[str, ...], ...] = ()
 
     def of_views(self, views: Sequence[int]) -> "Batch":
         """The batch of some of its photographs, by number, with the same targets."""
         views = list(views)
-        names = ("images", "masks", "cameras", "depths", "alpha")
+        names = ("images", "masks", "cameras", "depths", "alpha", "log_gains")
         parts = {name: value[:, views] for name in names if (value := getattr(self, name)) is not None}
         said = tuple(tuple(row[view] for view in views) for row in self.views)
         return dataclasses.replace(self, **parts, views=said)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from statistics import geometric_mean
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -187,8 +188,15 @@ def mended_by(backgrounds: Backgrounds, given: Capture) -> Capture:
 
 
 def advice_of(directory: Path) -> Iterator[str]:
-    """Lines that say why a prediction of photographs may be poor, and what may help, by its report."""
+    """Lines that say what of photographs is undone, why a prediction of them may be poor, and what may help,
+    by its report."""
     report = json.loads((directory / REPORT).read_text())
+    shares = {name: geometric_mean(each) - 1 for name, each in report.get("gains", {}).items()}
+    said = [
+        f"{n} {abs(x):.0%} {'darker' if x < 0 else 'brighter'}" for n, x in shares.items() if round(100 * x)
+    ]
+    if said:
+        yield f"gains: {', '.join(said)} than the mean of the cameras, undone"
     quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
@@ -256,6 +264,9 @@ def write_result(
     if result.moved:
         facts["refine_cameras"] = dict(zip(result.batch.views[0], result.moved, strict=True))
         print(moved_line(facts["refine_cameras"]) + why.get("refine_cameras", ""), flush=True)
+    if result.batch.log_gains is not None:
+        gains = result.batch.log_gains[0].exp().tolist()
+        facts["gains"] = dict(zip(result.batch.views[0], gains, strict=True))
     if model.auto is not None:
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)

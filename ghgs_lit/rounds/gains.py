@@ -36,10 +36,15 @@ _STEPS = 5
 
 def equalized(gaussians: Gaussians, batch: Batch) -> tuple[Gaussians, Batch]:
     """Gaussians and the photographs that they come from, divided by their cameras' gains."""
-    gains = torch.exp(-log_gains(gaussians, batch))
-    images = (at_least_float32(batch.images) * gains[..., None, None]).clamp(0, 1)
-    colors = gaussians.colors * gains.flatten(0, 1)[gaussians.image]
-    return dataclasses.replace(gaussians, colors=colors), dataclasses.replace(batch, images=images)
+    logs = log_gains(gaussians, batch)
+    colors = gaussians.colors * torch.exp(-logs).flatten(0, 1)[gaussians.image]
+    return dataclasses.replace(gaussians, colors=colors), divided(batch, logs)
+
+
+def divided(batch: Batch, logs: Float[Tensor, "B V 3"]) -> Batch:
+    """The photographs divided by gains, given by their logarithms."""
+    images = (at_least_float32(batch.images) * torch.exp(-logs)[..., None, None]).clamp(0, 1)
+    return dataclasses.replace(batch, images=images, log_gains=logs)
 
 
 @torch.no_grad()

@@ -120,7 +120,7 @@ class RoundsOptions(Options):
     """Number of depths around the current one at which a round compares the photographs; 4096 are finer than
     their pixels."""
     gains: bool = True
-    """Photographs of cameras whose exposure differs are made alike first."""
+    """Photographs of cameras whose exposure differs are made alike first, where a rig does not know them."""
     exchange: Width | None = 16
     """Channels in which Gaussians of neighbouring pixels tell each other what they know; null: none."""
 
@@ -167,7 +167,7 @@ class Rounds(nn.Module):
     def forward(self, state: State, activate: Activate, batch: Batch) -> tuple[State, ...]:
         """The state before the first round and after each. ``state``: the prediction of the stages before;
         its depths have bounds. ``batch``: photographs, masks and cameras are read."""
-        if self.options.gains:
+        if self.options.gains and batch.log_gains is None:
             gaussians, batch = equalized(state.gaussians, batch)
             state = dataclasses.replace(state, gaussians=gaussians)
         states, memory = [state], torch.tanh(self.start(state.raw.descriptors))

@@ -176,6 +176,38 @@ def test_cameras_of_a_sequence_are_corrected_once_and_the_next_one_reads_them(
     assert not (here / "none" / "rig.json").exists()
 
 
+def test_gains_of_a_rig_are_written_read_and_said(here, checkpoint, capsys, monkeypatch):
+    """The next capture, of one instant, has the same photographs; without gains nothing is said."""
+    for instant in ("000", "001"):
+        cameras = Figure().write(here / "images" / instant)
+    gains = {"cam0": [0.8] * 3, "cam1": [1.25] * 3, "cam2": [1.0, 0.8, 1.25], "cam3": [1.0, 1.25, 0.8]}
+
+    def correct(captures, *others):
+        named = {photograph.name: photograph for photograph in captures[0].photographs}
+        poses, ones = {name: p.extrinsics for name, p in named.items()}, dict.fromkeys(named, 1.0)
+        return Rig(poses, ones, ones, gains={name: np.array(values) for name, values in gains.items()})
+
+    monkeypatch.setattr("ghgs_lit.cli.predict.corrected_rig", correct)
+    common = (f"checkpoint={checkpoint}", "formats=[inputs]", "turntable.frames=0", "device=cpu")
+    common = (*common, "refine_masks=0", "check_cameras=false")
+    said = "gains: cam0 20% darker, cam1 25% brighter than the mean of the cameras, undone\n"
+    assert ghgs("predict", "images=images", f"cameras={cameras}", "out=splats", *common) == 0
+    assert capsys.readouterr().out.count(said) == 1
+    one = (*common, "images=images/001", "refine_cameras=0")
+    assert ghgs("predict", "cameras=splats/rig.json", "out=next", *one) == 0
+    assert said in capsys.readouterr().out
+    assert ghgs("predict", f"cameras={cameras}", "out=alone", *one) == 0
+    assert "gains: " not in capsys.readouterr().out
+    folders = [here / "splats" / "001", here / "next", here / "alone"]
+    first, second, alone = (json.loads((folder / "report.json").read_text()) for folder in folders)
+    assert first["gains"] == second["gains"]
+    for name, values in gains.items():
+        assert first["gains"][name] == pytest.approx(values, rel=1e-5)
+    assert "gains" not in alone
+    first, second, alone = (next(folder.rglob("cam0*.png")).read_bytes() for folder in folders)
+    assert first == second != alone
+
+
 def test_a_sequence_goes_on_where_an_instant_lacks_photographs(here, checkpoint, capsys):
     """Three of four predict; two do not, which is said and counted. Of nothing else there is an error."""
     for instant in ("000", "001", "002"):

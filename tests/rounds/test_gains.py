@@ -1,6 +1,7 @@
 """Cameras whose exposure differs: their gains are found, and divided out."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from ghgs_lit.data.imperfections import color_gains
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.rounds.gains import equalized, log_gains
+from ghgs_lit.rounds.gains import divided, equalized, log_gains
 from ghgs_lit.types import Gaussians
 from tests.helpers.models import make_model
 from tests.helpers.scenes import CENTER, make_batch
@@ -129,3 +130,24 @@ def test_the_model_equalizes_before_its_rounds():
     torch.testing.assert_close(plain.gaussians.colors, own)
     assert (equal.gaussians.colors - own).abs().max() > 0.02
     torch.testing.assert_close(equal.drafts[0].colors, equal.gaussians.colors)
+
+
+def test_photographs_that_are_divided_already_are_not_equalized_again():
+    """To the bit what a model without the option predicts of them, also of some views alone."""
+    batch = painted()
+    dark, logs = seen_with(batch, drawn(batch)), torch.zeros(1, 4, 3)
+    logs[0, 1] = 0.1
+    known = divided(dark, logs)
+    torch.testing.assert_close(known.images[0, 1], dark.images[0, 1] * math.exp(-0.1))
+    assert torch.equal(known.images[0, 2], dark.images[0, 2])
+    plain, equal = (
+        make_model("model=recurrent", "skip=exact", f"rounds.gains={on}").eval() for on in ("false", "true")
+    )
+    with torch.no_grad():
+        for views in (range(4), (3, 1, 2)):
+            some = known.of_views(views)
+            assert torch.equal(some.log_gains, logs[:, list(views)])
+            without = dataclasses.replace(some, log_gains=None)
+            expected, found = plain(without).gaussians.colors, equal(some).gaussians.colors
+            assert torch.equal(found, expected)
+            assert not torch.equal(equal(without).gaussians.colors, expected)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.data.decoding import check_extrinsics, check_intrinsics
+from ghgs_lit.data.decoding import check_array, check_extrinsics, check_intrinsics
 from ghgs_lit.data.view import half_centers
 from ghgs_lit.errors import InputError, choice, require
 
@@ -21,6 +21,8 @@ AXES = ("opencv", "opengl")
 INTRINSICS = ("pixels", "normalized", "normalized_principal")
 PIXEL_CENTERS = ("half", "integer")
 
+#: A camera multiplies colours by at most this beside the mean of all, and at least by one over it.
+MOST_GAIN = 2.0
 #: Between the camera axes of OpenGL (y up, z backward) and OpenCV (y down, z forward).
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
@@ -81,6 +83,7 @@ class StoredCamera:
             ``fisheye`` k1 to k4 of Kannala and Brandt's.
         fisheye: which of these models.
         mask: the photograph's mask, where the file names it.
+        gains: [3], by what it multiplies red, green and blue beside other cameras, where the file says it.
     """
 
     name: str
@@ -91,6 +94,7 @@ class StoredCamera:
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(0))
     fisheye: bool = False
     mask: Path | None = None
+    gains: np.ndarray | None = None
 
     def has_numbers_of(self, other: "StoredCamera") -> bool:
         """Whether both mean the same camera."""
@@ -108,6 +112,12 @@ class StoredCamera:
         require(bool(np.isfinite(self.distortion).all()), self.origin, "finite distortion", "NaN or infinity")
         positive = self.size is None or min(self.size) > 0
         require(positive, self.origin, "a width and a height above 0", self.size)
+        if self.gains is not None:
+            gains = check_array(f"{self.origin}: gains", self.gains, [(3,)])
+            fits = bool(((gains >= 1 / MOST_GAIN) & (gains <= MOST_GAIN)).all())
+            expected = f"numbers from {1 / MOST_GAIN:g} to {MOST_GAIN:g}"
+            require(fits, f"{self.origin}: gains", expected, gains.tolist())
+            object.__setattr__(self, "gains", gains)
 
 
 @dataclass(frozen=True)
@@ -117,13 +127,14 @@ class Calibration:
     Attributes:
         intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
         extrinsics: [4, 4] float64, world to camera, OpenCV axes.
-        distortion, fisheye: as for :class:`StoredCamera`.
+        distortion, fisheye, gains: as for :class:`StoredCamera`.
     """
 
     intrinsics: np.ndarray
     extrinsics: np.ndarray
     distortion: np.ndarray
     fisheye: bool
+    gains: np.ndarray | None = None
 
 
 def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[int, int]) -> Calibration:
@@ -150,7 +161,7 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
     intrinsics[:2] *= convention.resized
     extrinsics = extrinsics_of(camera.pose, convention)
-    return Calibration(intrinsics, extrinsics, camera.distortion, camera.fisheye)
+    return Calibration(intrinsics, extrinsics, camera.distortion, camera.fisheye, camera.gains)
 
 
 def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:

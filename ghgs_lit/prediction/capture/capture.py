@@ -10,6 +10,7 @@ import torch
 from ghgs_lit.errors import require
 from ghgs_lit.prediction.capture.crops import Photograph, crop_to_subject
 from ghgs_lit.prediction.capture.folder import CaptureFolder
+from ghgs_lit.rounds.gains import divided
 from ghgs_lit.types import Batch, Cameras
 
 
@@ -39,7 +40,8 @@ class Capture:
     def batch(self, size: tuple[int, int], refine_masks: int = 0) -> Batch:
         """Crops around the subject on a black background, as a model sees them: a batch of one element.
 
-        Cameras are in the user's world, in float64, which a world far from its origin needs.
+        Cameras are in the user's world, in float64, which a world far from its origin needs. Photographs are
+        divided by the gains of their cameras where those of all are known.
 
         Args:
             size: (height, width) of the crops in pixels.
@@ -51,7 +53,7 @@ class Capture:
             torch.from_numpy(np.stack([getattr(crop, name) for crop in crops]))[None]
             for name in ("image", "matte", "intrinsics", "extrinsics")
         )
-        return Batch(
+        batch = Batch(
             images=images.movedim(-1, 2).float() / 255,
             masks=mattes > 127,
             cameras=Cameras(intrinsics, extrinsics, *size),
@@ -59,3 +61,6 @@ class Capture:
             subjects=(self.name,),
             views=(tuple(crop.name for crop in crops),),
         )
+        gains = [crop.gains for crop in crops]
+        known = all(values is not None for values in gains)
+        return divided(batch, torch.from_numpy(np.log(gains)).float()[None]) if known else batch

@@ -22,6 +22,7 @@ class Photograph:
         matte: [h, w] uint8, 255 times the share of each pixel that shows the subject.
         intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
         extrinsics: [4, 4] float64, world to camera, OpenCV axes, in the user's unit.
+        gains: [3] float64, by what the camera multiplies colours beside others; None: it is not known.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Photograph:
     matte: np.ndarray
     intrinsics: np.ndarray
     extrinsics: np.ndarray
+    gains: np.ndarray | None = None
 
     @property
     def mask(self) -> np.ndarray:

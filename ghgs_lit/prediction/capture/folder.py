@@ -227,7 +227,8 @@ class CaptureFolder:
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
         calibration = quarter_turned(calibration, turns, size)
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
-        return Photograph(name, image, matte, calibration.intrinsics, calibration.extrinsics)
+        cameras = calibration.intrinsics, calibration.extrinsics, calibration.gains
+        return Photograph(name, image, matte, *cameras)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""

@@ -1,47 +1,55 @@
-"""Cameras of a rig that stands still, corrected once over several instants.
+"""Cameras of a rig that stands still, corrected once over several instants, and their colour gains.
 
 One instant shows one pose, often with a mask that is wrong somewhere; several together say more of the
 cameras, and cameras that are the same in all of them do not flicker.
 """
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import torch
 
+from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS
-from ghgs_lit.prediction.capture.calibration import Calibration, calibrate
+from ghgs_lit.prediction.capture.calibration import MOST_GAIN, Calibration, calibrate
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.refinement import CameraRefinement, pixels_moved
 from ghgs_lit.rendering import Renderer
+from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Cameras
 
 #: Instants, spread over a sequence, that its cameras are corrected with.
 INSTANTS = 8
+#: Median deviation of the logarithms of gains from which a camera changes its exposure between instants.
+_CHANGING = 0.05
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Corrected cameras, by name.
+    """Corrected cameras, and what else photographs of all instants share, by name.
 
     Attributes:
         extrinsics: [4, 4] float64, world to camera.
         zoom: by how much their focal lengths grow.
         moved: pixels of a crop that the correction moved the subject by.
         why: what the given cameras contradicted, where ``auto`` decided.
+        gains: [3], by what they multiply red, green and blue, with a geometric mean of 1; of those alone of
+            which it is found here.
     """
 
     extrinsics: Mapping[str, np.ndarray]
     zoom: Mapping[str, float]
     moved: Mapping[str, float]
     why: str = ""
+    gains: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with the corrected cameras."""
@@ -51,12 +59,12 @@ class Rig:
         """A camera that most instants lack stays as it is."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
         lens = self._zoomed(photograph.name, photograph.intrinsics)
-        return dataclasses.replace(photograph, intrinsics=lens, extrinsics=pose)
+        gains = self.gains.get(photograph.name, photograph.gains)
+        return dataclasses.replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
 
     def _zoomed(self, name: str, intrinsics: np.ndarray) -> np.ndarray:
-        intrinsics = intrinsics.copy()
-        intrinsics[[0, 1], [0, 1]] *= self.zoom.get(name, 1.0)
-        return intrinsics
+        zoom = self.zoom.get(name, 1.0)
+        return intrinsics * [zoom, zoom, 1.0]
 
     def calibrations(
         self, folder: CaptureFolder, captures: Sequence[Capture]
@@ -72,11 +80,10 @@ class Rig:
             size = stored.size or photograph.mask.shape
             given = calibrate(stored, folder.convention, size)
             # A photograph may be turned upright: what moved is the same before.
-            moved = np.linalg.inv(photograph.extrinsics) @ self._corrected(photograph).extrinsics
-            changed = {
-                "intrinsics": self._zoomed(name, given.intrinsics),
-                "extrinsics": given.extrinsics @ moved,
-            }
+            corrected = self._corrected(photograph)
+            moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
+            lens, pose = self._zoomed(name, given.intrinsics), given.extrinsics @ moved
+            changed = {"intrinsics": lens, "extrinsics": pose, "gains": corrected.gains}
             found[name] = (dataclasses.replace(given, **changed), size)
         return found
 
@@ -115,13 +122,34 @@ def corrected_rig(
     batch = _together(batches).to(next(model.parameters()).device)
     corrected = CameraRefinement(rounds, model, renderer, shared=True)(batch)
     before, after = batch.cameras, corrected.cameras
-    zoom = (after.intrinsics / before.intrinsics)[0, :, 0, 0].tolist()
     if torch.equal(before.extrinsics, after.extrinsics) and torch.equal(before.intrinsics, after.intrinsics):
         return None
-    extrinsics = dict(zip(names, after.extrinsics[0].double().cpu().numpy(), strict=True))
-    moved = np.mean(pixels_moved(batch, corrected), 0).tolist()
     why = f"in {len(contradicted)} of {len(captures)} instants {contradicted[0]}" if contradicted else ""
-    return Rig(extrinsics, dict(zip(names, zoom, strict=True)), dict(zip(names, moved, strict=True)), why)
+    extrinsics = after.extrinsics[0].double().cpu().numpy()
+    zoom = (after.intrinsics / before.intrinsics)[0, :, 0, 0].tolist()
+    moved = np.mean(pixels_moved(batch, corrected), 0).tolist()
+    gains = shared_gains(corrected, model)
+    by_name = (dict(zip(names, values, strict=True)) for values in (extrinsics, zoom, moved))
+    return Rig(*by_name, why, {} if gains is None else dict(zip(names, gains, strict=True)))
+
+
+@torch.no_grad()
+def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
+    """By what the cameras [V, 3] of several instants multiply colours: the median, and 1 in the mean of all.
+
+    None: exposures change from instant to instant, photographs are divided by gains already, or the model
+    does not ask for any. ``batch``: an element for each instant, in the world.
+    """
+    if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
+        return None
+    batch = Frame.of(batch).enter(batch)
+    each = log_gains(model(batch).gaussians, batch)
+    logs = each.quantile(0.5, 0)
+    if (each - logs).abs().quantile(0.5, 0).max() > _CHANGING:
+        return None
+    logs = (logs - logs.mean(0)).double()
+    scale = (math.log(MOST_GAIN) / logs.abs().amax(0)).clamp(max=1)
+    return torch.exp(logs * scale).clamp(1 / MOST_GAIN, MOST_GAIN).cpu().numpy()
 
 
 def _names(capture: Capture) -> tuple[str, ...]:
@@ -130,13 +158,11 @@ def _names(capture: Capture) -> tuple[str, ...]:
 
 def _together(batches: Sequence[Batch]) -> Batch:
     """The instants as the elements of one batch."""
-    images, masks, alpha, lenses, poses = (
-        torch.cat(parts)
-        for parts in zip(
-            *((b.images, b.masks, b.alpha, b.cameras.intrinsics, b.cameras.extrinsics) for b in batches),
-            strict=True,
-        )
-    )
-    cameras = Cameras(lenses, poses, *masks.shape[2:])
+    names = ("images", "masks", "alpha", "log_gains")
+    known = [name for name in names if getattr(batches[0], name) is not None]
+    parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}
+    lenses = torch.cat([batch.cameras.intrinsics for batch in batches])
+    poses = torch.cat([batch.cameras.extrinsics for batch in batches])
     subjects, views = zip(*((b.subjects[0], b.views[0]) for b in batches), strict=True)
-    return Batch(images, masks, cameras, alpha=alpha, subjects=subjects, views=views)
+    cameras = Cameras(lenses, poses, *parts["masks"].shape[2:])
+    return Batch(**parts, cameras=cameras, subjects=subjects, views=views)

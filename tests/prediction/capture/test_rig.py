@@ -1,17 +1,21 @@
-"""Cameras that several instants share: what is corrected, and the file that says so."""
+"""Cameras and colour gains that several instants share: what is found, and the file that says so."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.capture import rig as rig_module
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
-from ghgs_lit.prediction.capture.rig import Rig, corrected_rig
+from ghgs_lit.prediction.capture.predict import predict
+from ghgs_lit.prediction.capture.rig import Rig, corrected_rig, shared_gains
 from ghgs_lit.rendering import Renderer
 from tests.helpers.figures import Figure
 
@@ -138,3 +142,115 @@ def test_a_camera_that_most_instants_lack_stays_as_it_is(tmp_path, asked, model)
     found = rig.calibrations(folder, [*three, whole[3]])
     assert list(found) == NAMES
     np.testing.assert_allclose(found["cam3"][0].extrinsics, last.extrinsics, atol=1e-12)
+
+
+#: Two cameras 15 % off, one a little blue; the product over the cameras is 1.
+GAINS = np.array([[0.85, 0.85, 0.85], [1.15, 1.15, 1.15], [1.0, 1.0, 1.0], [1.0, 1.0, 1.1]])
+GAINS = GAINS / np.exp(np.log(GAINS).mean(0))
+
+
+def seen_with(path, gains, seed=0):
+    """A figure's photographs, which no gain makes too bright, by cameras with these gains."""
+    figure = Figure(seed=seed)
+    dim = np.round((60 + 0.45 * figure.images) * np.reshape(gains, (-1, 1, 1, 3)))
+    figure.images = dim.astype(np.uint8)
+    return figure.write(path)
+
+
+def test_gains_are_found_once_written_and_used_by_the_next_capture(tmp_path, asked, monkeypatch):
+    """Of three instants one has other exposures, which does not count."""
+    model = GHGS.from_checkpoint()
+    for instant, gains in enumerate((GAINS, GAINS, GAINS[::-1])):
+        cameras = seen_with(tmp_path / "images" / str(instant), gains, seed=instant)
+    folder = CaptureFolder(tmp_path / "images", cameras)
+    given = [Capture(name, folder.photographs(name)) for name in folder.instants]
+    rig = corrected_rig(given, model, (112, 112), 1, 0, Renderer())
+    assert list(rig.gains) == NAMES
+    found = np.array(list(rig.gains.values()))
+    np.testing.assert_allclose(found, GAINS, rtol=0.03)
+    np.testing.assert_allclose(found.prod(0), 1, rtol=1e-5)
+
+    path = tmp_path / "rig.json"
+    path.write_text(json_text(rig.calibrations(folder, given)))
+    next_one = CaptureFolder(tmp_path / "images" / "1", path)
+    capture = Capture("next", next_one.photographs(*next_one.instants))
+    monkeypatch.setattr("ghgs_lit.rounds.rounds.equalized", None)  # what an instant would guess with
+    result = predict(capture, model, (112, 112), refine_cameras=0, refine_masks=0)
+    plain = given[1].batch((112, 112))
+    np.testing.assert_allclose(result.batch.log_gains[0].exp(), found, rtol=1e-6)
+    factors = torch.from_numpy(found).float()[..., None, None]
+    torch.testing.assert_close(result.batch.images[0] * factors, plain.images[0])
+    again = corrected_rig([capture, capture], model, (112, 112), 1, 0, Renderer())
+    assert not again.gains
+    assert asked.batches[-1].log_gains is not None
+    for name, (camera, _) in again.calibrations(next_one, [capture]).items():
+        np.testing.assert_array_equal(camera.gains, rig.gains[name])
+
+
+def test_gains_of_some_cameras_alone_are_not_used(tmp_path):
+    """An instant then finds them itself, from photographs as they are, to the bit."""
+    path = seen_with(tmp_path, GAINS)
+    cameras = json.loads(path.read_text())["cameras"]
+    for name, gains in list(zip(NAMES, GAINS.tolist(), strict=True))[:3]:
+        cameras[name]["gains"] = gains
+    (tmp_path / "some.json").write_text(json.dumps({"cameras": cameras}))
+    some, without = (Capture.read(tmp_path, tmp_path / name) for name in ("some.json", "cameras.json"))
+    np.testing.assert_array_equal(some.photographs[0].gains, GAINS[0])
+    assert some.photographs[3].gains is None
+    one, other = (capture.batch((56, 56)) for capture in (some, without))
+    assert one.log_gains is None
+    assert torch.equal(one.images, other.images)
+    photograph = Capture(some.name, some.photographs[:3]).batch((56, 56))
+    assert not torch.equal(photograph.images, one.images[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("gains", "says"),
+    [
+        ([1.0, 1.0], "expected an array 3; found 2"),
+        (0.9, "expected an array 3; found "),
+        ([1.0, 1.0, "red"], "expected an array 3; found could not convert"),
+        ([1.0, 1.0, float("nan")], "expected finite numbers"),
+        ([1.0, 0.0, 1.0], "expected numbers from 0.5 to 2; found"),
+        ([1.0, 2.1, 1.0], "expected numbers from 0.5 to 2; found"),
+    ],
+)
+def test_wrong_gains_of_a_file_are_refused(tmp_path, gains, says):
+    figure = Figure()
+    path = figure.write(
+        tmp_path, cameras={**figure.cameras, "cam2": {**figure.cameras["cam2"], "gains": gains}}
+    )
+    with pytest.raises(InputError) as refused:
+        Capture.read(tmp_path, path)
+    assert str(refused.value).startswith(f"{path}: cam2: gains: {says}")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("each", "expected"),
+    [
+        ([-1.5, 0.5, 0.5, 0.5], [-0.6931, 0.231, 0.231, 0.231]),
+        ([0.3, 0.1, 0.1, 0.1], [0.15, -0.05, -0.05, -0.05]),
+    ],
+)
+def test_gains_are_bounded_with_a_mean_of_one(tmp_path, monkeypatch, model, each, expected):
+    """Too large ones of all cameras shrink alike, so that files that are written can be read."""
+    batch = captures(tmp_path, 1)[0].batch((56, 56))
+    logs = torch.tensor(each)[None, :, None].expand(1, 4, 3)
+    monkeypatch.setattr(rig_module, "log_gains", lambda gaussians, batch: logs)
+    found = shared_gains(batch, model)
+    np.testing.assert_allclose(np.log(found), np.repeat(np.array(expected)[:, None], 3, 1), atol=1e-3)
+    np.testing.assert_allclose(found.prod(0), 1, rtol=1e-6)
+    assert 0.5 <= found.min() < 1 < found.max() <= 2
+
+
+def test_exposures_that_change_are_left_to_each_instant(tmp_path, monkeypatch, model):
+    """A camera that gets brighter by a third over eight instants; noise of 2 % is none."""
+    batch = rig_module._together([capture.batch((56, 56)) for capture in captures(tmp_path, 8)])
+    logs = torch.zeros(8, 4, 3)
+    logs[:, 1] = torch.linspace(0, 0.3, 8)[:, None]
+    for noise, change in ((0.02, 0.0), (0.0, 1.0)):
+        torch.manual_seed(0)
+        seen = change * logs + noise * torch.randn(8, 4, 3)
+        monkeypatch.setattr(rig_module, "log_gains", lambda gaussians, batch, seen=seen: seen)
+        assert (shared_gains(batch, model) is None) == bool(change)

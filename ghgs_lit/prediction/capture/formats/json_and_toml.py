@@ -18,7 +18,7 @@ from ghgs_lit.prediction.capture.formats.opencv import (
     size_from_fields,
 )
 
-_KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye")
+_KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye", "gains")
 
 
 def read_json_file(path: Path) -> dict[str, Any]:
@@ -29,9 +29,9 @@ def read_json_file(path: Path) -> dict[str, Any]:
 def read_json(path: Path) -> CameraFile:
     """``{"cameras": {<name>: {...}}}``, or that mapping alone, with the keys of one of two kinds.
 
-    ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion`` and
-    ``fisheye``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there. ``K``,
-    ``R``, ``T``, ``D``: OpenCV's. InputError: a camera is missing or wrong.
+    ``intrinsics`` [3, 3], ``extrinsics`` [4, 4] or [3, 4], ``width``, ``height``, ``distortion``, ``fisheye``
+    and ``gains``: this package's conventions (:mod:`ghgs_lit.types`); only the first two must be there.
+    ``K``, ``R``, ``T``, ``D``: OpenCV's. InputError: a camera is missing or wrong.
     """
     content = read_json_file(path)
     named = _cameras_of(path, content)
@@ -78,7 +78,8 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
     pose = check_array(f"{origin}: extrinsics", camera["extrinsics"], [(4, 4), (3, 4)])
     distortion = check_array(f"{origin}: distortion", camera.get("distortion", []), [(None,)])
     size, fisheye = size_from_fields(origin, camera), bool(camera.get("fisheye", False))
-    return StoredCamera(name, origin, camera["intrinsics"], pose, size, distortion, fisheye)
+    lens, gains = camera["intrinsics"], camera.get("gains")
+    return StoredCamera(name, origin, lens, pose, size, distortion, fisheye, gains=gains)
 
 
 def write_json(path: Path, cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> None:
@@ -93,6 +94,7 @@ def json_text(cameras: Mapping[str, tuple[Calibration, tuple[int, int]]]) -> str
     entries = {
         name: camera_entry(camera.intrinsics, camera.extrinsics, size)
         | {"distortion": camera.distortion.tolist(), "fisheye": camera.fisheye}
+        | ({} if camera.gains is None else {"gains": camera.gains.tolist()})
         for name, (camera, size) in cameras.items()
     }
     return cameras_json(entries) + "\n"
