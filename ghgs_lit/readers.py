@@ -53,17 +53,17 @@ def read_text(path: Path, expected: str = "text") -> str:
 def read_json(path: Path, expected: str = "JSON") -> Any:
     """The content of a JSON file; arguments and errors as for :func:`read_text`. InputError: also where it is
     no JSON, or nested deeper than 64 levels."""
-    return _parsed(path, expected, json.loads)
+    return read_parsed(path, expected, json.loads)
 
 
 def read_yaml(path: Path) -> Any:
     """The plain data of a YAML file; as :func:`read_json`, and without aliases, which grow without limit."""
-    return _parsed(path, "YAML", _plain_yaml)
+    return read_parsed(path, "YAML", _plain_yaml)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
     """The lines of a CSV file by the names of its header; errors as for :func:`read_text`."""
-    return _parsed(
+    return read_parsed(
         path, "CSV with a header", lambda text: list(csv.DictReader(io.StringIO(text, newline="")))
     )
 
@@ -94,24 +94,47 @@ def read_npy(path: Path, expected: str = "a readable .npy file") -> "np.ndarray"
 
 
 def _plain_yaml(text: str) -> Any:
-    level = 0
-    for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError("an alias (*name)")
-        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if level > DEEPEST:
-            raise ValueError(f"more than {DEEPEST} levels")
+    check_yaml(text, aliases=False)
     return yaml.safe_load(text)
 
 
-def _parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
+def check_yaml(text: str, aliases: bool = True) -> None:
+    """Whether YAML may be loaded. ValueError: it is nested deeper than 64 levels, or has aliases, which are
+    not allowed or make it more than a million values; yaml.YAMLError: it is no YAML."""
+    sizes: dict[str | None, int] = {}
+    unfinished: list[list[Any]] = [[None, 0]]
+    for event in yaml.parse(text, yaml.SafeLoader):
+        match event:
+            case yaml.CollectionStartEvent():
+                unfinished.append([event.anchor, 1])
+                if len(unfinished) > DEEPEST + 1:
+                    raise ValueError(f"more than {DEEPEST} levels")
+                continue
+            case yaml.CollectionEndEvent():
+                anchor, size = unfinished.pop()
+            case yaml.ScalarEvent():
+                anchor, size = event.anchor, 1
+            case yaml.AliasEvent():
+                if not aliases or event.anchor not in sizes:
+                    raise ValueError("an alias (*name)")
+                anchor, size = event.anchor, sizes[event.anchor]
+            case _:
+                continue
+        sizes[anchor] = size
+        unfinished[-1][1] += size
+        if unfinished[-1][1] > 1e6:
+            raise ValueError("aliases (*name) of more than a million values")
+
+
+def read_parsed(path: Path, expected: str, parse: Callable[[str], Any]) -> Any:
+    """What ``parse`` makes of a file of text; other arguments and errors as for :func:`read_json`."""
     try:
         value = parse(read_text(path, expected))
         if _levels(value) > DEEPEST:
             raise ValueError(f"more than {DEEPEST} levels")
     except InputError:
         raise
-    except (ValueError, RecursionError, yaml.YAMLError, csv.Error) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, yaml.YAMLError, csv.Error) as error:
         raise InputError(f"{path}: expected {expected}; found {error}") from error
     return value
 

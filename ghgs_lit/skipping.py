@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import model_validator
 from torch import Tensor
 
-from ghgs_lit.config.options import Amount, Count, Index, Options, Text
+from ghgs_lit.config.options import Amount, Count, Options, Patches, Text
 from ghgs_lit.types import Decision, DecodedPixels
 
 
@@ -50,7 +50,7 @@ class Preset(Options):
     tokens: Literal["all", "window", "subject"] = "all"
     """Patches that the encoder works on: all, those of the smallest rectangle around the subject (window), or
     the subject's."""
-    margin: Index = 1
+    margin: Patches = 1
     """Patches around the window or the subject that stay."""
     pixels: DecodedPixels = "subject"
     """Pixels that the dense heads decode: whole views, or windows around the subject. The depth head decodes

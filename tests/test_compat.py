@@ -66,7 +66,7 @@ def test_the_releases_protocol_of_measuring_comes_with_it(verb):
     chosen = OmegaConf.to_container(compose(verb, ["compat=release", "metrics=correct"]))
     assert cfg["metrics"]["protocol"] == "release"
     assert cfg["metrics"]["regions"] == ["image"]
-    assert cfg["metrics"]["protocol"] == "release"
+    assert cfg["metrics"]["lpips"] == "require"  # it is not dropped beside the paper's
     assert chosen["metrics"]["protocol"] == "correct"
 
 

@@ -54,10 +54,7 @@ class SubjectBox(Options):
             coarse = silhouettes(batch.masks, batch.cameras, RESOLUTION, self.dilation)
             voting = self._voting(coarse)
             lower, upper = subject_box(
-                coarse.masks & voting[..., None, None],
-                coarse.cameras,
-                coarse.dilation,
-                self.tolerance,
+                coarse.masks & voting[..., None, None], coarse.cameras, coarse.dilation, self.tolerance
             )
             return self._within(batch, coarse, voting, lower - MARGIN, upper + MARGIN)
 

@@ -7,12 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import (
-    at_least_float32,
-    inverse_intrinsics,
-    pixel_centers,
-    world_to_camera,
-)
+from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, world_to_camera
 from ghgs_lit.types import Cameras, DepthBounds
 
 

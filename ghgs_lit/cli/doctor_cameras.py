@@ -21,6 +21,8 @@ _LISTED = 6
 def run(cfg: DictConfig) -> None:
     """Print what was found; write ``cameras.png``, and ``cameras.json`` of a meaning that fits. InputError:
     the cameras do not fit as they are."""
+    tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
+    require(cfg.images is not None, "images", tasks, None)
     directory = output_dir()
     folder = capture_folder(save_config(cfg, directory))
     inputs = {path.resolve() for path in folder.input_files}

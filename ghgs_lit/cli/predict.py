@@ -156,11 +156,7 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
 
 
 def shared_by(
-    folder: CaptureFolder,
-    model: GHGS,
-    size: tuple[int, int],
-    refining: Mapping[str, Any],
-    renderer: Renderer,
+    folder: CaptureFolder, model: GHGS, size: tuple[int, int], refining: Mapping[str, Any], renderer: Renderer
 ) -> tuple[Backgrounds, Rig | None, bytes]:
     """What the instants of a sequence share, found over some of them: backgrounds; the cameras, corrected,
     which is said; and the content of their file. None: they stay, and have no file."""

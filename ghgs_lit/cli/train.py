@@ -170,12 +170,7 @@ def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> flo
     renderer, losses = build(config["renderer"], "renderer"), build(config["loss"], "loss")
     data.trains_on_depths &= getattr(losses, "reads_depths", True)  # a plug-in's may not say
     module = GHGSModule(
-        model,
-        renderer,
-        losses,
-        build(config["optimizer"], "optimizer"),
-        config,
-        config.get("token_budgets"),
+        model, renderer, losses, build(config["optimizer"], "optimizer"), config, config.get("token_budgets")
     )
     quiet()
     cost = TrainingCost()

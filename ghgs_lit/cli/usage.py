@@ -30,10 +30,7 @@ VERBS = {
         "whether cameras and masks fit together, what this machine lacks, whether a GPU computes well",
         "ghgs doctor task=cameras images=photographs cameras=cameras.json masks=masks",
     ),
-    "view": (
-        "a page in the browser to look around in a prediction",
-        "ghgs view path=runs/predict/...",
-    ),
+    "view": ("a page in the browser to look around in a prediction", "ghgs view path=runs/predict/..."),
     "import": (
         "published weights to a checkpoint",
         "ghgs import vggt=facebook/VGGT-1B release=release.pth out=release.ckpt",

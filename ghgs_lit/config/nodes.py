@@ -59,22 +59,22 @@ class Turntable(Options):
 
     frames: int = Field(24, ge=0, le=2000)
     """Number of pictures (0: none); more than 2000 fill a disk before anybody looks."""
-    fps: Count = 12
-    """Pictures per second of a video."""
+    fps: int = Field(12, ge=1, le=1000)
+    """Pictures per second of a video; no player shows more than 1000."""
 
 
 class PerScene(Options):
     """3D Gaussian splatting on each subject's inputs."""
 
-    steps: Count = 200
-    """Steps of optimisation."""
+    steps: int = Field(200, ge=1, le=100000)
+    """Steps of optimisation; whole scenes are published with 30000."""
 
 
 class Timing(Options):
     """How times are taken."""
 
-    repeats: Count = 9
-    """Rounds that count; each runs all presets, and each begins with another one."""
+    repeats: int = Field(9, ge=1, le=1000)
+    """Rounds that count, enough of them at 1000; each runs all presets, and each begins with another one."""
 
 
 class Check(Options):

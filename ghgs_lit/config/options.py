@@ -46,10 +46,15 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 Workers = Annotated[int, Field(ge=0, le=1024)]
 Width = Annotated[int, Field(ge=1, le=65536)]
+#: Patches of a photograph: none has more than pixels along a side.
+Patches = Annotated[int, Field(ge=0, le=8192)]
 # A photograph of more pixels would need gigabytes before anything could refuse it.
 Side = Annotated[int, Field(ge=1, le=8192)]
 #: A side or [height, width] in pixels; read as (height, width).
 Size = Annotated[Side | tuple[Side, Side], AfterValidator(_pair)]
+CropSide = Annotated[int, Field(ge=1, le=2072)]
+#: The same of what a model sees.
+CropSize = Annotated[CropSide | tuple[CropSide, CropSide], AfterValidator(_pair)]
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

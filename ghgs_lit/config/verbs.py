@@ -5,23 +5,16 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
-from ghgs_lit.config.nodes import (
-    Check,
-    PairedTest,
-    PerScene,
-    Sequence,
-    Texts,
-    Timing,
-    Turntable,
-)
+from ghgs_lit.config.nodes import Check, PairedTest, PerScene, Sequence, Texts, Timing, Turntable
 from ghgs_lit.config.options import (
     Count,
+    CropSize,
     Index,
     Options,
+    Patches,
     Path,
     Positive,
     Seed,
-    Size,
     Text,
     Workers,
 )
@@ -30,7 +23,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["inherit", "float32", "bfloat16", "float16", "auto"]
 Axis = Literal["y", "-y", "z"]
 #: One entry of ``token_budgets``.
-Budget = Literal["all", "window"] | Index
+Budget = Literal["all", "window"] | Patches
 Budgets = Annotated[tuple[Budget, ...], Field(min_length=1)]
 
 
@@ -105,8 +98,9 @@ class Predict(Photographs, Measured):
     """The one that comes with the package, or a file of ``ghgs train`` or ``ghgs import``."""
     check_cameras: bool = True
     """Refuse cameras that the masks contradict (``ghgs doctor task=cameras`` says more)."""
-    size: Size | None = None
-    """Side or [height, width] of what the model sees, in pixels; null: as it was trained."""
+    size: CropSize | None = None
+    """Side or [height, width] of what the model sees, in pixels; null: as it was trained. At most 2072, four
+    times the published 518: memory grows with its square."""
     refine_masks: Literal["auto"] | Annotated[int, Field(ge=0, le=64)] = "auto"
     """Pixels of size that masks may be off by: photographs say where outlines are; 0: none; auto: 4 where
     photographs contradict the masks (of images alone, not of a data set)."""
@@ -206,8 +200,8 @@ class Benchmark(Measured):
     """Number of subjects, the first of the split; null: all."""
     timing: Timing = Timing()
     """How times are taken."""
-    threads: Count | None = None
-    """Threads of PyTorch; null: as many as it chooses."""
+    threads: int | None = Field(None, ge=1, le=1024)
+    """Threads of PyTorch, of which no machine has more than 1024; null: as many as it chooses."""
 
 
 class Export(Options):

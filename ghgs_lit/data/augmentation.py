@@ -6,11 +6,12 @@ A batch is a function of (seed, step, index) alone, as its samples are, so that 
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from ghgs_lit.config import options
@@ -34,6 +35,8 @@ _SIZES, _IMPERFECTIONS, _CHANCE = 3, 4, 5
 HOLE = 0.12
 
 Size = tuple[int, int]
+Stops = Annotated[float, Field(ge=0, le=16)]
+Pixels = Annotated[float, Field(ge=0, le=64)]
 
 
 class Augmentation(Options):
@@ -55,20 +58,20 @@ class Augmentation(Options):
     """Share of the steps whose inputs are imperfect in the ways below."""
     exact_from: Count | None = None
     """Step of training from which all inputs are exact: the last part of a run; null: never."""
-    exposure: Amount = 0.0
-    """Stops: greatest deviation of single cameras."""
-    white_balance: Amount = 0.0
+    exposure: Stops = 0.0
+    """Stops: greatest deviation of single cameras; 16 are from black to white."""
+    white_balance: Stops = 0.0
     """Stops: greatest deviation of red and of blue of single cameras."""
     gamma: Amount = 0.0
     """Greatest natural logarithm of the power to which single cameras raise colours: their tone curves."""
     cut: Share = 0.0
     """Share of the samples whose feet or legs are outside the frame: in all photographs, or in some."""
-    mask_offset: Amount = 0.0
-    """Pixels that masks grow or shrink by at most; inputs are then black outside their masks."""
-    mask_ragged: Amount = 0.0
+    mask_offset: Pixels = 0.0
+    """Pixels that masks grow or shrink by at most; inputs are then black outside them."""
+    mask_ragged: Pixels = 0.0
     """Pixels: greatest height of bumps of the outlines of masks."""
-    mask_hole_chance: Amount = 0.0
-    """How often a piece of a mask is missing, of a diameter of up to 0.12 of the subject's height, 0 to 1."""
+    mask_hole_chance: Share = 0.0
+    """How often a piece of a mask is missing, of a diameter of up to 0.12 of the subject's height."""
     background: Share = 0.0
     """Share of samples with wrong masks that were taken before a background, which a mask that is too large
     shows; behind the others it is black."""

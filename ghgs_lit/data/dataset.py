@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from pydantic import Field
+
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Amount, Count, Index, Options, Size, Text, Workers
 from ghgs_lit.data.augmentation import Augmentation
@@ -53,8 +55,8 @@ class DataOptions(Options):
     resampling: Literal["area", "release"] = "area"
     """area: means over exact areas, everything stays at its place. release: as the authors' code reads
     (photographs by Pillow's bicubic filter, masks by OpenCV's nearest neighbour)."""
-    batch_size: Count = 1
-    """Samples of one step in each process."""
+    batch_size: int = Field(1, ge=1, le=1024)
+    """Samples of one step in each process, all in memory at once: at most 1024."""
     steps_per_epoch: Count | None = None
     """Training steps of an epoch; null: one pass over the subjects."""
     cache_images_mb: Amount = 512

@@ -49,9 +49,7 @@ class Aggregator(nn.Module):
         return torch.cat((tokens[:1], tokens[1:].expand(views - 1, -1, -1)))
 
     def forward(
-        self,
-        images: Float[Tensor, "b v i H W"],
-        kept: KeptPatches,
+        self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
         """Tokens of the layers that are read out. Returns: For each layer in ``layers`` the packed tokens
         after its frame block and after its global block, special tokens included; and the patch tokens that

@@ -6,9 +6,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
-def first_and_last(
-    hits: Bool[Tensor, "*batch n"],
-) -> tuple[Int[Tensor, "*batch"], Int[Tensor, "*batch"]]:
+def first_and_last(hits: Bool[Tensor, "*batch n"]) -> tuple[Int[Tensor, "*batch"], Int[Tensor, "*batch"]]:
     """Index of the first and of the last True along the last axis; ``n`` and -1 where there is none."""
     count = hits.shape[-1]
     index = torch.arange(count, device=hits.device)

@@ -51,5 +51,5 @@ def undistort(image: np.ndarray, matte: np.ndarray, grid: torch.Tensor) -> tuple
     layers = np.concatenate((image, matte[..., None]), -1)
     stacked = torch.from_numpy(layers).permute(2, 0, 1)[None].float()
     sampled = F.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    sampled = np.round(sampled[0].permute(1, 2, 0).numpy()).astype(np.uint8)
+    sampled = np.round(sampled[0].nan_to_num().permute(1, 2, 0).numpy()).astype(np.uint8)
     return sampled[..., :3], sampled[..., 3]

@@ -30,10 +30,7 @@ class Part:
 
 
 def decode(
-    dpt: DPTHead,
-    tokens: Tokens,
-    guide: Guide | None,
-    windows: Sequence[Window | None] | None,
+    dpt: DPTHead, tokens: Tokens, guide: Guide | None, windows: Sequence[Window | None] | None
 ) -> Iterator[Part]:
     """Maps of the windows of the images, in their order.
 

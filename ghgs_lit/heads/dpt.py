@@ -185,10 +185,7 @@ class DPTHead(nn.Module):
         self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 
     def forward(
-        self,
-        tokens: Tokens,
-        guide: Guide | None = None,
-        window: Window | None = None,
+        self, tokens: Tokens, guide: Guide | None = None, window: Window | None = None
     ) -> Float[Tensor, "bv o h w"]:
         """Raw maps of all images, float32 or wider; under float16 autocast all of it is computed in float32.
         ``guide``: where ``guide_channels`` is not 0; of whole images. ``window``: the part of the maps that

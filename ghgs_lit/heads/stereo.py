@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from ghgs_lit.config.options import Count, Options
+from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, project, unproject
 from ghgs_lit.geometry.sampling import sample
@@ -40,8 +40,8 @@ class StereoHeadOptions(Options):
     group = "depth_head"
     consistency_depths: int = Field(48, ge=2 ** (LEVELS - 1), le=4096)
     """Inverse depths from near to far at which neighbouring views are correlated."""
-    updates: Count = 3
-    """Updates of the inverse depth by the GRU; 3 as published."""
+    updates: int = Field(3, ge=1, le=64)
+    """Updates of the inverse depth by the GRU; 3 as published, and no stereo method takes more than 64."""
 
     def build(self, dim_latent: int) -> "StereoHead":
         """The stage; it reads no tokens."""

@@ -63,10 +63,7 @@ class SemanticAttention(nn.Module):
         self.mlp = nn.Sequential(Linear(dim, dim), nn.GELU(), Linear(dim, dim))
 
     def forward(
-        self,
-        x: Float[Tensor, "N C"],
-        neighbors: Sequence[Neighbors],
-        cosines: Sequence[Tensor] | None,
+        self, x: Float[Tensor, "N C"], neighbors: Sequence[Neighbors], cosines: Sequence[Tensor] | None
     ) -> Float[Tensor, "N C"]:
         """Recalibrated tokens.
 

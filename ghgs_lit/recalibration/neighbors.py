@@ -37,10 +37,7 @@ class Neighbors:
 
 @torch.no_grad()
 def nearest_neighbors(
-    points: Float[Tensor, "n d"],
-    view: Int[Tensor, " n"],
-    k: int,
-    places: Int[Tensor, " n"] | None = None,
+    points: Float[Tensor, "n d"], view: Int[Tensor, " n"], k: int, places: Int[Tensor, " n"] | None = None
 ) -> Neighbors:
     """The ``min(k, n)`` nearest points of each point in any view, itself included, nearest first.
 

@@ -19,7 +19,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ghgs_lit.bounds.rays import ray_directions
-from ghgs_lit.config.options import Count, Options, Width
+from ghgs_lit.config.options import Options, Width
 from ghgs_lit.geometry.photo_consistency import consistency_of
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.heads.activations import bounded_tanh
@@ -102,18 +102,23 @@ def replaced(activate: Activate, training: bool) -> Activate:
     return torch.no_grad()(activate) if training else activate
 
 
+#: Of rounds.
+Number = Annotated[int, Field(ge=1, le=32)]
+
+
 class RoundsOptions(Options):
     """Rounds that render the inputs, compare them with the photographs and correct the Gaussians."""
 
     group = "rounds"
-    count: Count = 2
-    """Number of rounds; in prediction any number."""
-    training_counts: Annotated[tuple[Count, ...], Field(min_length=1)] = (1, 2, 3)
+    count: Number = 2
+    """Number of rounds; in prediction any up to 32, where halving has left nothing to change."""
+    training_counts: Annotated[tuple[Number, ...], Field(min_length=1)] = (1, 2, 3)
     """Numbers of rounds, of which each training step draws one, so that any number works."""
     hidden: Width = 48
     """Width of the network."""
-    depths: Count = 8
-    """Number of depths around the current one at which a round compares the photographs."""
+    depths: int = Field(8, ge=1, le=4096)
+    """Number of depths around the current one at which a round compares the photographs; 4096 are finer than
+    their pixels."""
     gains: bool = True
     """Photographs of cameras whose exposure differs are made alike first, where a rig does not know them."""
     exchange: Width | None = 16

@@ -1,5 +1,6 @@
 """The sweeper of ``conf/hydra/sweeper/grid.yaml``: launches the runs of a grid that are not done."""
 
+import itertools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
 
@@ -26,6 +28,7 @@ from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between two looks at runs that other processes work on
+_MOST_RUNS = 10_000  # of a sweep
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 
@@ -78,8 +81,20 @@ def combinations(
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
     own = parser.parse_overrides([f"{k}={v}" for k, v in (params or {}).items() if k not in keys])
+    _require_few([*own, *given])
     (batch,) = BasicSweeper.split_arguments([*own, *given], None)
     return batch
+
+
+def _require_few(overrides: Sequence[Override]) -> None:
+    """Refuse a grid that would take all memory before any of its runs starts."""
+    count = 1
+    for override in overrides:
+        if override.is_sweep_override() and override.is_discrete_sweep():
+            # Not the iterator of a range, which would list it to shuffle it.
+            values = override.value().range() if override.is_range_sweep() else override.sweep_iterator()
+            count *= sum(1 for _ in itertools.islice(values, _MOST_RUNS + 1))
+            require(count <= _MOST_RUNS, override.key_or_group, f"at most {_MOST_RUNS} runs", "more")
 
 
 def plan(combos: Sequence[Sequence[str]], compose: Callable[[list[str]], DictConfig]) -> list[PlannedRun]:

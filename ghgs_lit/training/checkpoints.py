@@ -11,8 +11,9 @@ import lightning.pytorch as L
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from pydantic import Field
 
-from ghgs_lit.config.options import Index, Options, Positive, Text
+from ghgs_lit.config.options import Index, Options, Text
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights import frozen
@@ -82,7 +83,7 @@ class CheckpointOptions(Options):
     """Logged value that is compared at each validation, the higher the better; null: none."""
     every_n_train_steps: Index | None = None
     """Steps between two checkpoints."""
-    minutes: Positive | None = None
+    minutes: float | None = Field(None, gt=0, le=1e6)
     """Minutes between two checkpoints, beside every_n_train_steps."""
 
     def build(self) -> "Checkpoints":

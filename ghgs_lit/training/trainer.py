@@ -8,11 +8,13 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
 from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Amount, Count, Index, Options, Share, Text
+from ghgs_lit.config.options import Count, Index, Options, Share, Text
 from ghgs_lit.errors import InputError
 
+#: Numbers of which no sum of days is too large for Python.
 Duration = Annotated[
-    Annotated[str, Field(pattern=r"^\d+(:\d+){3}$")] | dict[str, Amount],
+    Annotated[str, Field(pattern=r"^\d{1,8}(:\d{1,9}){3}$")]
+    | dict[str, Annotated[float, Field(ge=0, le=1e8)]],
     Words("days:hours:minutes:seconds such as 00:00:10:00"),
 ]
 
@@ -23,8 +25,9 @@ class TrainerOptions(Options):
     group = "trainer"
     accelerator: Text = "gpu"
     """gpu, cpu or auto."""
-    devices: Count | tuple[Index, ...] | Literal[-1, "auto"] = 1
-    """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters."""
+    devices: Annotated[int, Field(ge=1, le=64)] | tuple[Index, ...] | Literal[-1, "auto"] = 1
+    """Number of processes, or a list of GPUs; several are DDP, in which each has all parameters. At most 64,
+    as each starts at once on a CPU."""
     precision: Text | Literal[16, 32, 64] = "32-true"
     """32-true (the paper's), tf32, bf16-mixed or 16-mixed; geometry is float32 in each."""
     max_steps: int = Field(200000, ge=-1)

@@ -115,8 +115,7 @@ def _open_safetensors(path: Path) -> "dict[str, Tensor]":
 
 
 def cast(
-    open_tensors: "Callable[[], Mapping[str, Tensor]]",
-    dtype_of: "Callable[[str, torch.dtype], torch.dtype]",
+    open_tensors: "Callable[[], Mapping[str, Tensor]]", dtype_of: "Callable[[str, torch.dtype], torch.dtype]"
 ) -> "dict[str, Tensor]":
     """The tensors of a mapped file, converted to the precision that ``dtype_of`` chooses.
 

@@ -38,6 +38,8 @@ def files(tmp_path_factory):
     places["loop"].symlink_to(folder / "back")
     (folder / "back").symlink_to(places["loop"])
     (places["yaml"] / "views").mkdir(parents=True)
+    (places["yaml"] / "bounds").mkdir()
+    (places["yaml"] / "bounds" / "calls.yaml").write_text("kind: hull\n_target_: os.system\n")
     (places["yaml"] / "views" / "cut.yaml").write_text("name: cut\ntraining_counts: [3\n")
     (places["yaml"] / "views" / "tagged.yaml").write_text("name: !!python/object/apply:os.getcwd []\n")
     (places["broken"] / "run").mkdir(parents=True)

@@ -1,9 +1,12 @@
 """The command line: verbs, one-line errors, exit codes, completion."""
 
 import importlib
+import logging
 import os
+import re
 import subprocess
 import sys
+import warnings
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -16,6 +19,7 @@ from ghgs_lit.cli.application import discard_unused
 from ghgs_lit.cli.messages import flags_first
 from ghgs_lit.cli.runtime import write_config
 from ghgs_lit.config import compose, conf_dir
+from ghgs_lit.config.verbs import VERBS
 from tests.helpers.processes import run_python
 from tests.helpers.verbs import ghgs
 
@@ -120,6 +124,27 @@ def test_help_of_a_verb_and_of_a_group(monkeypatch, capsys, tmp_path):
     code, _, err = call(monkeypatch, capsys, "train", "--help", "depth_heat")
     assert code == 1
     assert "found 'depth_heat' (did you mean depth_head?)" in err
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_every_verb_names_its_keys(monkeypatch, capsys, verb):
+    code, out, _ = call(monkeypatch, capsys, verb, "--help")
+    assert code == 0
+    for name in VERBS[verb].model_fields:
+        assert re.search(rf"^ *{name}( |\.|:|$)", out, re.MULTILINE), name
+
+
+def test_what_lightning_says_of_itself_is_not_shown():
+    """Its lines came twice, and its advice is for other programs."""
+    from ghgs_lit.cli.train import quiet
+
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        quiet()
+        warnings.warn("'train_dataloader' does not have many workers: increase `num_workers`", stacklevel=1)
+        warnings.warn("Checkpoint directory a exists and is not empty.", stacklevel=1)
+    assert shown == []
+    assert not logging.getLogger("lightning.pytorch.utilities.rank_zero").isEnabledFor(logging.INFO)
 
 
 def test_cfg_is_hydras(monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 from typing import get_origin
 
 import pytest
@@ -9,9 +10,10 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import compose, conf_dir, resolve
-from ghgs_lit.config.describe import meanings, options_of
+from ghgs_lit.config.describe import expected, meanings, options_of
 from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.registry import KINDS, NAMED, check, class_of
+from ghgs_lit.config.verbs import VERBS as OPTIONS
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed, verb_with
 
@@ -64,6 +66,40 @@ def test_every_field_has_a_meaning(group, kind):
                 check(nested)
 
     check(class_of(group, kind, group))
+
+
+#: Integers that need no limit, by the reason: no value hangs or takes all memory.
+UNLIMITED = {
+    "there are no more": """
+        subjects subject limit.train limit.val pictures k tolerance chamfer_points limit_val_batches
+        start stop step split frames cameras""",
+    "refused where there are fewer": """
+        evaluation_positions positions views evaluation_count training_counts per_subject per_step layers
+        token sequences""",
+    "how seldom something comes": """
+        every every_n_train_steps log_every_n_steps val_check_interval exact_from""",
+    "the end of a run or epoch comes first, or Ctrl-C": """
+        max_steps steps_per_epoch accumulate_grad_batches skip_nonfinite""",
+    "of a list": "devices",
+}
+
+
+def numbers(cls, prefix=""):
+    """Keys and descriptions of the fields of a class with an integer that has no upper limit."""
+    for name, field in cls.model_fields.items():
+        if (nested := options_of(field.annotation)) is not None:
+            yield from numbers(nested, f"{prefix}{name}.")
+        elif re.search(r"an integer( >=? -?\d+)?( or|\)|$)", expected(field)):
+            yield f"{prefix}{name}"
+
+
+def test_every_number_has_a_limit_or_can_do_no_harm():
+    """``skip.margin=1000000000`` and ``rounds.count=1000000000`` ran until somebody killed them."""
+    classes = [class_of(group, kind, group) for group, kind in TYPED] + list(OPTIONS.values())
+    found = {key for cls in classes for key in numbers(cls)}
+    harmless = {name for names in UNLIMITED.values() for name in names.split()}
+    assert {key for key in found if key not in harmless and key.split(".")[-1] not in harmless} == set()
+    assert "k" in found
 
 
 @pytest.fixture(scope="module")
@@ -148,5 +184,7 @@ def test_an_unknown_key_is_refused_in_every_group(whole, group):
 
 def test_resolve_checks():
     """Verbs, sweeps and saved configurations all go through ``resolve``."""
-    with pytest.raises(InputError, match=r"data\.batch_size: expected an integer >= 1; found 1\.5"):
+    with pytest.raises(
+        InputError, match=r"data\.batch_size: expected an integer >= 1 and <= 1024; found 1\.5"
+    ):
         resolve(compose("train", ["data.batch_size=1.5"]))

@@ -57,7 +57,7 @@ def test_every_key_of_a_verb_has_a_meaning(verb):
             "token_budgets=[some]",
             "token_budgets: expected a list (each one of all, window or an integer",
         ),
-        ("predict", "size=9000", "size: expected an integer >= 1 and <= 8192 or a list of 2 values"),
+        ("predict", "size=9000", "size: expected an integer >= 1 and <= 2072 or a list of 2 values"),
         ("predict", "refine=1e9", "refine: expected an integer >= 0 and <= 10000; found 1000000000.0"),
         ("predict", "turntable.frames=1000000", "turntable.frames: expected an integer >= 0 and <= 2000"),
         ("predict", "device=tpu", "device: expected one of auto, cpu, cuda; found 'tpu'"),
@@ -65,7 +65,7 @@ def test_every_key_of_a_verb_has_a_meaning(verb):
         ("predict", "calibration.unit=0", "calibration.unit: expected a number > 0 or null; found 0"),
         ("view", "port=70000", "port: expected an integer >= 0 and <= 65535; found 70000"),
         ("evaluate", "evaluation.views=[1]", "evaluation.views: expected an integer >= 2 or a list"),
-        ("benchmark", "timing.repeats=0", "timing.repeats: expected an integer >= 1; found 0"),
+        ("benchmark", "timing.repeats=0", "timing.repeats: expected an integer >= 1 and <= 1000; found 0"),
         ("table", "runs=[]", "runs: expected a text or a list of paths; found []"),
     ],
 )

@@ -237,7 +237,7 @@ def test_an_epoch_and_the_evaluation_have_the_expected_length(root):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"batch_size": 0}, "data.batch_size: expected an integer >= 1; found 0"),
+        ({"batch_size": 0}, "data.batch_size: expected an integer >= 1 and <= 1024; found 0"),
         (
             {"views": V4 | {"training_counts": [1]}},
             r"views.training_counts: expected a list \(each an integer >= 2\)",

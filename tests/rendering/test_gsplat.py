@@ -1,6 +1,8 @@
 """gsplat: its projection in PyTorch as an independent check, how it is called, and its image on a GPU."""
 
 import inspect
+import sys
+import types
 
 import pytest
 import torch
@@ -75,6 +77,15 @@ def test_gsplat_without_cuda_says_what_is_missing():
     """Without CUDA the error names the backend and the reason."""
     with pytest.raises(BackendUnavailable, match=r"renderer\.backend=gsplat.*CUDA"):
         render(cloud(5), camera_ring(1, 8, 8), "gsplat")
+
+
+@pytest.mark.parametrize("broken", [None, types.ModuleType("gsplat")])
+def test_a_broken_gsplat_says_why_it_cannot_be_loaded(monkeypatch, broken):
+    """One that was built for another PyTorch, or half removed, before anything is drawn."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", broken)
+    with pytest.raises(BackendUnavailable, match=r"`import gsplat` failed with (ModuleNotFound|Attribute)"):
+        gsplat_backend.load()
 
 
 def test_gsplat_refuses_constants_it_does_not_know():

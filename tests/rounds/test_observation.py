@@ -10,6 +10,7 @@ from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import render
+from ghgs_lit.rounds import observation
 from ghgs_lit.rounds.observation import CHANNELS, SLOPES, observe, slopes
 from ghgs_lit.types import Batch, Gaussians
 from tests.helpers.scenes import make_batch, with_soft_rims
@@ -115,8 +116,11 @@ def test_photographs_are_compared_with_renders_where_both_are_premultiplied():
     assert between[0] > between[1]
 
 
-def test_errors_are_the_photograph_minus_the_render():
+@pytest.mark.parametrize("kernel", [True, False])
+def test_errors_are_the_photograph_minus_the_render(monkeypatch, kernel):
     """Splats that are too dark have positive errors, those of their own pixel."""
+    if not kernel:
+        monkeypatch.setattr(observation, "is_supported", lambda *_: False)
     batch = make_batch(1, 3)
     dark = splats(batch)
     dark = dataclasses.replace(dark, colors=0.5 * dark.colors)

@@ -60,6 +60,11 @@ def test_a_miniature_can_be_written_again(case):
     assert file.read_text() == "miniature"
     (folder / scans.MARKER).write_text('{"files": null}')  # as a killed run leaves it
     make()
+    for foreign in ('{"files": ', "5", '{"files": "a"}', "[" * 9999):
+        (folder / scans.MARKER).write_text(foreign)
+        refused(rf"{scans.MARKER}.*: expected a (list of names|miniature's list)", make)
+    (folder / scans.MARKER).write_text('{"files": null}')
+    make()
     (folder / "mine.txt").write_text("mine")
     refused(r"found 1 other files such as mine\.txt", make)
 

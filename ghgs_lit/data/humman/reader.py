@@ -69,8 +69,9 @@ class HuMManReader(FrameReader):
     def _add(self, path: Path, frames: Sequence[int]) -> None:
         cameras = read_calibration(path / "cameras.json", "color")
         there = {k: _frames_of(path / "kinect_color" / f"kinect_{k:03d}") for k in KINECTS}
-        found = {number: tuple(k for k in KINECTS if number in there[k]) for number in frames}
-        found = {number: positions for number, positions in found.items() if positions}
+        # Not one by one: any number of frames may be asked for.
+        numbers = [number for number in sorted(set().union(*there.values())) if number in frames]
+        found = {number: tuple(k for k in KINECTS if number in there[k]) for number in numbers}
         if not found:
             raise InputError(
                 f"{path / 'kinect_color'}: expected frames such as {frames[0]:06d}.png; found none of "

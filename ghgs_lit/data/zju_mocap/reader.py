@@ -90,7 +90,7 @@ class ZJUMoCapReader(FrameReader):
         if cameras is not None and cameras > count:
             raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
         wanted = range(*frames)
-        chosen = [index for index in wanted if index < len(annotations.frames)]
+        chosen = [index for index in range(len(annotations.frames)) if index in wanted]
         if not chosen:
             raise InputError(
                 f"{path / 'annots.npy'}: expected a frame {wanted.start}; "

@@ -127,11 +127,7 @@ def _counts(prediction: Prediction) -> dict[str, float]:
 
 
 def record_cases(
-    cases: Sequence[Case],
-    batches: Sequence[Batch],
-    metrics: ImageMetrics,
-    device: torch.device,
-    repeats: int,
+    cases: Sequence[Case], batches: Sequence[Batch], metrics: ImageMetrics, device: torch.device, repeats: int
 ) -> list[Record]:
     """Measure work and error of cases on batches, then their times. ``cases``: the yardstick first.
     ``batches``: on the device, with targets."""

@@ -37,9 +37,7 @@ class Task:
 
 
 def tasks_of(
-    stages: Sequence[str] | None = None,
-    families: Sequence[str] | None = None,
-    quick: bool = False,
+    stages: Sequence[str] | None = None, families: Sequence[str] | None = None, quick: bool = False
 ) -> list[Task]:
     """Everything to run; None: all stages or families. InputError: a name that is not known."""
     stages = _chosen("stages", stages, tuple(STAGES))

@@ -27,6 +27,8 @@ MOST_GAIN = 2.0
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Video is coded in blocks of 16 pixels: a sensor's 1088 are 1080 in the pictures of some programs.
 _CODED, _SHOWN = 1088, 1080
+# Distance from the origin beyond which a rotation's seventh digit moves a centre by more than 0.1 mm.
+_FAR = 1e3
 # Sides of a photograph and of its calibration have one ratio up to the rounding of a resize, in pixels.
 _ROUNDING = 1.5
 
@@ -108,6 +110,8 @@ class StoredCamera:
         expected = f"{', '.join(map(str, counts))} distortion coefficients"
         require(len(self.distortion) in counts, self.origin, expected, len(self.distortion))
         require(bool(np.isfinite(self.distortion).all()), self.origin, "finite distortion", "NaN or infinity")
+        positive = self.size is None or min(self.size) > 0
+        require(positive, self.origin, "a width and a height above 0", self.size)
         if self.gains is not None:
             gains = check_array(f"{self.origin}: gains", self.gains, [(3,)])
             fits = bool(((gains >= 1 / MOST_GAIN) & (gains <= MOST_GAIN)).all())
@@ -166,7 +170,17 @@ def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
         pose = np.linalg.inv(pose)
     extrinsics = _FLIP @ pose if convention.axes == "opengl" else pose.copy()
     extrinsics[:3, 3] *= convention.unit
-    return extrinsics
+    return _rigid(extrinsics) if np.abs(extrinsics[:3, 3]).max() > _FAR else extrinsics
+
+
+def _rigid(pose: np.ndarray) -> np.ndarray:
+    """World to camera with the nearest rotation about the camera's centre: of a rotation of seven digits the
+    transpose is no inverse, and 100 km from the origin the centre that follows is a centimetre off."""
+    u, _, v = np.linalg.svd(pose[:3, :3])
+    rigid = pose.copy()
+    rigid[:3, :3] = u @ v
+    rigid[:3, 3] = u @ v @ np.linalg.solve(pose[:3, :3], pose[:3, 3])
+    return rigid
 
 
 def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:

@@ -223,6 +223,8 @@ class CaptureFolder:
             from ghgs_lit.geometry.undistortion import undistort
 
             image, matte = undistort(image, matte, _grid(_key(calibration), *size))
+            expected, lens = "a lens distortion that leaves some of the subject", calibration.distortion
+            require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
         calibration = quarter_turned(calibration, turns, size)
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
         cameras = calibration.intrinsics, calibration.extrinsics, calibration.gains

@@ -1,12 +1,7 @@
 """Predictions as files for other programs: one table of formats, one function that writes all."""
 
 from ghgs_lit.prediction.export.instants import Instants
-from ghgs_lit.prediction.export.prediction import (
-    FORMATS,
-    output_files,
-    output_options,
-    write_prediction,
-)
+from ghgs_lit.prediction.export.prediction import FORMATS, output_files, output_options, write_prediction
 from ghgs_lit.prediction.export.reports import REPORT, require_free
 from ghgs_lit.prediction.export.subject import OutputOptions
 

@@ -104,7 +104,7 @@ def read_ply(path: Path) -> Gaussians:
         }
         matches = filter(None, map(_CONSTANTS_PATTERN.fullmatch, content.comments))
         constants = [{"low_pass": float(m[1]), "antialiased": m[2] == "True"} for m in matches]
-    except (PlyParseError, KeyError, ValueError) as error:
+    except (PlyParseError, KeyError, ValueError, MemoryError, OverflowError) as error:
         raise InputError(f"{path}: expected a 3D Gaussian Splatting PLY; found {error}") from error
     return Gaussians(
         means=columns["means"],

@@ -74,11 +74,7 @@ class CameraRefinement:
     """
 
     def __init__(
-        self,
-        rounds: int,
-        predict: Callable[[Batch], Prediction],
-        renderer: Renderer,
-        shared: bool = False,
+        self, rounds: int, predict: Callable[[Batch], Prediction], renderer: Renderer, shared: bool = False
     ):
         require(rounds >= 1, "refine_cameras", "1 or more rounds", rounds)
         self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
@@ -135,11 +131,7 @@ class CameraRefinement:
         return loss.mean().expand(len(loss)) if self.shared else loss
 
     def _corrected(
-        self,
-        prediction: Prediction,
-        batch: Batch,
-        free: Bool[Tensor, "B V"],
-        worth: Float[Tensor, " B"],
+        self, prediction: Prediction, batch: Batch, free: Bool[Tensor, "B V"], worth: Float[Tensor, " B"]
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
         """Cameras after one round, and which elements agree better by ``worth``; those of the others stay."""
         cameras, losses = batch.cameras, []

@@ -143,9 +143,7 @@ def coherent_cameras(
     count, device = len(pose) // len(rigs), batch.masks.device
     poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
     moved = dataclasses.replace(
-        cameras,
-        intrinsics=torch.cat(lenses).to(cameras.intrinsics),
-        extrinsics=poses.to(cameras.extrinsics),
+        cameras, intrinsics=torch.cat(lenses).to(cameras.intrinsics), extrinsics=poses.to(cameras.extrinsics)
     )
     return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
 

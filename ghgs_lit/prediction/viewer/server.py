@@ -31,15 +31,24 @@ def _require_address(host: str) -> None:
         raise InputError(f"host: expected an address of this machine; found {host!r} ({error})") from error
 
 
+def _refuse_other_addresses(connection: Any, request: Any, response: Any) -> Any:
+    """The answer to a connection of a page of another address than the one it connects to; None: accepted."""
+    origin = request.headers.get("Origin")
+    if response.status_code != 101 or origin is None or origin.split("://")[-1] == request.headers["Host"]:
+        return None
+    return connection.respond(403, "expected a page of this address\n")
+
+
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
     """Let servers that begin meanwhile refuse pages of other sites; viser would take those of any origin."""
     from websockets.asyncio import server
 
     serve, names = server.serve, "|".join(map(re.escape, (host, "localhost", "127.0.0.1", "[::1]")))
-    # Who opens it to the network has visitors by any name of this machine.
+    # Who opens it to the network has visitors by any name of this machine; it is in the address they use.
     names = ".+" if host in ("0.0.0.0", "::") else names
-    server.serve = partial(serve, origins=[None, re.compile(rf"https?://({names})(:\d+)?")])
+    origins = [None, re.compile(rf"https?://({names})(:\d+)?")]
+    server.serve = partial(serve, origins=origins, process_response=_refuse_other_addresses)
     try:
         yield
     finally:

@@ -1,7 +1,10 @@
 """Captures that cannot be read: one line that names the place, what was expected and what was found."""
 
 import json
+import os
 import re
+from itertools import pairwise
+from string import ascii_lowercase
 
 import numpy as np
 import pytest
@@ -72,6 +75,19 @@ def folders(place, *names):
     only(place)
 
 
+def pipe(place, name):
+    (place / "images" / name).unlink()
+    os.mkfifo(place / "images" / name)
+
+
+def loop(place, name):
+    (place / "images" / name).unlink()
+    (place / "images" / name).symlink_to(name)
+
+
+FRAME = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+NARROW = json.dumps({"fl_x": 90, "cx": 48, "cy": 64, "w": 0, "h": 128, "frames": [FRAME]})
+LAUGHS = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in pairwise(ascii_lowercase))
 SKEWED = (np.array(Figure().cameras["cam1"]["extrinsics"]) * 1.1).tolist()
 WIDE = np.zeros((128, 128, 3), np.uint8)
 
@@ -140,6 +156,11 @@ BAD = {
         lambda p: {"calibration": {"axes": "maya"}},
         "calibration.axes: expected one of opencv, opengl",
     ),
+    "absurd unit": (
+        lambda p: {"calibration": {"unit": 1e300}},
+        "calibration.unit: expected a number above 0, from 1e-9 to 1e9",
+        "1e+300",
+    ),
     "no such option": (
         lambda p: {"calibration": {"axis": "y"}},
         "calibration key: expected one of",
@@ -148,6 +169,29 @@ BAD = {
     "no segmenter": (
         lambda p: (remove(p, "cam1_mask.png"), {"segment": "sam"})[1],
         "segment: expected one of rembg",
+    ),
+    "a pipe": (lambda p: pipe(p, "cam1.png"), "cam1.png: expected an image", "no regular file"),
+    "a pipe for a mask": (lambda p: pipe(p, "cam1_mask.png"), "cam1_mask.png", "no regular file"),
+    "a pipe for cameras": (
+        lambda p: pipe(p, "cameras.json"),
+        "cameras.json: expected JSON",
+        "no regular file",
+    ),
+    "links in a loop": (lambda p: loop(p, "cam1.png"), "cam1.png: expected an image", "Too many levels"),
+    "deep JSON": (lambda p: write(p, "c.json", "[" * 9999), "c.json: expected JSON", "recursion"),
+    "deep TOML": (lambda p: write(p, "c.toml", "a = " + "[" * 9999), "c.toml: expected TOML", "recursion"),
+    "deep YAML": (lambda p: write(p, "c.yml", "a: " + "[" * 9999), "c.yml: expected YAML", "64 levels"),
+    "billion laughs": (lambda p: write(p, "c.yml", LAUGHS), "c.yml: expected YAML", "a million values"),
+    "alias of itself": (lambda p: write(p, "c.yml", "a: &a [*a]"), "c.yml: expected YAML", "an alias"),
+    "no width": (
+        lambda p: write(p, "transforms.json", NARROW),
+        "frames[0]: expected a width and a height above 0",
+        "(128, 0)",
+    ),
+    "a lens that shows nothing": (
+        lambda p: camera(p, distortion=[1e6, 0, 0, 0]),
+        "cam1: expected a lens distortion that leaves some of the subject",
+        "1000000.0",
     ),
     "two instants": (lambda p: folders(p, "a", "b"), "calibration.names", "found a"),
 }

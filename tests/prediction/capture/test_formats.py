@@ -208,5 +208,19 @@ def test_a_unit_is_metres_of_one_unit_of_length(extrinsics):
     np.testing.assert_array_equal(millimetres[:3, :3], metres[:3, :3])
 
 
+@pytest.mark.parametrize("extrinsics", ["world_to_camera", "camera_to_world"])
+def test_rotations_of_seven_digits_far_away(extrinsics):
+    """The centre was 9 mm from where the camera projects from, and an image changed by up to 0.02."""
+    rotation, center = rig()["cam_01"]["R"].round(7), np.array([1e5, -3e4, 1e4])
+    pose, around = np.eye(4), center + POINTS
+    pose[:3, :3] = rotation if extrinsics == "world_to_camera" else rotation.T
+    pose[:3, 3] = -rotation @ center if extrinsics == "world_to_camera" else center
+    found = extrinsics_of(pose, Convention(extrinsics=extrinsics))
+    assert np.abs(found[:3, :3] @ found[:3, :3].T - np.eye(3)).max() < 1e-12
+    assert np.abs(-found[:3, :3].T @ found[:3, 3] - center).max() < 1e-6
+    local = around @ found[:3, :3].T + found[:3, 3]
+    assert np.abs(local - POINTS @ rotation.T).max() < 1e-5
+
+
 def test_every_format_can_be_said():
     assert get_args(nodes.Calibration.model_fields["format"].annotation) == ("auto", *FORMATS)

@@ -6,6 +6,7 @@ import unicodedata
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from ghgs_lit import Capture
@@ -136,6 +137,22 @@ def test_cameras_of_one_name_are_refused(tmp_path):
 def test_numbers_are_names_of_yaml(tmp_path):
     text = "\n".join(f"{n}: {json.dumps(CAMERA)}" for n in ("0", "1", "08", "010"))
     assert list(read_cameras(write(tmp_path / "a.yaml", text)).cameras) == ["0", "1", "08", "010"]
+
+
+def test_values_that_yaml_writes_once(tmp_path):
+    """PyYAML names a list that several cameras have, and refers to it."""
+    text = yaml.dump({name: CAMERA | {"D": LENS} for name in "ab"})
+    assert "*id001" in text
+    cameras = read_cameras(write(tmp_path / "a.yaml", text)).cameras
+    np.testing.assert_array_equal(cameras["b"].intrinsics, CAMERA["K"])
+    np.testing.assert_array_equal(cameras["b"].distortion, LENS)
+
+
+def test_a_pipe_among_files_of_colmap(tmp_path):
+    (colmap(tmp_path, (1, "a.jpg")) / "points3D.txt").unlink()
+    os.mkfifo(tmp_path / "points3D.txt")
+    with pytest.raises(InputError, match=r"points3D\.txt: expected a file of a COLMAP model; found 'no reg"):
+        read_cameras(tmp_path)
 
 
 def test_easymocaps_lens_counts_under_every_name(tmp_path):

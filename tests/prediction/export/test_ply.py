@@ -48,6 +48,16 @@ def test_comments_that_are_not_ascii(tmp_path):
     np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").means, read_ply(tmp_path / "a.ply").means)
 
 
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("count", ["-5", "1000000000000", "1" + 40 * "0"])
+@pytest.mark.parametrize("rows", ["property float x", "property list int int x"])
+def test_a_header_that_promises_terabytes(tmp_path, kind, count, rows):
+    path = tmp_path / "a.ply"
+    path.write_text(f"ply\nformat {kind} 1.0\nelement vertex {count}\n{rows}\nend_header\n1 2\n")
+    with pytest.raises(InputError, match=r"a\.ply: expected a 3D Gaussian Splatting PLY; found"):
+        read_ply(path)
+
+
 def test_a_ply_has_the_names_and_units_of_3dgs(tmp_path):
     """Viewers of 3D Gaussian Splatting read the columns by name; empty and bad files are handled."""
     plyfile = pytest.importorskip("plyfile")

@@ -128,25 +128,27 @@ def test_an_address_of_another_machine_is_named(directory, host):
         Viewer(read_content(directory, None), host, PORT)
 
 
+@pytest.mark.parametrize("listens", ["127.0.0.1", "0.0.0.0"])
 @pytest.mark.parametrize(
     ("origin", "status"),
     [
-        ("http://{host}", 101), (None, 101), ("http://evil.example", 403),
-        ("http://{host}.evil.example", 403), ("null", 403),
+        ("http://{host}", 101), ("https://{host}", 101), (None, 101), ("http://evil.example", 403),
+        ("http://{host}.evil.example", 403), ("http://evil.example?://{host}.", 403), ("null", 403),
+        ("http://127.0.0.1:1", 403), ("http://evil.example:{port}", 403),
     ],
 )  # fmt: skip
-def test_pages_of_other_sites_get_no_connection(tmp_path, origin, status):
+def test_pages_of_other_sites_get_no_connection(tmp_path, listens, origin, status):
     """A page that is open in the same browser must not read the photographs."""
     write_ply(body(50, 60), tmp_path / "a.ply")
-    viewer = Viewer(read_content(tmp_path / "a.ply", None), port=PORT)
+    viewer = Viewer(read_content(tmp_path / "a.ply", None), listens, PORT)
     try:
         host = viewer.address.removeprefix("http://")
         lines = [
             "GET / HTTP/1.1", f"Host: {host}", "Upgrade: websocket", "Connection: Upgrade",
             "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13",
         ]  # fmt: skip
-        lines += [f"Origin: {origin.format(host=host)}"] if origin else []
         name, port = host.split(":")
+        lines += [f"Origin: {origin.format(host=host, port=port)}"] if origin else []
         with socket.create_connection((name, int(port)), timeout=20) as connection:
             connection.sendall("\r\n".join([*lines, "", ""]).encode())
             assert connection.recv(100).split()[1] == str(status).encode()

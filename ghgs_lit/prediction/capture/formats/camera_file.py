@@ -13,6 +13,7 @@ import numpy as np
 
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
+from ghgs_lit.readers import read_parsed
 
 _SUFFIXES = ("jpg", "jpeg", "png", "tif", "tiff", "bmp", "webp")
 # Entries about a lens, as :func:`plain` spells them, and models of which the entries do not say enough.
@@ -91,11 +92,7 @@ def _bends(value: Any) -> bool:
 def read_mapping(path: Path, parse: Callable[[str], Any], kind: str, content: str) -> dict[str, Any]:
     """The mapping that a file of text holds. ``kind``, ``content``: of such files, for messages. InputError:
     the file cannot be read or parsed, or holds something else."""
-    try:
-        # Editors of Windows mark UTF-8.
-        value = parse(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: expected {kind}; found {error}") from error
+    value = read_parsed(path, kind, parse)
     require(isinstance(value, dict), str(path), content, type(value).__name__)
     return value
 

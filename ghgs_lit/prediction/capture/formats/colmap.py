@@ -7,6 +7,7 @@ import numpy as np
 from ghgs_lit.errors import InputError, installed, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
+from ghgs_lit.readers import require_file
 
 #: COLMAP's camera models: order of its parameters; ``f`` is both focal lengths.
 _MODELS = {
@@ -20,6 +21,7 @@ _MODELS = {
     "RADIAL_FISHEYE": "f cx cy k1 k2",
     "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
+_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _ORDER = {False: "k1 k2 p1 p2 k3 k4 k5 k6", True: "k1 k2 k3 k4"}
 
 
@@ -35,6 +37,9 @@ def read_colmap(path: Path) -> CameraFile:
     folder = model_folder(path if path.is_dir() else path.parent)
     require(folder is not None, str(path), "a COLMAP model (cameras.bin or cameras.txt)", "none")
     pycolmap = installed("pycolmap", "colmap", str(path))
+    for file in folder.iterdir():
+        if file.stem in _FILES:
+            require_file(file, "a file of a COLMAP model")
     names = _names(folder)
     try:
         model = pycolmap.Reconstruction(str(folder))

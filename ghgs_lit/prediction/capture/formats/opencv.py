@@ -24,6 +24,7 @@ from ghgs_lit.prediction.capture.formats.camera_file import (
     plain,
     read_mapping,
 )
+from ghgs_lit.readers import check_yaml
 
 #: The files of EasyMocap: intrinsics and poses.
 EASYMOCAP = ("intri.yml", "extri.yml")
@@ -104,11 +105,10 @@ def read_easymocap(path: Path) -> CameraFile:
 def _read_yaml(path: Path) -> dict[str, Any]:
 
     def parse(text: str) -> Any:
-        try:
-            # OpenCV writes "%YAML:1.0", which is not a directive of YAML.
-            return yaml.load(re.sub(r"\A%YAML[^\n]*\n", "", text), _Loader)
-        except yaml.YAMLError as error:
-            raise ValueError(error) from error
+        # OpenCV writes "%YAML:1.0", which is not a directive of YAML.
+        text = re.sub(r"\A%YAML[^\n]*\n", "", text)
+        check_yaml(text)
+        return yaml.load(text, _Loader)
 
     return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
 
@@ -190,5 +190,4 @@ def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] 
         raise InputError(
             f"{origin}: expected width and height in pixels; found {width!r}, {height!r}"
         ) from None
-    require(min(size) > 0, origin, "a width and a height above 0", size)
     return size

@@ -8,6 +8,7 @@ import numpy as np
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, coefficients, pinhole
+from ghgs_lit.readers import require_file
 
 _SUBPIXELS = 64
 _ORDER = "k1 k2 p1 p2 k3"
@@ -17,6 +18,7 @@ _DISTORTION = {"k": "radialDistortion", "p": "tangentalDistortion"}
 def read_qualisys(path: Path) -> CameraFile:
     """The cameras by their serial numbers; results are in metres. InputError: it is no such file, or an entry
     is missing or no number."""
+    require_file(path, "cameras of Qualisys")
     try:
         cameras = [_camera(path, camera) for camera in ElementTree.parse(path).getroot().iter("camera")]
     except InputError:
