@@ -62,7 +62,7 @@ class Augmentation(Options):
     """Stops: greatest deviation of single cameras; 16 are from black to white."""
     white_balance: Stops = 0.0
     """Stops: greatest deviation of red and of blue of single cameras."""
-    gamma: Amount = 0.0
+    gamma: Share = 0.0
     """Greatest natural logarithm of the power to which single cameras raise colours: their tone curves."""
     cut: Share = 0.0
     """Share of the samples whose feet or legs are outside the frame: in all photographs, or in some."""

@@ -189,13 +189,12 @@ class Rounds(nn.Module):
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """New depths and changes of raw attributes, and what the next round remembers."""
         gaussians = state.gaussians.detach()
-        drawn, more = None, []
+        drawn, steep = None, []
         if self.options.slopes:
-            drawn, steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
-            more = [steep]
+            drawn, *steep = slopes(gaussians, batch, rays.direction, _footprints(state, batch, rays))
         each = observe(gaussians, batch, drawn)
         search = self._search(state, batch, rays, size * REACH)
-        rows = (each, torch.cat((search.matches, search.place, gaussians.colors, *more), -1), memory)
+        rows = (each, torch.cat((search.matches, search.place, gaussians.colors, *steep), -1), memory)
         memory, change = self._looked(*rows, windows)
         step = bounded_tanh(change[:, 0])
         moved = torch.where(step > 0, search.up, search.down) * step

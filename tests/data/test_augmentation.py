@@ -305,6 +305,7 @@ def test_shipped_variation_is_built():
         ({"target_scale": [2, 1]}, r"augmentation.target_scale: expected \[least, greatest\] above 0"),
         ({"chance": 1.5}, "augmentation.chance: expected a number >= 0 and <= 1; found 1.5"),
         ({"background": 2}, "augmentation.background: expected a number >= 0 and <= 1; found 2"),
+        ({"gamma": 1e9}, "augmentation.gamma: expected a number >= 0 and <= 1; found"),
         ({"cut": 2}, "augmentation.cut: expected a number >= 0 and <= 1; found 2"),
         ({"calibration": -1}, "augmentation.calibration: expected a number >= 0; found -1"),
         ({"mask_holes": 1}, "augmentation key: .*did you mean mask_hole_chance"),
