@@ -26,15 +26,15 @@ from ghgs_lit import GHGS
 from ghgs_lit.cli.evaluate import baselines_of
 from ghgs_lit.cli.inputs import build_data, build_renderer, pick_device
 from ghgs_lit.config import build, compose, resolve
-from ghgs_lit.config.groups import read_option
-from ghgs_lit.config.settings import image_size
+from ghgs_lit.config.compose import read_option
+from ghgs_lit.config.options import image_size
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds
 from ghgs_lit.data.sampling import even_positions, subject_rng
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import Photograph

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from ghgs_lit import GHGS
-from ghgs_lit.data.resampling import area_image
+from ghgs_lit.data.view import area_image
 from ghgs_lit.metrics.flicker import flicker_in_place
 from ghgs_lit.metrics.functional import box_of, decibels, mean_over, psnr
 from ghgs_lit.prediction.capture.backgrounds import Backgrounds

@@ -22,9 +22,8 @@ from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import SemanticBranch, SemanticOptions
 from ghgs_lit.geometry.masks import patches_around_subject
-from ghgs_lit.training.pretext.labels import part_shares
-from ghgs_lit.training.pretext.measure import neighbor_shows_part
-from ghgs_lit.training.pretext.parts import PARTS
+from ghgs_lit.training.pretext.labels import PARTS, part_shares
+from ghgs_lit.training.pretext.module import neighbor_shows_part
 from ghgs_lit.types import Batch, Tokens
 from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
 

@@ -22,7 +22,7 @@ from ghgs_lit.data.reader import Reader
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import MetricsOptions, psnr, ssim
 from ghgs_lit.metrics.functional import box_of
-from ghgs_lit.training.pretext.parts import PARTS, vertex_parts
+from ghgs_lit.training.pretext.labels import PARTS, vertex_parts
 from ghgs_lit.types import Batch, Targets
 
 SIZE = 252

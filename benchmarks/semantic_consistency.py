@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from ghgs_lit import GHGS
 from ghgs_lit.cli.inputs import build_data, build_renderer
 from ghgs_lit.config import build, compose, resolve
-from ghgs_lit.config.groups import read_option
+from ghgs_lit.config.compose import read_option
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.evaluation.tables.significance import compare

@@ -28,8 +28,7 @@ from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.layout import Layout
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import SampleSpec, evaluation_samples
-from ghgs_lit.evaluation.flicker import Flickers
-from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, measure
+from ghgs_lit.evaluation.measure import Estimate, Flickers, Method, ModelMethod, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.metrics.flicker import flicker_in_place
 from ghgs_lit.metrics.functional import box_of

@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ghgs_lit.encoder.rope import rotary_tables
+from ghgs_lit.encoder.attention import rotary_tables
+from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.geometry.unprojection import subject_tokens
-from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import bounded_depth
 from ghgs_lit.heads.dpt import ResidualUnit

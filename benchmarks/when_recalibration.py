@@ -25,13 +25,13 @@ from scipy.spatial import cKDTree
 
 from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.config.groups import read_option
+from ghgs_lit.config.compose import read_option
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.tables.significance import compare
 from ghgs_lit.synthesis.bench import definition, names
 from ghgs_lit.synthesis.jobs import SyntheticSource
 from ghgs_lit.synthesis.people.body import load_body
-from ghgs_lit.training.pretext.parts import PARTS, vertex_parts
+from ghgs_lit.training.pretext.labels import PARTS, vertex_parts
 
 NEAR = 0.05  # metres
 ROW = ["row", "views", "targets", "seed", "subject"]

@@ -6,8 +6,8 @@ import functools
 import pytest
 import torch
 
-from ghgs_lit.batch_checks import check_batch
 from ghgs_lit.errors import InputError
+from ghgs_lit.surroundings import check_batch
 from ghgs_lit.types import Batch
 from tests.helpers.models import make_model
 from tests.helpers.scenes import make_batch

@@ -12,7 +12,7 @@ from torch import nn
 import ghgs_lit
 from ghgs_lit.bounds import NoBounds
 from ghgs_lit.config import conf_dir
-from ghgs_lit.config.ablation import ablation_of
+from ghgs_lit.config.keys import ablation_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.projection import pixel_centers, project, world_to_camera
 from ghgs_lit.geometry.unprojection import Unprojection

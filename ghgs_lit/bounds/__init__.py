@@ -1,7 +1,6 @@
 """The first stage: near and far of each pixel's ray, from masks and cameras alone. Not part of the paper."""
 
-from ghgs_lit.bounds.box import SubjectBox
+from ghgs_lit.bounds.box import NoBounds, SubjectBox
 from ghgs_lit.bounds.hull import VisualHull
-from ghgs_lit.bounds.none import NoBounds
 
 __all__ = ["NoBounds", "SubjectBox", "VisualHull"]

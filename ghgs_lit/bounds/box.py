@@ -4,6 +4,8 @@ The box is found by carving a coarse grid with the masks. Masks are dilated, bec
 Nothing here has a gradient.
 """
 
+from typing import ClassVar
+
 import torch
 from jaxtyping import Bool, Float
 from pydantic import Field
@@ -149,3 +151,14 @@ def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tenso
     # More than what is seen: what reaches away from a camera looks smaller than it is.
     reach = 1.4 * extent.norm(dim=-1) * depth.clamp(min=NEAREST)
     return torch.where(masks.flatten(2).any(-1), reach, torch.nan)
+
+
+class NoBounds(Options):
+    """The stage of a model whose depths are not bounded, as in the authors' release."""
+
+    group = "bounds"
+    is_bounded: ClassVar[bool] = False
+
+    def __call__(self, batch: Batch) -> None:
+        """None: there are no bounds."""
+        return None

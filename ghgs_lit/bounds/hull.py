@@ -13,7 +13,7 @@ from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.box import SubjectBox
 from ghgs_lit.bounds.rays import depths_in_box, projection_matrices, ray_directions
 from ghgs_lit.bounds.silhouettes import Silhouettes, dilate, look_up, votes_outside
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Depths that are held at once (bounds memory).

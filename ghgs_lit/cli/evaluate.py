@@ -23,8 +23,8 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.evaluation.baselines import BASELINES, baseline
-from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import Method, ModelMethod, decisions_of
+from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement

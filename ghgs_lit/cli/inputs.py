@@ -9,8 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from ghgs_lit.config import build
-from ghgs_lit.config.ablation import ablation_of
-from ghgs_lit.config.keys import flatten, is_below, lookup
+from ghgs_lit.config.keys import ablation_of, flatten, is_below, lookup
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS

@@ -15,7 +15,7 @@ from ghgs_lit.encoder.semantic import SemanticOptions
 from ghgs_lit.errors import require
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.training import loggers
-from ghgs_lit.training.interruption import StopAtStep
+from ghgs_lit.training.checkpoints import StopAtStep
 from ghgs_lit.training.pretext.module import Pretext, PretextModule
 
 

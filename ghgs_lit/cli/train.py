@@ -19,8 +19,8 @@ from torch import nn
 from ghgs_lit.cli.inputs import build_data, check_size, choices, overrides, said
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import build, resolve
-from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
+from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs.checks import check_config
@@ -38,9 +38,8 @@ from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
 from ghgs_lit.training import GHGSModule, loggers, start
-from ghgs_lit.training.checkpoints import AtomicCheckpointIO
+from ghgs_lit.training.checkpoints import AtomicCheckpointIO, StopAtStep
 from ghgs_lit.training.cost import TrainingCost
-from ghgs_lit.training.interruption import StopAtStep
 from ghgs_lit.weights import switches
 from ghgs_lit.weights.checkpoint import read_checkpoint
 

@@ -1,16 +1,35 @@
-"""Composes the configuration of a verb, and turns a composed one into plain data."""
+"""Finds the Hydra configuration, composes that of a verb, and turns a composed one into plain data."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from ghgs_lit.config.paths import VERSION_BASE, conf_dir
+from ghgs_lit.config.options import did_you_mean
 from ghgs_lit.config.registry import KINDS, check
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
+
+#: How Hydra is to behave: Hydra 1.3 asks, later ones no longer do.
+VERSION_BASE: dict[str, Any] = {"version_base": "1.3"} if hydra.__version__.startswith("1.3") else {}
+
+
+def conf_dir() -> Path:
+    """Absolute path of ``conf``: inside the package in a wheel, beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    candidates = (package / "conf", package.parent / "conf")
+    for candidate in candidates:
+        if (candidate / "train.yaml").is_file():
+            return candidate
+    raise InputError(
+        f"configuration: expected train.yaml in one of {', '.join(map(str, candidates))}; found none"
+    )
+
 
 #: First line of the configuration that a run saves: a file without it is another program's.
 HEADER = "# The configuration of this run, by ghgs."
@@ -50,3 +69,19 @@ def own_keys(cfg: DictConfig, verb: str | None) -> dict[str, Any]:
     if verb is not None:
         VERBS[verb].read({name: value for name, value in data.items() if name not in KINDS}, "")
     return data
+
+
+def read_option(group: str, name: str, key: str | None = None) -> dict[str, Any]:
+    """The values of ``<group>/<name>.yaml``, its own defaults included, as plain data.
+
+    Inside a Hydra application its search path counts, which has the user's ``--config-dir`` too. InputError:
+    the group has no such option; names ``key``, or the group.
+    """
+    inside = GlobalHydra.instance().is_initialized()
+    with nullcontext() if inside else initialize_config_dir(str(conf_dir()), **VERSION_BASE):
+        known = sorted(GlobalHydra.instance().config_loader().get_group_options(group))
+        if name in known:
+            node = OmegaConf.select(hydra.compose(f"{group}/{name}"), group.replace("/", "."))
+            return OmegaConf.to_container(node, resolve=True)
+    hint = did_you_mean(name, known)
+    raise InputError(f"{key or group}: expected one of {', '.join(known)}; found {name!r}{hint}")

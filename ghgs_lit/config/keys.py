@@ -1,4 +1,4 @@
-"""Configurations as dotted keys, and which keys have no influence on a number."""
+"""Configurations as dotted keys, which keys have no influence on a number, and the rows of the ablation."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -72,3 +72,24 @@ def lookup(config: Any, key: str) -> Any:
 def is_below(key: str, parents: Iterable[str]) -> bool:
     """Whether a dotted key is one of ``parents`` or lies below one."""
     return any(key == parent or key.startswith(f"{parent}.") for parent in parents)
+
+
+#: The ablation's name by its switches (3D unprojection, semantic consistency), in the tables' order.
+ABLATIONS = {
+    (False, False): "neither",
+    (False, True): "no_unprojection",
+    (True, False): "no_semantic",
+    (True, True): "full",
+}
+
+
+def switches_of(config: Mapping[str, Any]) -> tuple[bool, bool]:
+    """Whether the model of ``config`` finds neighbours in 3D, and weights attention by similarity."""
+    recalibration = config["recalibration"]
+    # A class of the user's own may have other keys.
+    return recalibration.get("neighborhood", "xyz") == "xyz", recalibration.get("similarity") != "none"
+
+
+def ablation_of(config: Mapping[str, Any]) -> str:
+    """The name of a model's row in the ablation table; arguments as for :func:`switches_of`."""
+    return ABLATIONS[switches_of(config)]

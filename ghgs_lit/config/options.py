@@ -7,7 +7,7 @@ shows the same fields.
 
 import difflib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from omegaconf import OmegaConf
@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from ghgs_lit.config.describe import Words, expected, options_of
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, require
 
 _T = TypeVar("_T", bound="Options")
 
@@ -174,3 +174,11 @@ def _input_error(cls: type[Options], key: str, values: Mapping, error: Validatio
         return InputError(f"{dotted}: expected a value; found none")
     wanted = str(own) if own is not None else expected(field) if field is not None else first["msg"]
     return InputError(f"{dotted}: expected {wanted}; found {_plain(values)!r}")
+
+
+def image_size(key: str, size: int | Sequence[int]) -> tuple[int, int]:
+    """(height, width) in pixels from a side or a pair."""
+    pair = (size, size) if isinstance(size, int) else tuple(size)
+    valid = len(pair) == 2 and all(isinstance(side, int) and side >= 1 for side in pair)
+    require(valid, key, "a side or [height, width] in pixels", size)
+    return pair

@@ -34,7 +34,7 @@ KINDS: dict[str, dict[str | None, str]] = {
     },
     "unprojection": {"pinhole": "ghgs_lit.geometry.unprojection.Unprojection"},
     "recalibration": {
-        "none": "ghgs_lit.recalibration.none.NoRecalibrationOptions",
+        "none": "ghgs_lit.recalibration.recalibration.NoRecalibrationOptions",
         "semantic": "ghgs_lit.recalibration.RecalibrationOptions",
     },
     "gaussian_head": {"dpt": "ghgs_lit.heads.gaussian.GaussianHeadOptions"},

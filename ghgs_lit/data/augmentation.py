@@ -16,10 +16,10 @@ from torch import Tensor
 
 from ghgs_lit.config import options
 from ghgs_lit.config.options import Amount, Count, Options, Positive, Share
-from ghgs_lit.data.cuts import cut
 from ghgs_lit.data.imperfections import (
     backgrounds,
     color_gains,
+    cut,
     imperfect_mask,
     miscalibrated,
     tone_powers,

@@ -14,11 +14,9 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
-from ghgs_lit.data.contact import Tile, draw_tile, save_sheet
-from ghgs_lit.data.cross_checks import agreeing, shared
+from ghgs_lit.data.cross_checks import Phase, Photograph, Report, Seen, agreeing, shared
 from ghgs_lit.data.datamodule import PhotographsDataModule
-from ghgs_lit.data.findings import Phase, Photograph, Report, Seen
-from ghgs_lit.data.overlap import overlap
+from ghgs_lit.data.overlap import Tile, draw_tile, overlap, save_sheet
 from ghgs_lit.data.reader import PHASES, Photographs, Reader
 from ghgs_lit.data.sampling import CAMERAS, RING_VIEW, TargetProtocol
 from ghgs_lit.data.silhouettes import implausible, silhouette

@@ -6,8 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ghgs_lit.data.resampling import area_mask
-from ghgs_lit.data.view import View
+from ghgs_lit.data.view import View, area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 
 _T = TypeVar("_T")

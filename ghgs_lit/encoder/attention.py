@@ -1,17 +1,56 @@
-"""Multi-head self-attention of the ViT (plain) and of the aggregator (normalised, rotated q and k)."""
+"""Multi-head self-attention of the ViT (plain) and of the aggregator (normalised, rotated q and k).
+
+The rotary position embedding (RoPE) has two dimensions: half of a head turns with the row, half with the
+column. Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would change
+its cosine by up to 6e-2, rounding the cosine itself only by 2e-3.
+"""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ghgs_lit.encoder import cpu
-from ghgs_lit.encoder.rope import Rotary, rotate
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.kernels.pool import at_once, even_parts
+
+BASE = 100.0
+
+
+class Rotary(NamedTuple):
+    """Cosine and sine for every token and channel of a head; the sine has the sign of its term."""
+
+    cosine: Float[Tensor, "t d"]
+    sine: Float[Tensor, "t d"]
+
+
+def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
+    """Tables of all tokens.
+
+    Args:
+        positions: row and column of each token.
+        head_width: channels of a head, divisible by 4.
+        like: tokens; the tables are float32, or float64 for tokens in float64.
+    """
+    exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
+    angles = positions.float()[..., None] * (1.0 / BASE**exponents)
+    angles = angles.to(at_least_float32(like).dtype)
+    cosine, sine = angles.cos(), angles.sin()
+    return Rotary(
+        torch.stack((cosine, cosine), dim=-2).flatten(-3), torch.stack((-sine, sine), dim=-2).flatten(-3)
+    )
+
+
+def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*batch t d"]:
+    """Rotate channel ``m`` of each half of a head with its partner ``m + d/4``; in the tables' dtype."""
+    quarters = x.unflatten(-1, (2, 2, x.shape[-1] // 4))
+    return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)
+
 
 #: Values of queries or keys that are rotated at once without a gradient (bounds memory), and on a GPU.
 _ROTATED, _GPU_ROTATED = 1 << 18, 1 << 25

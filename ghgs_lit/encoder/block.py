@@ -8,10 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ghgs_lit.encoder.attention import Attention
-from ghgs_lit.encoder.rope import Rotary
+from ghgs_lit.encoder.attention import Attention, Rotary
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 
 #: Register tokens of each view, of the ViT and of the aggregator.
 REGISTERS = 4

@@ -9,9 +9,8 @@ from torch import Tensor, nn
 from ghgs_lit.encoder.aggregator import Aggregator, Pair
 from ghgs_lit.encoder.options import VGGTSettings
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.patch import ConvStem, PatchEmbed
 from ghgs_lit.encoder.semantic import PARTS
-from ghgs_lit.encoder.vit import VisionTransformer
+from ghgs_lit.encoder.vit import ConvStem, PatchEmbed, VisionTransformer
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window
 from ghgs_lit.geometry.projection import at_least_float32

@@ -6,15 +6,15 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options, Width
+from ghgs_lit.encoder.attention import rotary_tables
 from ghgs_lit.encoder.block import Block, draw_normal_, run_block
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.patch import ConvStem
-from ghgs_lit.encoder.rope import rotary_tables
+from ghgs_lit.encoder.vit import ConvStem
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.geometry.projection import at_least_float32
 
 NORM_EPS = 1e-5
-#: Parts of the body that ``ghgs pretext`` tells (``ghgs_lit.training.pretext.parts``): channels of a feature.
+#: Parts of the body that ``ghgs pretext`` tells (``training.pretext.labels``): channels of a feature.
 PARTS = 16
 
 

@@ -1,9 +1,13 @@
-"""The target protocols that an evaluation measures."""
+"""The target protocols that an evaluation measures, and checks of all that it needs before any work."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from ghgs_lit.config.groups import read_option
+from ghgs_lit.config import build
+from ghgs_lit.config.compose import read_option
+from ghgs_lit.data.datamodule import PhotographsDataModule
+from ghgs_lit.data.sampling import TargetProtocol
+from ghgs_lit.errors import choice, require
 
 
 def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -21,3 +25,38 @@ def target_protocols(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         name: {**values, "kind": values.get("kind") or values["name"], "name": name}
         for name, values in protocols.items()
     }
+
+
+def check_evaluation(config: Mapping[str, Any], data: PhotographsDataModule) -> None:
+    """Refuse an evaluation that could not be measured; data is prepared, no photograph is read. ``config``:
+    the run's configuration (``evaluation``, ``metrics`` and ``targets`` are used). InputError: a value is
+    impossible, a metric cannot be computed, the split has no subjects, or a subject lacks an input or a
+    target."""
+    evaluation = config["evaluation"]
+    for key in ("views", "targets"):
+        found = evaluation[key]
+        require(isinstance(found, list) and bool(found), f"evaluation.{key}", "a list with a value", found)
+    views = evaluation["views"]
+    require(len(set(views)) == len(views), "evaluation.views", "different numbers from 2 on", views)
+    protocols = {
+        name: TargetProtocol.read(values, "targets") for name, values in target_protocols(config).items()
+    }
+    build(config["metrics"], "metrics")
+    split = evaluation["split"]
+    choice("evaluation.split", split, data.dataset.split_names)
+    data.prepare_data([split])
+    require(len(data.subjects(split)) > 0, f"evaluation.split={split}", "a subject or more", "none")
+    for count in views:
+        for protocol in protocols.values():
+            _check_targets(data, split, count, protocol)
+
+
+def _check_targets(data: PhotographsDataModule, split: str, views: int, protocol: TargetProtocol) -> None:
+    reader = data.builder(split).targets.reader
+    for batch in data.evaluation_loader(views=views, targets=protocol, split=split).dataset.specs:
+        for spec in batch:
+            for position, view in spec.targets:
+                known = position in reader.subjects[spec.subject]
+                there = reader.views_at(spec.subject, position) if known else []
+                expected = f"view {view} of subject {spec.subject} at position {position}"
+                require(view in there, f"evaluation.targets={protocol.name}", expected, there)

@@ -10,7 +10,7 @@ from lightning.pytorch import LightningDataModule
 from tabulate import tabulate
 
 from ghgs_lit.config import build
-from ghgs_lit.config.ablation import ablation_of
+from ghgs_lit.config.keys import ablation_of
 from ghgs_lit.evaluation.measure import Method, measure_all
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.runs.provenance import provenance
@@ -38,8 +38,7 @@ def measure_and_write(
 ) -> Path:
     """Measure methods as configured; print the means and write the results.
 
-    What :func:`ghgs_lit.evaluation.check.check_evaluation` checks is not checked again. Returns: the path of
-    ``metrics.json``.
+    What :func:`check_evaluation` checks is not checked again. Returns: the path of ``metrics.json``.
 
     Args:
         config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used, and the

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, world_to_camera
-from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds, DepthMaps, Gaussians, Prediction
 

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from ghgs_lit.geometry import cpu
 from ghgs_lit.geometry.mattes import surface_colors
-from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers
-from ghgs_lit.geometry.sampling import sample
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
+from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 

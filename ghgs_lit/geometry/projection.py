@@ -1,10 +1,11 @@
-"""Between pixels and the world. Conventions: see :mod:`ghgs_lit.types`.
+"""Between pixels and the world, and values between pixels. Conventions: see :mod:`ghgs_lit.types`.
 
 Every function takes any leading dimensions and computes in float32 or wider under any autocast.
 """
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.types import Cameras
@@ -103,3 +104,21 @@ def look_at_point(cameras: Cameras) -> Tensor:
     away = torch.eye(3, dtype=torch.float64, device=forward.device) - forward[:, :, None] * forward[:, None]
     right = (away @ (centers - middle)[:, :, None]).sum(0)
     return middle + (torch.linalg.pinv(away.sum(0), rtol=1e-6) @ right)[:, 0]
+
+
+def sample(
+    maps: Float[Tensor, "m c H W"], image: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]
+) -> Float[Tensor, "*n c"]:
+    """Bilinear values of the maps ``image`` at ``pixels`` (u, v); 0 outside.
+
+    The maps must be finite: a rounding of the next map enters, too.
+    """
+    count, _, height, width = maps.shape
+    u, v = pixels.unbind(-1)
+    # The maps are the layers of a volume, and all pixels lie in the middle of a layer. Far outside is brought
+    # near: large numbers are not exact.
+    layer = (2 * image.to(pixels) + 1) / count - 1
+    grid = torch.stack(((2 / width * u - 1).clamp(-3, 3), (2 / height * v - 1).clamp(-3, 3), layer), -1)
+    grid = grid.reshape(1, 1, 1, -1, 3)
+    found = F.grid_sample(maps.transpose(0, 1)[None], grid, align_corners=False)
+    return found[0, :, 0, 0].mT.reshape(*image.shape, maps.shape[1])

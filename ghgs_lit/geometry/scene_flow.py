@@ -15,8 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import project, world_to_camera
-from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.projection import project, sample, world_to_camera
 from ghgs_lit.types import Cameras
 
 #: Metres between the nodes of the grid.

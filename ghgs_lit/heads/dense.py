@@ -13,7 +13,7 @@ from torch import Tensor
 from ghgs_lit.heads.dpt import DPTHead
 from ghgs_lit.heads.guide import Guide
 from ghgs_lit.heads.window import Span, Window
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Tokens
 
 #: Values of the largest map that are held at once where no gradient is kept (32 MB in float32).

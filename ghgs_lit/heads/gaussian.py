@@ -18,8 +18,7 @@ from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.geometry.relative_depth import relative_depth
-from ghgs_lit.geometry.rotations import multiply_quaternions, rotate
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import multiply_quaternions, rotate, unit
 from ghgs_lit.heads import cpu
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh
 from ghgs_lit.heads.dense import Part, decode

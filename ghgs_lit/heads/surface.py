@@ -8,8 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import matrix_to_quaternion, multiply_quaternions, unit
 from ghgs_lit.types import Cameras, DepthMaps
 
 #: A neighbour counts fully where its depth differs by less of a pixel's footprints than the first number, and

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper
-from ghgs_lit.kernels.products import make_product, product
+from ghgs_lit.kernels.products import PANEL, ROWS, make_product, product
 from ghgs_lit.kernels.simd import LANES
-from ghgs_lit.kernels.tile import PANEL, ROWS
 
 ZERO, ONE = np.float32(0), np.float32(1)
 

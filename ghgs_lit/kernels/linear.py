@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 
 #: Multiplications above which oneDNN is faster in spite of its slower calls: without a gradient, and as a
 #: convolution, which has one. That needs more inputs than ``_PIXELS`` (PyTorch's own limit) and two threads.

@@ -8,9 +8,13 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import I64, LANES, call, constant, everywhere, floats
-from ghgs_lit.kernels.tile import PANEL, ROWS
+
+#: Rows and columns: 24 of the 32 registers of AVX-512, or 12 of the 16 of AVX2. They divide ``QUERIES`` and
+#: ``WIDTH`` of ``layout``.
+ROWS, PANEL = (12, 32) if "avx512f" in processor_features() else (6, 16)
 
 
 def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, totals) -> None:

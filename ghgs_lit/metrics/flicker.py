@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.geometry.projection import project
-from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.projection import project, sample
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.types import Cameras
 

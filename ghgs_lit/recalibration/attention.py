@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.recalibration.neighbors import Neighbors
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.kernels.pool import at_once, even_parts
 
 #: Number of distances that are held at once: bounds memory, and keeps a block in a CPU's cache. On a GPU they
 #: and their keys take 200 MB.

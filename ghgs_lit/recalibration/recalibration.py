@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from ghgs_lit.config.options import Count, Options, Width
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.parts import at_once, even_parts
+from ghgs_lit.kernels.pool import at_once, even_parts
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.recalibration.attention import SemanticAttention, Similarity
 from ghgs_lit.recalibration.neighbors import Neighbors, nearest_neighbors, widened
-from ghgs_lit.types import Points, Tokens, true_places
+from ghgs_lit.types import DecodedPixels, Points, Tokens, true_places
 
 #: Number of cosines that are held at once (bounds memory).
 _COSINES, _GPU_COSINES = 1 << 21, 1 << 25
@@ -132,3 +132,21 @@ def neighbor_cosines(semantic: Float[Tensor, "n s"], neighbors: Neighbors) -> Fl
         for rows in even_parts(len(directions), most // max(1, len(directions))):
             torch.gather(linear(directions[rows], directions), 1, neighbors.index[rows], out=cosines[rows])
     return cosines
+
+
+class NoRecalibrationOptions(Options):
+    """Tokens stay as they are: for methods without attention across views behind the encoder."""
+
+    group = "recalibration"
+
+    def build(self, dim_latent: int) -> "NoRecalibration":
+        return NoRecalibration()
+
+
+class NoRecalibration(nn.Module):
+    """Gives the tokens back."""
+
+    tokens: DecodedPixels = "subject"
+
+    def forward(self, tokens: Tokens, points: Points) -> Tokens:
+        return tokens

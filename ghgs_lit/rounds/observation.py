@@ -9,8 +9,7 @@ from torch import Tensor
 
 from ghgs_lit.geometry.mattes import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
-from ghgs_lit.geometry.rotations import rotate
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import rotate, unit
 from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render

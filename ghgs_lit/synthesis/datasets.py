@@ -3,9 +3,11 @@
 import functools
 import hashlib
 import json
+import multiprocessing
 import os
+import sys
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -14,15 +16,13 @@ from pydantic import Field
 from ghgs_lit.config import options
 from ghgs_lit.config.describe import Words
 from ghgs_lit.config.options import Index, Options, Share, Size, Text, Workers
-from ghgs_lit.data.completeness import Completeness
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
-from ghgs_lit.data.layout import Layout, Rendered
+from ghgs_lit.data.layout import Completeness, Layout, Rendered
 from ghgs_lit.data.reader import PHASES
 from ghgs_lit.data.sampling import RING_VIEW, TargetProtocol
 from ghgs_lit.data.splits import read_split, split_names
 from ghgs_lit.errors import InputError
 from ghgs_lit.synthesis import bench, people
-from ghgs_lit.synthesis.beside import Joining, render_beside
 from ghgs_lit.synthesis.capture_rig import CaptureRig, RigCamera
 from ghgs_lit.synthesis.jobs import (
     ACTIVE,
@@ -32,10 +32,56 @@ from ghgs_lit.synthesis.jobs import (
     everything,
     identity,
     render_people,
+    start_worker,
 )
 from ghgs_lit.synthesis.motion import instant_names
+from ghgs_lit.synthesis.progress import Progress
 from ghgs_lit.synthesis.rig import Fill, Rig, RigOptions
 from ghgs_lit.synthesis.scans import ScanSource
+
+# Training loses nothing to a process of this priority: it takes what its threads leave idle.
+_NICE = 19
+_running: dict[Path, multiprocessing.process.BaseProcess] = {}
+
+
+class Joining(dict[str, tuple[int, ...]]):
+    """``subjects`` of a layout of training: each look finds those who became whole since the last."""
+
+    def __init__(self, layout: Layout, made: Completeness, names: Sequence[str]) -> None:
+        super().__init__(layout.subjects)
+        self._layout, self._made, self._names = layout, made, names
+        layout.subjects = self
+
+    def __iter__(self) -> Iterator[str]:
+        if len(self) < len(self._names):
+            whole = self._made.whole("train", self._names)
+            if len(whole) > len(self):
+                self._layout.find("train", whole)
+        return super().__iter__()
+
+
+def render_beside(
+    root: Path, names: Sequence[str], source: PersonSource, rig: object, settings: RenderOptions, seed: int
+) -> None:
+    """Begin to render training people below ``root`` in a process that ends with this one; arguments as for
+    :func:`ghgs_lit.synthesis.jobs.render_people`."""
+    if not Progress(root).complete.missing("train", names) or (
+        root in _running and _running[root].is_alive()
+    ):
+        return
+    arguments = (root, {"train": list(names)}, source, rig, settings, seed)
+    _running[root] = multiprocessing.get_context("spawn").Process(target=_render, args=arguments, daemon=True)
+    _running[root].start()
+
+
+def _render(*arguments: object) -> None:
+    start_worker()
+    os.nice(_NICE)
+    try:
+        render_people(*arguments, workers=0, shown=False)
+    except (InputError, OSError) as error:
+        print(f"training goes on with the people rendered so far: {error}", file=sys.stderr, flush=True)
+
 
 # Of built-in people: one population, whose numbers tell its people apart.
 _PEOPLE_SEED = 0

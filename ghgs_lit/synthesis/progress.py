@@ -1,4 +1,4 @@
-"""Bookkeeping of rendering, so that a killed run can resume; :mod:`ghgs_lit.data.completeness` reads it.
+"""Bookkeeping of rendering, so that a killed run can resume; :mod:`ghgs_lit.data.layout` reads it.
 
 Beside what is described there, ``<root>/rendering/`` holds ``settings.json`` (what the files were made
 with), ``lock`` and ``tmp/`` (workspaces: what is being written).
@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ghgs_lit.config.keys import flatten
-from ghgs_lit.data.completeness import Completeness
+from ghgs_lit.data.layout import Completeness
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import is_locked, lock, lock_owner, write_text_atomically
 from ghgs_lit.readers import read_json

@@ -11,7 +11,7 @@ from torch import nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.training.clock import StepClock
+from ghgs_lit.training.cost import StepClock
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION

@@ -14,7 +14,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.kernels.allocation import resident_bytes
 from ghgs_lit.kernels.watching import Inputs, Watcher, watched
 from ghgs_lit.runs.progress import Lines, clock, on_terminal
-from ghgs_lit.training.clock import PARTS
+from ghgs_lit.training.cost import PARTS
 from ghgs_lit.types import Batch
 
 

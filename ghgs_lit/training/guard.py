@@ -1,7 +1,12 @@
-"""What happens to a training step whose loss or gradient is not finite: it is explained, saved, skipped."""
+"""A training step whose loss or gradient is not finite: its first fault is named and saved, it is skipped."""
 
 import dataclasses
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as L
 import torch
@@ -9,7 +14,161 @@ from torch import Tensor
 
 from ghgs_lit.errors import InputError
 from ghgs_lit.files import write_atomically
-from ghgs_lit.training.faults import Fault, Step, first_fault
+from ghgs_lit.kernels.watching import Inputs, Watcher, watched
+from ghgs_lit.model import STAGES
+from ghgs_lit.types import Batch, map_tensors
+
+if TYPE_CHECKING:  # it imports this module
+    from ghgs_lit.training.module import GHGSModule
+
+#: What faults are told apart by; other modules belong to the model.
+_STAGES = (*STAGES, "renderer", "losses")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A forward and a backward pass, with all that it depends on beside the weights.
+
+    ``budget`` is that of :func:`~ghgs_lit.training.module.drawn_budget`, ``scale`` the factor of the loss.
+    """
+
+    batch: Batch
+    seed: int
+    budget: str | int | None = None
+    autocast: torch.dtype | None = None
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A value that is not finite; ``place`` is its tensor, ``sample`` the subject that is at fault alone."""
+
+    values: str
+    where: str
+    stage: str
+    place: str
+    sample: str | None = None
+
+    def __str__(self) -> str:
+        sample = "" if self.sample is None else f", subject {self.sample}"
+        return f"{self.values} in the {self.where} {self.stage} ({self.place}{sample})"
+
+
+class _Faults(list[Fault], Watcher):
+    """Faults in the order in which they are seen, in results of stages and in gradients of their inputs."""
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> Inputs:
+        """Views of the inputs, whose gradients are those from this stage alone."""
+
+        def view(value: Tensor) -> Tensor:
+            if not value.requires_grad:
+                return value
+            value = value.view_as(value)
+            value.register_hook(lambda slope: self.see("gradient from", "an input", slope, stage))
+            return value
+
+        return map_tensors(inputs, view)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self.see("result of", stage, result)
+
+    def see(self, where: str, place: str, value: Any, stage: str | None = None) -> None:
+        """Look at all tensors in ``value``; ``stage`` is the beginning of ``place`` unless it is given."""
+        for name, tensor in _tensors(value, place):
+            if broken := int((~tensor.isfinite()).sum()):
+                values = f"{broken} of {tensor.numel()} values are not finite"
+                self.append(Fault(values, where, stage or _stage_of(place), name))
+
+
+def _stage_of(place: str) -> str:
+    first = place.split(".")[0]
+    return first if first in _STAGES else "model"
+
+
+def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
+    """The floating-point tensors in ``value``, and what to call them."""
+    if isinstance(value, Tensor) and value.is_floating_point():
+        yield name, value
+    elif isinstance(value, (tuple, list)):
+        for item in value:
+            yield from _tensors(item, name)
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _tensors(item, f"{name}.{key}")
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        for field in dataclasses.fields(value):
+            yield from _tensors(getattr(value, field.name), f"{name}.{field.name}")
+
+
+def first_fault(module: "GHGSModule", step: Step) -> Fault | None:
+    """Run ``step`` again and look at weights, batch, results of all modules and gradients, in this order.
+
+    A batch that is at fault is run again subject by subject, to name the one that is at fault alone. Weights
+    and their gradients are not changed. None: all values are finite.
+    """
+    fault = _search(module, step)
+    if fault is None or fault.where == "weights of":
+        return fault
+    for element in range(len(step.batch.images)):
+        alone = dataclasses.replace(step, batch=_one_subject(step.batch, element))
+        if len(step.batch.images) == 1 or _search(module, alone) is not None:
+            subjects = step.batch.subjects
+            return dataclasses.replace(fault, sample=subjects[element] if subjects else str(element))
+    return fault
+
+
+def _search(module: "GHGSModule", step: Step) -> Fault | None:
+    faults, model, device = _Faults(), module.model, step.batch.images.device.type
+    for name, value in (*model.named_parameters(), *model.named_buffers()):
+        faults.see("weights of", name, value)
+    faults.see("data that enters", "batch", step.batch, "the model")
+    trained = {name: p for name, p in model.named_parameters() if p.requires_grad}
+    with ExitStack() as stack, torch.enable_grad():
+        if faults:
+            return faults[0]
+        _watch(module, faults, stack)
+        try:
+            with torch.autocast(device, step.autocast, enabled=step.autocast is not None):
+                _, total, _ = module.forward_losses(step)
+        except Exception:  # a later stage may refuse what is not finite
+            if not faults:
+                raise
+        if not faults:
+            slopes = torch.autograd.grad(total * step.scale, list(trained.values()), allow_unused=True)
+            norms = {n: slope.norm() for n, slope in zip(trained, slopes, strict=True) if slope is not None}
+            if norms:  # of finite values the largest is named
+                name = max(norms, key=lambda name: float(norms[name]))
+                norm = torch.stack(list(norms.values())).norm()
+                faults.see("gradient from", f"norm, largest of {name}", norm, _stage_of(name))
+    return faults[0] if faults else None
+
+
+def _watch(module: "GHGSModule", faults: _Faults, stack: ExitStack) -> None:
+    """Until ``stack`` closes, ``faults`` sees the results and the gradients of every stage of ``module``."""
+    model = module.model
+    for name, part in model.named_modules():
+        hook = part.register_forward_hook(
+            lambda part, inputs, result, name=name or "model": faults.see("result of", name, result)
+        )
+        stack.callback(hook.remove)
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            stack.callback(parameter.register_hook(partial(faults.see, "gradient from", name)).remove)
+    paths = {name: f"model.{name}" if name in STAGES else name for name in _STAGES}
+    stack.enter_context(watched(module, paths, faults))
+
+
+def _one_subject(batch: Batch, element: int) -> Batch:
+    one = slice(element, element + 1)
+    bodies, targets = batch.body_vertices, batch.targets
+    part = map_tensors(dataclasses.replace(batch, body_vertices=None), lambda t: t[one])
+    return dataclasses.replace(
+        part,
+        targets=targets and dataclasses.replace(part.targets, names=targets.names[one]),
+        body_vertices=bodies and bodies[one],
+        subjects=batch.subjects[one],
+        views=batch.views[one],
+    )
 
 
 class DivergedError(InputError):

@@ -17,8 +17,7 @@ from ghgs_lit.metrics.functional import box_of, psnr, ssim
 from ghgs_lit.model import GHGS
 from ghgs_lit.skipping import View, seeing
 from ghgs_lit.training.base import BudgetedModule, image_mean
-from ghgs_lit.training.faults import Step
-from ghgs_lit.training.guard import Guard
+from ghgs_lit.training.guard import Guard, Step
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.types import Batch, Cameras, DepthMaps, Gaussians, Prediction, Rendering
 from ghgs_lit.weights.checkpoint import load_strictly, model_state, read_checkpoint

@@ -9,7 +9,7 @@ import torch
 from ghgs_lit.config import build
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
-from ghgs_lit.training.faults import Fault, Step, first_fault
+from ghgs_lit.training.guard import Fault, Step, first_fault
 from ghgs_lit.training.module import GHGSModule
 from ghgs_lit.types import Batch, Cameras, Targets
 from ghgs_lit.weights.checkpoint import describe

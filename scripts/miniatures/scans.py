@@ -1,6 +1,6 @@
 """Built-in people as a few scans of THuman2.0, with their fits.
 
-Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2_scans`). Bodies
+Names, types, shapes and units are those of the real files (:mod:`ghgs_lit.synthesis.thuman2`). Bodies
 are MakeHuman's in place of SMPL-X: the parameters in ``smplx_param.pkl`` have the right shapes and place the
 body correctly, but do not pose it. Folders that are written get the marker ``miniature.json``, which lists
 their files, so that real data of the same names is never overwritten.
@@ -26,7 +26,7 @@ from ghgs_lit.readers import read_json
 from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.generate import join
 from ghgs_lit.synthesis.people.mesh import TexturedMesh
-from ghgs_lit.synthesis.thuman2_scans import FIT_FOLDERS
+from ghgs_lit.synthesis.thuman2 import FIT_FOLDERS
 
 #: In each folder that a miniature was written to: which files are its own.
 MARKER = "miniature.json"

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import build, conf_dir
-from ghgs_lit.config.ablation import ablation_of, switches_of
+from ghgs_lit.config.keys import ablation_of, switches_of
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from tests.helpers.configs import composed, verb_with

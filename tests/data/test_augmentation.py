@@ -7,7 +7,7 @@ import torch
 from ghgs_lit.config import compose
 from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
-from ghgs_lit.data.cuts import cut
+from ghgs_lit.data.imperfections import cut
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.types import Batch

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from scipy import sparse
 
-from ghgs_lit.data.humman.reader import HuMManReader
+from ghgs_lit.data.humman.dataset import HuMManReader
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS

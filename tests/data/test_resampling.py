@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from ghgs_lit.config import build, compose
-from ghgs_lit.data.resampling import (
+from ghgs_lit.data.view import (
+    View,
     area_image,
     area_mask,
     centered_depth,
+    encode_depth,
     release_image,
     release_mask,
+    resize_view,
 )
-from ghgs_lit.data.view import View, encode_depth, resize_view
 from ghgs_lit.errors import InputError
 from tests.helpers.people import render_boxes
 

@@ -16,7 +16,7 @@ from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.data.view import half_centers, resize_view
 from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
-from ghgs_lit.data.zju_mocap.reader import Frames, ZJUMoCapReader
+from ghgs_lit.data.zju_mocap.dataset import Frames, ZJUMoCapReader
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 from scripts.miniatures import zju_mocap

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from omegaconf import OmegaConf
 
 from ghgs_lit.encoder import VGGTEncoder
+from ghgs_lit.encoder.attention import rotary_tables, rotate
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed
 from tests.helpers.encoders import make_encoder

@@ -12,12 +12,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from ghgs_lit.encoder.attention import rotary_tables, rotate
 from ghgs_lit.encoder.block import REGISTERS
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.rope import rotary_tables, rotate
 from ghgs_lit.encoder.vit import VisionTransformer
-from ghgs_lit.heads.dpt import DPTHead
-from ghgs_lit.heads.position import add_positions_
+from ghgs_lit.heads.dpt import DPTHead, add_positions_
 from ghgs_lit.types import Tokens
 from tests.helpers.activations import split_activated
 from tests.helpers.encoders import make_encoder

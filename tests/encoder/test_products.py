@@ -8,13 +8,13 @@ import torch.nn.functional as F
 
 import ghgs_lit.kernels.linear
 from ghgs_lit.encoder import cpu
+from ghgs_lit.encoder.attention import rotary_tables
 from ghgs_lit.encoder.block import Block
 from ghgs_lit.encoder.packing import KeptPatches
-from ghgs_lit.encoder.rope import rotary_tables
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.kernels.linear import linear
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.kernels.precision import has_bfloat16, precision_of
 from tests.helpers.encoders import make_encoder
 from tests.helpers.models import ATTRIBUTES, make_model

@@ -2,7 +2,7 @@
 
 import torch
 
-from ghgs_lit.geometry.motion import after_motions, motions_between, rigid, without_common
+from ghgs_lit.geometry.rotations import after_motions, motions_between, rigid, without_common
 from tests.helpers.scenes import ring
 
 

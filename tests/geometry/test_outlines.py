@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from ghgs_lit.geometry.outlines import signed_distance, soft_signed_distance
+from ghgs_lit.geometry.masks import signed_distance, soft_signed_distance
 
 
 def test_the_outline_runs_half_way_between_pixels():

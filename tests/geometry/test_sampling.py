@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
 
-from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.projection import sample
 
 
 def test_sampling_is_bilinear_and_0_outside():

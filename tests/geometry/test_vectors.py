@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import unit
 
 
 @pytest.mark.parametrize("length", [1e-30, 1e-20, 1.0, 1e19, 1e30])

@@ -7,9 +7,8 @@ import torch
 from torch import nn
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.vectors import unit
-from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise
-from ghgs_lit.heads.position import add_positions_
+from ghgs_lit.geometry.rotations import unit
+from ghgs_lit.heads.dpt import DPTHead, ResidualUnit, _pointwise, add_positions_
 from ghgs_lit.types import Tokens
 
 

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.heads.activations import confidence_of
 
 

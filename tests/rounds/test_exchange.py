@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.signal import correlate
 
-from ghgs_lit.rounds.exchange import REACH, Exchange, Windows
+from ghgs_lit.rounds.rounds import SIDE, Exchange, Windows
 from ghgs_lit.types import extents
 
 HEIGHT, WIDTH, KNOWN, CHANNELS = 13, 17, 6, 3
@@ -72,7 +72,7 @@ def test_nothing_comes_from_farther_away_or_from_another_image():
     one = int((raw.image == 2).nonzero()[4])
     trained()(known, Windows.of(raw, batch))[one].sum().backward()
     row, column = raw.pixel // WIDTH, raw.pixel % WIDTH
-    near = (row - row[one]).abs().maximum((column - column[one]).abs()) <= REACH // 2
+    near = (row - row[one]).abs().maximum((column - column[one]).abs()) <= SIDE // 2
     heard = known.grad.abs().sum(1) > 0
     assert torch.equal(heard, near & (raw.image == raw.image[one]))
 

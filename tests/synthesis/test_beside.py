@@ -2,9 +2,8 @@
 
 import pytest
 
-from ghgs_lit.data.completeness import Completeness
-from ghgs_lit.data.layout import Layout
-from ghgs_lit.synthesis import beside, datasets
+from ghgs_lit.data.layout import Completeness, Layout
+from ghgs_lit.synthesis import datasets
 from ghgs_lit.synthesis.jobs import render_people
 from ghgs_lit.synthesis.scans import ScanSource
 from tests.helpers.people import RIG, TINY, write_obj_scan
@@ -26,7 +25,7 @@ def begun(tmp_path):
 
 def joining(root):
     layout = Layout(root, "train", NAMES[:1])
-    return layout, beside.Joining(layout, Completeness(root), NAMES)
+    return layout, datasets.Joining(layout, Completeness(root), NAMES)
 
 
 def test_others_join_when_they_are_whole(begun):
@@ -44,10 +43,10 @@ def test_the_rest_is_rendered_in_another_process(begun):
     """Once only, the same photographs as without it; nothing is started for people who are whole."""
     root, source = begun
     arguments = (root, NAMES, source, RIG, SMALL, 0)
-    beside.render_beside(*arguments)
-    process = beside._running[root]
-    beside.render_beside(*arguments)
-    assert beside._running[root] is process
+    datasets.render_beside(*arguments)
+    process = datasets._running[root]
+    datasets.render_beside(*arguments)
+    assert datasets._running[root] is process
     process.join(300)
     assert process.exitcode == 0
     layout, subjects = joining(root)
@@ -57,15 +56,15 @@ def test_the_rest_is_rendered_in_another_process(begun):
     whole = Layout(other, "train", NAMES)
     for name in NAMES:
         assert (layout.read_view(name, 0, 0, False).image == whole.read_view(name, 0, 0, False).image).all()
-    beside.render_beside(*arguments)
-    assert beside._running[root] is process
+    datasets.render_beside(*arguments)
+    assert datasets._running[root] is process
 
 
 def test_people_who_cannot_be_made_are_said(begun, capfd):
     """Training goes on with the others."""
     root, source = begun
-    beside.render_beside(root, ["s0", "nobody"], source, RIG, SMALL, 0)
-    beside._running[root].join(60)
+    datasets.render_beside(root, ["s0", "nobody"], source, RIG, SMALL, 0)
+    datasets._running[root].join(60)
     assert "training goes on with the people rendered so far: " in capfd.readouterr().err
     assert list(joining(root)[1]) == ["s0"]
 

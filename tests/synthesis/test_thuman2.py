@@ -18,8 +18,7 @@ from ghgs_lit.synthesis import people
 from ghgs_lit.synthesis.people.mesh import Person
 from ghgs_lit.synthesis.photograph import Lights, Studio
 from ghgs_lit.synthesis.rig import Rig
-from ghgs_lit.synthesis.thuman2 import THuman2
-from ghgs_lit.synthesis.thuman2_scans import THuman2Source, find_fits, ghg_body, read_fit
+from ghgs_lit.synthesis.thuman2 import THuman2, THuman2Source, find_fits, ghg_body, read_fit
 from ghgs_lit.types import Cameras
 from scripts.miniatures import thuman2 as miniature
 from scripts.miniatures.scans import POSE_SIZES, make_scans, scan_of
@@ -176,12 +175,12 @@ def test_scale_comes_before_translation(raw):
 
 def test_bodies_are_computed_where_the_licensed_model_is(raw, monkeypatch, tmp_path):
     """smplx(...) * scale + translation; without the package or the files one line says so."""
-    from ghgs_lit.synthesis import thuman2_scans
+    from ghgs_lit.synthesis import thuman2
 
     source = THuman2Source(raw, find_fits(raw, None), tmp_path)
     fit = read_fit(source.fit("0000") / "smplx_param.pkl")
     posed = (source_body := THuman2Source(raw, source.fits).body("0000")) - fit.translation
-    monkeypatch.setattr(thuman2_scans, "smplx_vertices", lambda folder, parameters: posed / fit.scale)
+    monkeypatch.setattr(thuman2, "smplx_vertices", lambda folder, parameters: posed / fit.scale)
     np.testing.assert_allclose(source.body("0000"), source_body, atol=1e-9)
     monkeypatch.undo()
     with pytest.raises(

@@ -11,7 +11,7 @@ import torch
 
 from ghgs_lit.runs import signals
 from ghgs_lit.runs.signals import Interrupted, handlers, interruptible
-from ghgs_lit.training.interruption import StopAtStep
+from ghgs_lit.training.checkpoints import StopAtStep
 from tests.training.test_resume import Cut, fit, rows
 
 
@@ -86,7 +86,7 @@ def test_a_second_signal_stops_at_once(tmp_path, monkeypatch):
     """Who does not want to wait for the step is not made to; one signal that arrives twice is one."""
     assert stopped(tmp_path / "twice", Signal(5, signal.SIGINT, times=2)) == 130
     assert (tmp_path / "twice" / "checkpoints" / "last.ckpt").exists()
-    monkeypatch.setattr("ghgs_lit.training.interruption._SAME", -1.0)
+    monkeypatch.setattr("ghgs_lit.training.checkpoints._SAME", -1.0)
     assert stopped(tmp_path / "now", Signal(2, signal.SIGTERM, times=2)) == 143
     assert not (tmp_path / "now" / "checkpoints" / "last.ckpt").exists()
 

@@ -18,7 +18,7 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.allocation import resident_bytes
 from ghgs_lit.training import GHGSModule, Optimization
 from ghgs_lit.training.callbacks import Costs
-from ghgs_lit.training.clock import PARTS, StepClock
+from ghgs_lit.training.cost import PARTS, StepClock
 from ghgs_lit.training.loggers import (
     CsvLog,
     TensorBoardLog,

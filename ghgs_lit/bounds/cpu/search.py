@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 
 #: Slices of a grid, or rows of an image, of one task.
 _SLICES, _ROWS = 8, 16

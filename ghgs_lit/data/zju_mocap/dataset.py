@@ -1,13 +1,153 @@
-"""ZJU-MoCap as it is configured."""
+"""ZJU-MoCap as it is configured and read.
 
-from collections.abc import Mapping
+``<root>/CoreView_<id>/`` holds ``annots.npy`` (see :mod:`.annotations`), the photographs of each camera,
+``mask_cihp/`` and sometimes ``mask/`` (label maps: any value but 0 is the subject), ``new_vertices/`` and
+``vertices/`` (<frame number>.npy: 6890 x 3, metres, world with z up).
+"""
+
+import functools
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
 from typing import Annotated, ClassVar
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
-from ghgs_lit.config.options import Options, Size, Text, Workers
+from ghgs_lit.config.options import Count, Index, Options, Size, Text, Workers
 from ghgs_lit.data.dataset import DataSet
-from ghgs_lit.data.zju_mocap.reader import Frames, ZJUMoCapReader
+from ghgs_lit.data.decoding import check_center, check_name, read_array, read_map, read_photograph
+from ghgs_lit.data.reader import FrameReader
+from ghgs_lit.data.view import View, half_centers, opencv_view
+from ghgs_lit.data.zju_mocap.annotations import Annotations, frame_field, frame_number, read_annotations
+from ghgs_lit.errors import InputError
+from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
+
+log = logging.getLogger(__name__)
+
+BODY_VERTICES = 6890
+#: Folders of vertices; the first that a sequence has is read.
+_BODIES = ("new_vertices", "vertices")
+
+
+class Frames(Options):
+    """Some frames of some sequences."""
+
+    sequences: tuple[Annotated[Text | Index, AfterValidator(str)], ...]
+    """Ids, such as 377."""
+    frames: tuple[Index, Index, Count]
+    """[start, stop, step] of the indices in annots.npy, from 0. A shorter sequence gives the
+    frames that it has, as in the published loaders."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "Frames":
+        self.require(self.sequences != (), "sequences", "ids such as 377")
+        self.require(self.frames[0] < self.frames[1], "frames", "[start, stop, step] with start < stop")
+        return self
+
+
+@dataclass(frozen=True)
+class _Frame:
+    folder: Path
+    annotations: Annotations
+    index: int
+
+    @property
+    def number(self) -> int:
+        return frame_number(self.folder / self.annotations.frames[self.index][0])
+
+
+class ZJUMoCapReader(FrameReader):
+    """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
+
+    Missing sequences are left out (``ghgs prepare task=check`` counts them). InputError: all sequences are
+    missing, or annotations are bad. ``limit``: number of frames in all, the first ones (None: all).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        chosen: Sequence[Frames],
+        cameras: int | None = 20,
+        undistorted: bool = True,
+        masks: Sequence[str] = ("mask_cihp",),
+        limit: int | None = None,
+        strict: bool = True,
+    ) -> None:
+        super().__init__(strict)
+        self.undistorted, self.masks = undistorted, tuple(masks)
+        wanted = [(f"CoreView_{s}", some.frames) for some in chosen for s in some.sequences]
+        there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
+        for name, frames in wanted:
+            if name in there:
+                with self.collecting():
+                    self._add(folder / name, frames, cameras)
+        self.subjects = dict(list(self.subjects.items())[:limit])
+
+    def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
+        annotations = read_annotations(path / "annots.npy")
+        count = len(annotations.intrinsics)
+        if cameras is not None and cameras > count:
+            raise InputError(f"{path / 'annots.npy'}: expected {cameras} cameras; found {count}")
+        wanted = range(*frames)
+        chosen = [index for index in range(len(annotations.frames)) if index in wanted]
+        if not chosen:
+            raise InputError(
+                f"{path / 'annots.npy'}: expected a frame {wanted.start}; "
+                f"found {len(annotations.frames)} frames"
+            )
+        named = [_Frame(path, annotations, index) for index in chosen]
+        named = {check_name(f"{path.name}_{frame.number:06d}"): frame for frame in named}
+        if len(chosen) < len(wanted):
+            log.info("%s: %d of %d frames (the sequence is shorter)", path, len(chosen), len(wanted))
+        self.frames |= named
+        self.subjects |= dict.fromkeys(named, tuple(range(count if cameras is None else cameras)))
+
+    def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
+        frame = self.frames[name]
+        photograph = frame.annotations.frames[frame.index][position]
+        path = _find(frame.folder, photograph, photograph.suffix)
+        image = read_photograph(path)
+        mask = self._mask(frame.folder, photograph, image.shape[:2])
+        intrinsics = frame.annotations.intrinsics[position]
+        check_center(path, intrinsics, *image.shape[:2])
+        if self.undistorted:
+            distortion = frame.annotations.distortions[position]
+            grid = undistorting_grid(half_centers(intrinsics), distortion, *image.shape[:2])
+            image, matte = undistort(image, mask * np.uint8(255), grid)
+            mask = matte > 127
+        return opencv_view(image, mask, intrinsics, frame.annotations.extrinsics[position])
+
+    def read_body(self, name: str) -> np.ndarray | None:
+        frame = self.frames[name]
+        folder = next((f for b in _BODIES if (f := frame.folder / b).is_dir()), None)
+        if folder is None:
+            return None
+        return read_array(folder / f"{frame.number}.npy", [(BODY_VERTICES, 3)]).astype(np.float32)
+
+    def place(self, name: str, position: int, view: int) -> str:
+        frame = self.frames[name]
+        photograph = frame.annotations.frames[frame.index][position]
+        return str(_find(self._mask_folders(frame.folder)[0], photograph, ".png"))
+
+    def _mask_folders(self, folder: Path) -> list[Path]:
+        folders = [path for name in self.masks if (path := folder / name).is_dir()]
+        if not folders:
+            raise InputError(f"{folder}: expected a folder of masks, {' or '.join(self.masks)}; found none")
+        return folders
+
+    def _mask(self, folder: Path, photograph: PurePosixPath, size: tuple[int, int]) -> np.ndarray:
+        paths = [_find(masks, photograph, ".png") for masks in self._mask_folders(folder)]
+        return functools.reduce(np.logical_or, [read_map(path, size) != 0 for path in paths])
+
+
+def _find(folder: Path, photograph: PurePosixPath, suffix: str) -> Path:
+    """A photograph's file: under its own name, or under its frame field alone (313 and 315, renamed)."""
+    path = folder / photograph.with_suffix(suffix)
+    renamed = path.with_name(frame_field(photograph) + suffix)
+    return renamed if not path.exists() and renamed.exists() else path
+
 
 # Cameras of a sequence where all are used and nothing else is known; some have 23.
 _ALL = 21

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from ghgs_lit.config import build
-from ghgs_lit.config.groups import read_option
+from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.keys import flatten, is_below
 from ghgs_lit.diagnostics.benchmark.weights import random_model
 from ghgs_lit.errors import require

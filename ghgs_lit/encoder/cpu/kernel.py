@@ -12,9 +12,8 @@ from numba.core import types
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
-from ghgs_lit.kernels.products import make_product, product
+from ghgs_lit.kernels.products import PANEL, ROWS, make_product, product
 from ghgs_lit.kernels.simd import EXP2_LIMIT
-from ghgs_lit.kernels.tile import PANEL, ROWS
 
 LANES = simd.LANES
 LOWEST = np.float32(-np.inf)

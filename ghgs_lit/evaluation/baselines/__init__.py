@@ -5,14 +5,14 @@ from functools import partial
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 
 from ghgs_lit.errors import choice
-from ghgs_lit.evaluation.baselines.hull import hull_depth
-from ghgs_lit.evaluation.baselines.images import black, nearest_view
 from ghgs_lit.evaluation.baselines.per_scene import PerScene
-from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
+from ghgs_lit.evaluation.baselines.photo_depth import hull_depth, photo_depth
 from ghgs_lit.evaluation.baselines.splats import body_depth, splats_at, splatted, true_depth
-from ghgs_lit.evaluation.measure import Method, ModelMethod, Renderer
+from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
+from ghgs_lit.types import Batch
 
 __all__ = ["BASELINES", "baseline", "black", "nearest_view", "splats_at", "splatted"]
 
@@ -34,3 +34,22 @@ def baseline(
     if name == "untrained":
         return ModelMethod(untrained().eval(), renderer)
     return {"black": black, "nearest_view": nearest_view}[name]
+
+
+def black(batch: Batch) -> Estimate:
+    """A black image: the score of the background alone."""
+    return Estimate(torch.zeros_like(batch.targets.images))
+
+
+def nearest_view(batch: Batch) -> Estimate:
+    """The input photograph whose viewing direction is nearest to that of the target, at its size."""
+    forward = batch.cameras.extrinsics[..., 2, :3]
+    wanted = batch.targets.cameras.extrinsics[..., 2, :3]
+    choice_of_view = torch.einsum("btk,bvk->btv", wanted, forward).argmax(-1)
+    element = torch.arange(len(batch.images), device=batch.images.device)[:, None]
+    images = batch.images[element, choice_of_view]
+    size = batch.targets.images.shape[-2:]
+    if images.shape[-2:] != size:
+        flat = F.interpolate(images.flatten(0, 1), size, mode="bilinear", antialias=True, align_corners=False)
+        images = flat.unflatten(0, images.shape[:2])
+    return Estimate(images)

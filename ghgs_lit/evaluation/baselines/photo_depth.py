@@ -1,12 +1,29 @@
-"""Depth from photo-consistency, without a network: a plane sweep within the visual hull."""
+"""Depth without a network: from silhouettes alone, and by a plane sweep within their visual hull."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ghgs_lit.evaluation.baselines.hull import hull_bounds
+from ghgs_lit.bounds import VisualHull
 from ghgs_lit.geometry.photo_consistency import photo_consistency
-from ghgs_lit.types import Batch
+from ghgs_lit.types import Batch, DepthBounds
+
+#: Finer and closer to the masks than the bounds of a model, which must hold the subject whatever the masks.
+HULL = VisualHull(dilation=0.005, samples=192)
+
+
+def hull_bounds(batch: Batch) -> DepthBounds:
+    """Where the ray of each pixel enters and leaves the visual hull."""
+    return HULL(batch)
+
+
+def hull_depth(batch: Batch) -> Tensor:
+    """The hull's first surface along the ray of each pixel of the subject [B, V, H, W], metres; 0 elsewhere.
+
+    The photographs coloured by it are the image-based visual hull (Matusik et al. 2000).
+    """
+    return batch.once(hull_bounds).near * batch.masks
+
 
 #: Tuned on four people, with 3 to 5 views: depths that are compared; half the side of the window in which
 #: pixels share their evidence, as a part of the longer side of the image; and the difference of consistency

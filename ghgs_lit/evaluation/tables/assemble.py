@@ -5,13 +5,21 @@ from dataclasses import replace
 
 import pandas as pd
 
-from ghgs_lit.config.ablation import ABLATIONS
+from ghgs_lit.config.keys import ABLATIONS
 from ghgs_lit.errors import InputError, choice
 from ghgs_lit.evaluation.tables.cells import fill
-from ghgs_lit.evaluation.tables.layouts import Group, Layout, Line, Table, TableOptions
+from ghgs_lit.evaluation.tables.layouts import (
+    Group,
+    Layout,
+    Line,
+    Table,
+    TableOptions,
+    data_title,
+    reported_data,
+    reported_table,
+)
 from ghgs_lit.evaluation.tables.notes import write_caption, write_notes
 from ghgs_lit.evaluation.tables.records import SETTING, Planned, Sweep, Variant
-from ghgs_lit.evaluation.tables.reported import data_title, reported_data, reported_table
 
 NO_FIGURE = "-"
 """Where there is no figure, as the paper prints it."""

@@ -10,10 +10,8 @@ import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
-from ghgs_lit.evaluation.tables.differences import differing, differing_text, telling_apart
-from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, decimals
-from ghgs_lit.evaluation.tables.records import TRAINING, person_of
-from ghgs_lit.evaluation.tables.reported import data_title
+from ghgs_lit.evaluation.tables.layouts import CELL, Table, arrow, data_title, decimals
+from ghgs_lit.evaluation.tables.records import TRAINING, differing, differing_text, person_of, telling_apart
 from ghgs_lit.evaluation.tables.significance import Comparison, compare, holm
 
 

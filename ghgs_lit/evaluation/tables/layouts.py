@@ -1,14 +1,17 @@
-"""Layouts of tables (the paper's four, and the ablation at every number of views) and their parts."""
+"""Layouts of tables (the paper's four, the ablation at all numbers of views), and their parts."""
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.evaluation.tables.records import Planned, Variant
+from ghgs_lit.readers import read_yaml
 
 DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "flip": 4, "flicker": 4, "depth_error_mm": 1, "gaussians": 0}
 DECIMALS |= {"prediction_seconds": 3, "steps": 0, "seconds": 0, "peak_gb": 1}
@@ -189,3 +192,33 @@ class Table:
         """What stands above a block where a table has reported rows."""
         reported = f"as reported on {self.reported_on}, not measured here"
         return reported if self.lines[block[0]].is_reported else "measured here"
+
+
+@cache
+def _content() -> dict[str, Any]:
+    return read_yaml(Path(__file__).parent / "reported.yaml")
+
+
+def data_title(name: str) -> str:
+    """The paper's name of a data set, whatever its spelling (``zju_mocap``); ``name`` where it has none."""
+    return _content()["data"].get(re.sub(r"[^a-z0-9]", "", name.lower()), name)
+
+
+def reported_source() -> str:
+    """The reference of the paper."""
+    return _content()["source"]
+
+
+def reported_table(name: str) -> tuple[str, dict[str, dict[int | str, dict[str, float]]]]:
+    """The data of one of the paper's tables, and its rows: method -> views or data -> metric -> figure."""
+    table, metrics = _content()["tables"][name], _content()["metrics"]
+    rows = {
+        method: {group: dict(zip(metrics, figures, strict=True)) for group, figures in groups.items()}
+        for method, groups in table["rows"].items()
+    }
+    return table["data"], rows
+
+
+def reported_data(name: str) -> list[str]:
+    """The data sets that are columns of a reported table."""
+    return list(dict.fromkeys(group for row in reported_table(name)[1].values() for group in row))

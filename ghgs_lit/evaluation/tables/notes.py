@@ -2,10 +2,8 @@
 
 import pandas as pd
 
-from ghgs_lit.evaluation.tables.differences import differing, differing_text
-from ghgs_lit.evaluation.tables.layouts import Table
-from ghgs_lit.evaluation.tables.records import Planned
-from ghgs_lit.evaluation.tables.reported import data_title, reported_source
+from ghgs_lit.evaluation.tables.layouts import Table, data_title, reported_source
+from ghgs_lit.evaluation.tables.records import Planned, differing, differing_text
 from ghgs_lit.evaluation.tables.significance import needed_errors
 
 FOOTNOTE = (

@@ -1,23 +1,31 @@
-"""What runs measured, as a DataFrame: the method, the setting, the values of each subject.
+"""What runs measured, and other methods, as a DataFrame: method, setting, the values of each subject.
 
-A run is identified by its configuration, never by the name of its directory.
+A run is identified by its configuration, never by the name of its directory. The file of another method
+(``docs/tables.md`` describes it, ``docs/example_others.json`` is one) is::
+
+    {"format": "ghgs_lit.others", "format_version": 1, "method": "RoGSplat",
+     "source": "their code at commit 8a196b6, run by us", "rows": [
+       {"data": "thuman2", "split": "val", "targets": "release", "protocol": "release", "views": 4,
+        "subject": "0501", "seed": 1, "metrics": {"psnr": 28.9, "ssim": 0.96}}]}
+
+A row with ``subject`` has the values of one subject and can be tested; a row without has means over
+``subjects`` subjects (optional). ``seed`` is optional.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from ghgs_lit.config import conf_dir
-from ghgs_lit.config.ablation import ABLATIONS, switches_of
-from ghgs_lit.config.keys import flatten, is_below, lookup
+from ghgs_lit.config.keys import ABLATIONS, EXPECTED_TO_DIFFER, flatten, is_below, lookup, switches_of
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.readers import read_yaml
+from ghgs_lit.readers import read_json, read_yaml
 from ghgs_lit.runs.listing import files_below
 from ghgs_lit.runs.results import KEYS, METHOD, read_results, validated
 
@@ -246,3 +254,80 @@ def person_of(subject: str, unit: re.Pattern[str] | None) -> str:
     """The person of a subject: the first group of ``unit`` where it matches, else the subject itself."""
     match = unit.fullmatch(subject) if unit else None
     return match[1] if match else subject
+
+
+def differing(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Keys whose values differ among ``configs`` with these values, without those expected to differ."""
+    flat = [flatten(config) for config in configs]
+    keys = dict.fromkeys(key for values in flat for key in values)
+    found = {key: list(dict.fromkeys(str(values.get(key, "absent")) for values in flat)) for key in keys}
+    return {
+        key: values
+        for key, values in found.items()
+        if len(values) > 1 and not is_below(key, EXPECTED_TO_DIFFER)
+    }
+
+
+def differing_text(keys: Mapping[str, Sequence[str]], limit: int = 6) -> str:
+    """``optimizer.lr (0.001, 0.0001)`` and so on, the first ``limit`` keys."""
+    shown = [f"`{key}` ({', '.join(values[:4])})" for key, values in list(keys.items())[:limit]]
+    more = len(keys) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+
+
+def telling_apart(configs: Sequence[Mapping[str, Any]], keys: Mapping[str, Sequence[str]]) -> Iterable[str]:
+    """One of the ``keys`` in which ``configs`` differ if it tells all of them apart, else all."""
+    return next(([key] for key, values in keys.items() if len(values) == len(configs)), list(keys))
+
+
+_Text = Annotated[str, Field(min_length=1)]
+_Count = Annotated[int, Field(ge=1)]
+
+
+class _Exact(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class _Row(_Exact):
+    data: _Text
+    split: _Text
+    targets: _Text
+    protocol: _Text
+    views: _Count
+    seed: int = 0
+    subject: _Text | None = None
+    subjects: _Count | None = None
+    metrics: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
+
+
+class _Others(_Exact):
+    format: Literal["ghgs_lit.others"]
+    format_version: Literal[1]
+    method: _Text
+    source: _Text
+    rows: Annotated[list[_Row], Field(min_length=1)]
+
+
+def read_others(path: Path) -> pd.DataFrame:
+    """The lines of another method's results file, as :class:`Sweep` has them of ours.
+
+    ``said`` is the file's ``source``; lines that are means have no ``subject`` and may have a ``count``.
+    FileNotFoundError: there is no such file. InputError: it is not as the head of this module describes; the
+    message names the key.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected another method's results; found no such file")
+    others = validated(_Others, read_json(path), path.name)
+    rows = pd.DataFrame([row.model_dump() for row in others.rows])
+    cell = [*SETTING, "views", "seed"]
+    repeated = rows.duplicated([*cell, "subject"])
+    if repeated.any():
+        at = f"{path.name}.rows[{repeated.idxmax()}]"
+        raise InputError(f"{at}: expected each subject once a setting; found one again")
+    means = rows["subject"].isna()
+    if (means.groupby([rows[key] for key in cell]).nunique() > 1).any() or rows[~means]["subjects"].any():
+        raise InputError(f"{path.name}: expected subjects or one mean for each setting; found both")
+    metrics = pd.DataFrame(list(rows.pop("metrics")), dtype=float)
+    rows = rows.rename(columns={"subjects": "count"}).astype({"count": float})
+    variant = Variant("other", others.method)
+    return rows.assign(variant=variant, source=str(path), run=None, said=others.source).join(metrics)

@@ -8,9 +8,8 @@ from typing import Any
 import pandas as pd
 from tabulate import tabulate
 
-from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, decimals, title
+from ghgs_lit.evaluation.tables.layouts import Line, Table, arrow, data_title, decimals, title
 from ghgs_lit.evaluation.tables.notes import MARK
-from ghgs_lit.evaluation.tables.reported import data_title
 
 #: What a terminal shows bold and green.
 _BEST = "\033[1;32m{}\033[0m"

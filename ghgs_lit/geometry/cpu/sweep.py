@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 
 #: Pixels, and rows of an image, of one task.
 _PIXELS, _ROWS = 1024, 64

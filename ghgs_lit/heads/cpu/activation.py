@@ -1,4 +1,4 @@
-"""Activations distributed over threads; the result has the same bits with any number of them."""
+"""Networks and activations distributed over threads; the result has the same bits with any number of them."""
 
 from functools import partial
 from itertools import pairwise
@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from ghgs_lit.geometry.rotations import matrix_to_quaternion
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Cameras, DepthMaps, Points
 
 #: Gaussians of one task.
@@ -81,3 +81,32 @@ def activate(
         count,
     )  # fmt: skip
     return tuple(out)
+
+
+#: Rows of one task, and how many of the pool's pieces of work one of them is.
+_ROWS, _WORK = 1024, 2
+
+
+def attributes(
+    networks: list[nn.Sequential], descriptors: Float[Tensor, "*n c"]
+) -> tuple[Float[Tensor, "*n _"], ...]:
+    """What each of the networks makes of the descriptors; see :func:`ghgs_lit.kernels.pool.multiplies`.
+    ``networks``: of three layers, of equal widths but for the last, with ``nn.Tanh`` or ``nn.ReLU`` between.
+    ``descriptors``: of pixels."""
+    from ghgs_lit.heads.cpu.kernel import attributes as compiled  # here: it loads a compiler
+    from ghgs_lit.kernels.layers import packed, parameters
+
+    layers = packed(parameters([layer for network in networks for layer in network]))
+    outputs = [len(network[4].bias) for network in networks]
+    rows = descriptors.reshape(-1, descriptors.shape[-1]).contiguous()
+    found = rows.new_empty(len(rows), sum(outputs))
+    widths = np.array([len(networks[0][k].bias) for k in (0, 2)] + outputs)
+    bends = np.array([isinstance(network[1], nn.Tanh) for network in networks])
+    pool.run(
+        [
+            partial(compiled(), rows.numpy(), layers, widths, bends, found.numpy(), part.start, part.stop)
+            for part in even_parts(len(rows), _ROWS)
+        ],
+        _WORK * len(rows),
+    )
+    return torch.split(found.view(*descriptors.shape[:-1], -1), outputs, -1)

@@ -1,6 +1,7 @@
 """Raw attributes to Gaussians, 16 of one image at once; each line of ``values`` is a number of the 16.
 
-The same as :meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` in plain PyTorch, without a gradient.
+The same as :meth:`ghgs_lit.heads.gaussian.GaussianHead.activate` in plain PyTorch, without a gradient. And
+networks of three layers, of ``PANEL`` rows at once (see :mod:`ghgs_lit.kernels.layers`).
 """
 
 import math
@@ -13,6 +14,8 @@ from ghgs_lit.heads.activations import SIGMOID_LIMIT, TANH_LIMIT
 from ghgs_lit.heads.surface import OTHER, SAME
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.layers import bend, linear, lines, put_rows, rectify, size
+from ghgs_lit.kernels.products import PANEL
 from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
 ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
@@ -222,3 +225,48 @@ def _activate(
             for k in range(4):
                 quaternions[start + lane, k] = values[(ROTATION + k) * LANES + lane]
             opacities[start + lane] = values[OPACITY * LANES + lane]
+
+
+TABLE, FLAT = types.Array(types.float32, 2, "C"), types.Array(types.float32, 1, "C")
+WIDTHS, FLAGS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 1, "C")
+
+
+@cache
+def attributes():
+    """The compiled :func:`_attributes`."""
+    return kernel_for(_attributes, TABLE, FLAT, WIDTHS, FLAGS, TABLE, types.int64, types.int64)
+
+
+@helper
+def _bend_or_rectify(bends, layers, at, outputs, inputs, values):
+    """Add biases; then tanh where ``bends``, else ReLU."""
+    if bends:
+        bend(layers, at, outputs, inputs, values)
+    else:
+        rectify(layers, at, outputs, inputs, values)
+
+
+def _attributes(descriptors, layers, widths, bends, out, first, last):
+    """Write rows ``first`` to ``last``; see :func:`ghgs_lit.heads.cpu.attributes`."""
+    channels, wide, narrow = descriptors.shape[1], widths[0], widths[1]
+    widest = max(channels, lines(wide), lines(narrow), lines(widths[2:].max())) * PANEL
+    given, one, two = simd.aligned(channels * PANEL), simd.aligned(widest), simd.aligned(widest)
+    for start in range(first, last, PANEL):
+        count = min(PANEL, last - start)
+        put_rows(descriptors, start, count, 0, given)
+        at, column = 0, 0
+        for network in range(len(bends)):
+            outputs = widths[2 + network]
+            linear(layers, at, wide, channels, given, one)
+            _bend_or_rectify(bends[network], layers, at, wide, channels, one)
+            at += size(wide, channels)
+            linear(layers, at, narrow, wide, one, two)
+            _bend_or_rectify(bends[network], layers, at, narrow, wide, two)
+            at += size(narrow, wide)
+            linear(layers, at, outputs, narrow, two, one)
+            biases = at + lines(outputs) * narrow
+            for lane in range(count):
+                for k in range(outputs):
+                    out[start + lane, column + k] = one[k * PANEL + lane] + layers[biases + k]
+            at += size(outputs, narrow)
+            column += outputs

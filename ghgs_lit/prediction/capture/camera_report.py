@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ghgs_lit.data.resampling import area_image, area_mask
 from ghgs_lit.data.silhouettes import twins
+from ghgs_lit.data.view import area_image, area_mask
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette, subject_sphere
 from ghgs_lit.prediction.capture.calibration import AXES, EXTRINSICS, INTRINSICS, Convention, StoredCamera

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ghgs_lit.data.resampling import area_image
+from ghgs_lit.data.view import area_image
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
 SHARE = 0.8

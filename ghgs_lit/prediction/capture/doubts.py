@@ -6,7 +6,7 @@ Both are quick looks. A capture of which they find nothing is predicted as it is
 import numpy as np
 
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import SHARE, Photograph
 from ghgs_lit.prediction.refinement.coherence import contradiction

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 
 from ghgs_lit.config.keys import lookup
-from ghgs_lit.config.settings import image_size
+from ghgs_lit.config.options import image_size
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.model import GHGS

@@ -8,7 +8,7 @@ and the camera moves until they fit. A view's own Gaussians take no part, as the
 wherever its camera is. Bundle adjustment with a rendering loss is that of BARF (Lin et al., ICCV 2021).
 
 Photographs do not tell where the whole rig is, so cameras only move beside one another
-(:mod:`ghgs_lit.geometry.motion`); where a minority of them explains the silhouettes, beside the others.
+(:mod:`ghgs_lit.geometry.rotations`); where a minority of them explains the silhouettes, beside the others.
 """
 
 import dataclasses
@@ -22,8 +22,8 @@ from torch import Tensor
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import HEIGHT, Frame
 from ghgs_lit.geometry.mattes import coverage, on_black
-from ghgs_lit.geometry.motion import after_motions, rigid, without_common
 from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.prediction.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering

@@ -21,8 +21,8 @@ from torch import Tensor
 
 from ghgs_lit.geometry.frame import HEIGHT, subject_center
 from ghgs_lit.geometry.mattes import coverage
-from ghgs_lit.geometry.motion import after_motions, without_common
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
+from ghgs_lit.geometry.rotations import after_motions, without_common
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.prediction.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.types import Batch, Cameras

@@ -8,9 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ghgs_lit.geometry.outlines import signed_distance, soft_signed_distance
-from ghgs_lit.geometry.projection import pixel_centers
-from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.masks import signed_distance, soft_signed_distance
+from ghgs_lit.geometry.projection import pixel_centers, sample
 
 #: Size of the distance maps over that of the photographs.
 _FINER = 4

@@ -17,11 +17,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.geometry.mattes import coverage, on_black
-from ghgs_lit.geometry.projection import at_least_float32, project, unproject_maps
-from ghgs_lit.geometry.rotations import multiply_quaternions
-from ghgs_lit.geometry.sampling import sample
+from ghgs_lit.geometry.projection import at_least_float32, project, sample, unproject_maps
+from ghgs_lit.geometry.rotations import multiply_quaternions, unit
 from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow
-from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.prediction.refinement.refinement import Change, Descent, Renderer, seen_by
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 

@@ -8,8 +8,8 @@ from numba.core import types
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
 from ghgs_lit.kernels.layers import learn, linear, lines, put_ones, put_rows, put_slopes, rectify, unrectify
+from ghgs_lit.kernels.products import PANEL
 from ghgs_lit.kernels.simd import LANES
-from ghgs_lit.kernels.tile import PANEL
 from ghgs_lit.rounds.cpu.kernel import FLOATS, ONE, ZERO, see
 
 PLACES = types.Array(types.int64, 2, "C")

@@ -1,13 +1,15 @@
 """The kernels distributed over threads; the result has the same bits with any number of them."""
 
 from functools import partial
+from itertools import accumulate, pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.parts import even_parts
+from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.types import Cameras, Gaussians, Rendering
 
 #: Gaussians of one task, and how many of the pool's pieces of work one of them is.
 _TASK, _WORK = 512, 8
@@ -94,3 +96,36 @@ class _Remember(torch.autograd.Function):
         ]
         pool.run(tasks, 4 * _WORK * len(slope))
         return None, None, d_before, *sums.gradients()
+
+
+#: Gaussians of one task.
+_OBSERVED = 1024
+
+
+def compare(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    photo: Float[Tensor, "B V 3 H W"],
+    mask: Float[Tensor, "B V H W"],
+    rendering: Rendering,
+    near: float,
+    out: Float[Tensor, "N V 11"],
+) -> None:
+    """Write the values of :func:`ghgs_lit.rounds.observation.observe`. ``rendering``: of the Gaussians, by
+    ``cameras``. ``near``: metres behind the rendered surface at which a Gaussian counts as hidden."""
+    from ghgs_lit.rounds.cpu.kernel import observe  # here: it loads a compiler
+
+    inputs = (
+        *(gaussians.means, gaussians.colors, gaussians.image, cameras.intrinsics, cameras.extrinsics),
+        *(photo, mask, rendering.image, rendering.alpha, rendering.depth),
+    )
+    arrays = [x.contiguous().numpy() for x in inputs]
+    pool.run(
+        [
+            partial(observe(), *arrays, near, out.numpy(), first + part.start, first + part.stop)
+            for first, last in pairwise((0, *accumulate(gaussians.splits)))
+            for part in even_parts(last - first, _OBSERVED)
+            if last > first
+        ],
+        len(gaussians),
+    )

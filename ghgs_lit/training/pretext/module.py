@@ -1,20 +1,33 @@
-"""The LightningModule of the pretext stage."""
+"""The LightningModule of the pretext stage, and what it measures: part-awareness of features."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.semantic import SemanticBranch, features_of
+from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.training.base import BudgetedModule
 from ghgs_lit.training.guard import DivergedError
 from ghgs_lit.training.optimization import Optimization
 from ghgs_lit.training.pretext.labels import part_shares
-from ghgs_lit.training.pretext.measure import neighbor_shows_part
 from ghgs_lit.types import Batch
+
+
+def neighbor_shows_part(
+    features: Float[Tensor, "n c"], parts: Int[Tensor, " n"], views: Int[Tensor, " n"]
+) -> Bool[Tensor, " n"]:
+    """Whether the part of the most similar patch (cosine) among those of the other views is a patch's own.
+    ``features``: of the patches of one person. ``views``: the view of each patch. Patches without another
+    view are wrong."""
+    directions = unit(features)
+    cosines = (directions @ directions.T).masked_fill(views[:, None] == views, -torch.inf)
+    best, nearest = cosines.max(1) if len(features) else (cosines.new_zeros(0), views)
+    return (parts[nearest] == parts) & (best > -torch.inf)
 
 
 class Pretext(nn.Module):

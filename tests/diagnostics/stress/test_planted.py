@@ -12,7 +12,7 @@ import pytest
 from ghgs_lit.bounds.agreement import trusted_views
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.stages import STAGES, heads
-from ghgs_lit.geometry import projection, rotations, sampling, vectors
+from ghgs_lit.geometry import projection, rotations
 from ghgs_lit.geometry.padding import Padding
 from ghgs_lit.metrics import functional
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
@@ -45,15 +45,15 @@ class Defect:
 
 DEFECTS = (
     Defect(
-        "a bare square root", vectors.unit, "keepdim=True).masked_fill(is_zero, 1.0)", "keepdim=True)",
+        "a bare square root", rotations.unit, "keepdim=True).masked_fill(is_zero, 1.0)", "keepdim=True)",
         "unit vectors", "zero_quaternion",
     ),
     Defect(
-        "squares that overflow", vectors.unit, "scaled = x / largest.masked_fill(is_zero, 1.0)", "scaled = x",
-        "unit vectors", "huge_quaternion",
+        "squares that overflow", rotations.unit, "scaled = x / largest.masked_fill(is_zero, 1.0)",
+        "scaled = x", "unit vectors", "huge_quaternion",
     ),
     Defect(
-        "an epsilon that hides what is short", vectors.unit, "scaled * squared.rsqrt()",
+        "an epsilon that hides what is short", rotations.unit, "scaled * squared.rsqrt()",
         "x / (x.norm(dim=-1, keepdim=True) + 1e-8)", "cosine", "tiny_features",
     ),
     Defect(
@@ -82,7 +82,7 @@ DEFECTS = (
         '"use_mm_for_euclid_dist"', "neighbours", "shifted",
     ),
     Defect(
-        "the map of another subject", sampling.sample, "2 * image.to(pixels) + 1",
+        "the map of another subject", projection.sample, "2 * image.to(pixels) + 1",
         "2 * (image.to(pixels) + 1) % (2 * count) + 1", "samples of maps", "ordinary",
     ),
     Defect(

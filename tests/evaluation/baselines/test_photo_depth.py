@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from ghgs_lit.evaluation.baselines.hull import hull_bounds, hull_depth
-from ghgs_lit.evaluation.baselines.photo_depth import _shared, photo_depth
+from ghgs_lit.evaluation.baselines.photo_depth import _shared, hull_bounds, hull_depth, photo_depth
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import painted_ellipsoid, ring
 

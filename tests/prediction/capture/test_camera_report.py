@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ghgs_lit.data.resampling import area_mask
+from ghgs_lit.data.view import area_mask
 from ghgs_lit.geometry.silhouettes import HullSearch, Silhouette
 from ghgs_lit.prediction.capture.camera_report import diagnose
 from ghgs_lit.prediction.capture.drawing import camera_sheet

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.geometry.outlines import signed_distance
+from ghgs_lit.geometry.masks import signed_distance
 from ghgs_lit.prediction.capture import predict as predicting
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from ghgs_lit.geometry.frame import HEIGHT, Frame
-from ghgs_lit.geometry.motion import after_motions, rigid, without_common
 from ghgs_lit.geometry.projection import project, unproject_maps
+from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
 from ghgs_lit.prediction.refinement import coherence
 from ghgs_lit.prediction.refinement.coherence import coherent_cameras, contradiction
 from ghgs_lit.prediction.refinement.outlines import Outlines

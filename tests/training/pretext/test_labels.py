@@ -12,8 +12,7 @@ from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject
 from ghgs_lit.synthesis.people.body import BODY_VERTICES, load_body
-from ghgs_lit.training.pretext.labels import part_shares
-from ghgs_lit.training.pretext.parts import PARTS, parts_of_points, vertex_parts
+from ghgs_lit.training.pretext.labels import PARTS, part_shares, parts_of_points, vertex_parts
 from ghgs_lit.training.validation_pictures import PicturesOptions
 from tests.helpers.bodies import body_batch
 from tests.helpers.models import make_model

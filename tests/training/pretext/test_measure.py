@@ -3,7 +3,7 @@
 import torch
 import torch.nn.functional as F
 
-from ghgs_lit.training.pretext.measure import neighbor_shows_part
+from ghgs_lit.training.pretext.module import neighbor_shows_part
 
 
 def test_the_nearest_neighbour_of_another_view_is_asked():

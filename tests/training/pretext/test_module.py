@@ -4,8 +4,8 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.encoder.semantic import SemanticOptions
+from ghgs_lit.training.pretext.labels import PARTS
 from ghgs_lit.training.pretext.module import Pretext, cross_entropy
-from ghgs_lit.training.pretext.parts import PARTS
 from tests.helpers.bodies import body_batch
 
 

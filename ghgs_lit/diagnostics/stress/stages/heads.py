@@ -7,8 +7,7 @@ from torch import Generator
 
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import Stage, Values, except_for
-from ghgs_lit.geometry.rotations import quaternion_to_matrix
-from ghgs_lit.geometry.vectors import unit
+from ghgs_lit.geometry.rotations import quaternion_to_matrix, unit
 from ghgs_lit.heads.activations import confidence_of
 from ghgs_lit.heads.depth import BOUNDED, bounded_depth
 from ghgs_lit.heads.dpt import DPTHead
