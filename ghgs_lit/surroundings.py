@@ -194,14 +194,9 @@ def computing(
     precision: str, auto: AutoSkip | None, encoder: Encoder, masks: Bool[Tensor, "B V H W"]
 ) -> Iterator[tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"] | None]]:
     """How much is computed while the context lasts: in which precision, and which patches take part.
-
-    Args:
-        precision: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`.
-        auto: chooses what the encoder sees of each subject (``skip=auto``); None: the encoder does itself.
-
-    Yields:
-        The choices, and the patches that take part, None where the encoder decides.
-    """
+    ``precision``: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`. ``auto``: chooses what the encoder
+    sees of each subject (``skip=auto``); None: the encoder does itself. Yields: the choices, and the patches
+    that take part, None where the encoder decides."""
     decisions, kept = ((), None) if auto is None else auto.decide(encoder, masks)
     with precision_of(precision, torch.device(masks.device)):
         yield decisions, kept

@@ -138,15 +138,9 @@ def class_of(group: str, kind: Any, key: str) -> type[Options]:
 
 
 def read_node(node: Any, key: str) -> Options:
-    """The checked options of a node.
-
-    Args:
-        node: a mapping of plain data, with ``kind`` where its group has kinds.
-        key: its dotted key, such as ``bounds`` or ``callbacks.best``.
-
-    Raises:
-        InputError: names the key of the first wrong value, what was expected and what was found.
-    """
+    """The checked options of a node. ``node``: a mapping of plain data, with ``kind`` where its group has
+    kinds. ``key``: its dotted key, such as ``bounds`` or ``callbacks.best``. InputError: names the key of the
+    first wrong value, what was expected and what was found."""
     group = key.split(".")[0]
     if not isinstance(node, Mapping):
         raise InputError(f"{key}: expected a mapping of its keys; found {node!r}")

@@ -107,13 +107,9 @@ def _read_all(items: Dataset, workers: int, label: str) -> list:
 
 def inspect(data: PhotographsDataModule, min_iou: float = 0.5, min_agreement: float = 0.9) -> Report:
     """Read everything that training and evaluation would read, once, with the workers of ``data``.
-
-    Args:
-        min_iou: least IoU of a body's silhouette and a mask; below it a camera counts as wrong. Clothed
-            people reach 0.75 to 0.95, a wrong camera 0 to 0.4.
-        min_agreement: the same for people without a body: least share of a mask that the other masks allow.
-            Right cameras reach 0.98 to 1.
-    """
+    ``min_iou``: least IoU of a body's silhouette and a mask; below it a camera counts as wrong. Clothed
+    people reach 0.75 to 0.95, a wrong camera 0 to 0.4. ``min_agreement``: the same for people without a body:
+    least share of a mask that the other masks allow. Right cameras reach 0.98 to 1."""
     report = Report()
     dataset, workers = data.dataset, data.dataset.workers
     # With static cameras only one protocol is possible; the configured one matters in training only.

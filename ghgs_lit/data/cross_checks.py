@@ -17,14 +17,10 @@ Photograph = tuple[str, int, int]
 
 @dataclass(frozen=True)
 class Seen:
-    """What reading one photograph gave.
-
-    Attributes:
-        iou, inside: how the body fits the mask (:class:`Overlap`), where there is a body.
-        agreement: where there is none, the share of the mask that the other masks allow.
-        tall: its largest side in world units, by its body or by its masks, where that is known.
-        silhouette: the coarse mask, where the body does not check the camera.
-    """
+    """What reading one photograph gave. ``iou``, ``inside``: how the body fits the mask (:class:`Overlap`),
+    where there is a body. ``agreement``: where there is none, the share of the mask that the other masks
+    allow. ``tall``: its largest side in world units, by its body or by its masks, where that is known.
+    ``silhouette``: the coarse mask, where the body does not check the camera."""
 
     name: str
     position: int
@@ -62,13 +58,9 @@ class Phase:
 
 @dataclass
 class Report:
-    """The result of a check.
-
-    Attributes:
-        problems: lines ``<place>: expected ...; found ...`` of what keeps training from starting.
-        notes: the same of what does not.
-        inspections: number of files that were checked beside the photographs.
-    """
+    """The result of a check. ``problems``: lines ``<place>: expected ...; found ...`` of what keeps training
+    from starting. ``notes``: the same of what does not. ``inspections``: number of files that were checked
+    beside the photographs."""
 
     phases: dict[str, Phase] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)

@@ -135,14 +135,9 @@ class PhotographsDataModule(LightningDataModule):
         split: str = "val",
         batch_size: int | None = None,
     ) -> DataLoader:
-        """One sample for each subject, always the same ones.
-
-        Args:
-            views: number of inputs (None: the view protocol's).
-            targets: a protocol or its mapping, or several, whose targets a sample has one after another
-                (None: this module's).
-            batch_size: samples of a batch (None: this module's).
-        """
+        """One sample for each subject, always the same ones. ``views``: number of inputs (None: the view
+        protocol's). ``targets``: a protocol or its mapping, or several, whose targets a sample has one after
+        another (None: this module's). ``batch_size``: samples of a batch (None: this module's)."""
         protocols = _protocols(self.targets if targets is None else targets)
         specs = self._evaluation_samples(self.subjects(split), protocols, views)
         batches = EvaluationBatches(self.builder(split), specs, batch_size or self.dataset.batch_size)

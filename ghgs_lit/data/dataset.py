@@ -33,13 +33,10 @@ class Limit(Options):
 
 
 class DataOptions(Options):
-    """Everything that data sets have in common; each has a subclass with the keys of its own.
-
-    Class attributes:
-        published: number of people of each phase in the publication, where there is one.
-        static_cameras: whether there are no views between the cameras (their view number is always 0).
-        ring: number of positions on a full ring of cameras; inputs are evenly spaced among them.
-    """
+    """Everything that data sets have in common; each has a subclass with the keys of its own. ``published``:
+    number of people of each phase in the publication, where there is one. ``static_cameras``: whether there
+    are no views between the cameras (their view number is always 0). ``ring``: number of positions on a full
+    ring of cameras; inputs are evenly spaced among them."""
 
     group = "data"
     published: ClassVar[Mapping[str, int]] = {}

@@ -18,13 +18,9 @@ _CELLS = 96
 
 @dataclass(frozen=True)
 class Overlap:
-    """How a body fits a mask.
-
-    Attributes:
-        iou: intersection over union of the body's silhouette and the mask.
-        inside: share of the vertices inside the photograph that lie in the mask, or in a cell beside it (a
-            hundredth of the body's height).
-    """
+    """How a body fits a mask. ``iou``: intersection over union of the body's silhouette and the mask.
+    ``inside``: share of the vertices inside the photograph that lie in the mask, or in a cell beside it (a
+    hundredth of the body's height)."""
 
     iou: float
     inside: float
@@ -82,15 +78,8 @@ _DOTS = 400
 
 
 def draw_tile(view: View | None, body: np.ndarray | None) -> Tile:
-    """Draw the outline of the mask in green and some vertices of the body in red.
-
-    Args:
-        view: the photograph; None draws a cross.
-        body: vertices [n, 3] in the world, or None.
-
-    Returns:
-        [176, w, 3] uint8.
-    """
+    """Draw the outline of the mask in green and some vertices of the body in red. ``view``: the photograph;
+    None draws a cross. ``body``: vertices [n, 3] in the world, or None. Returns: [176, w, 3] uint8."""
     if view is None:
         image = Image.new("RGB", (_HEIGHT, _HEIGHT), _GREY)
         draw = ImageDraw.Draw(image)

@@ -39,13 +39,9 @@ class Reader(ABC):
 
     @abstractmethod
     def read_view(self, name: str, position: int, view: int, depth: bool) -> View:
-        """Read one photograph at its stored size. InputError: a file is missing or bad.
-
-        Args:
-            position: number of the camera, or position on the ring.
-            view: number of the view at that position.
-            depth: whether to read the depth map too, if there is one.
-        """
+        """Read one photograph at its stored size. InputError: a file is missing or bad. ``position``: number
+        of the camera, or position on the ring. ``view``: number of the view at that position. ``depth``:
+        whether to read the depth map too, if there is one."""
 
     @abstractmethod
     def read_body(self, name: str) -> np.ndarray | None:

@@ -226,15 +226,9 @@ def evaluation_samples(
     seed: int,
     positions: Sequence[Sequence[int]] = (),
 ) -> list[SampleSpec]:
-    """One sample for each subject, always the same ones.
-
-    Args:
-        protocols: whose targets a sample has, one after another; none: samples without targets.
-        positions: lists of input positions; evenly spaced where none has ``count``.
-
-    Raises:
-        InputError: the input positions are not different ones, or a subject lacks one.
-    """
+    """One sample for each subject, always the same ones. ``protocols``: whose targets a sample has, one after
+    another; none: samples without targets. ``positions``: lists of input positions; evenly spaced where none
+    has ``count``. InputError: the input positions are not different ones, or a subject lacks one."""
     inputs = next((list(listed) for listed in positions if len(listed) == count), even_positions(ring, count))
     expected = f"different positions of a ring of {ring}"
     require(count > 0 and len(set(inputs)) == count, f"evaluation with {count} views", expected, inputs)

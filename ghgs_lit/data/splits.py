@@ -18,13 +18,9 @@ def split_names(
     source: Path, names: Sequence[str], split: Split | None, val_fraction: float, seed: int
 ) -> dict[str, list[str]]:
     """Divide the scans of a folder. InputError: the split is missing or malformed, names scans that do not
-    exist, or overlaps.
-
-    Args:
-        split: as for :func:`read_split` (None: the split files in ``source``, if there are any).
-        val_fraction: fraction of ``names`` that is ``val`` where nothing else decides, 0 to 1; above 0 at
-            least one of them.
-    """
+    exist, or overlaps. ``split``: as for :func:`read_split` (None: the split files in ``source``, if there
+    are any). ``val_fraction``: fraction of ``names`` that is ``val`` where nothing else decides, 0 to 1;
+    above 0 at least one of them."""
     if split is None and not any((source / name).exists() for name in _SPLIT_FILES):
         order = np.random.default_rng(seed).permutation(len(names))
         count = max(round(val_fraction * len(names)), val_fraction > 0)
@@ -43,13 +39,9 @@ def split_names(
 
 def read_split(split: Split, names: Sequence[str]) -> dict[str, list[str]]:
     """The ids of ``train`` and of ``val`` (which a split may call ``test``). InputError: it is missing or
-    malformed, or an id is in both.
-
-    Args:
-        split: a JSON file with these lists; a folder with ``splits.json``, or with ``split_train.txt`` and
-            ``split_val.txt`` (one id a line); or a mapping of ids and of ranges such as ``0000-0425``.
-        names: the ids that a range selects from.
-    """
+    malformed, or an id is in both. ``split``: a JSON file with these lists; a folder with ``splits.json``, or
+    with ``split_train.txt`` and ``split_val.txt`` (one id a line); or a mapping of ids and of ranges such as
+    ``0000-0425``. ``names``: the ids that a range selects from."""
     if isinstance(split, Mapping):
         place: Path | str = "data.split"
         chosen = _lists(place, split)

@@ -159,14 +159,9 @@ def half_centers(intrinsics: np.ndarray) -> np.ndarray:
 
 
 def opencv_view(image: np.ndarray, mask: np.ndarray, intrinsics: np.ndarray, extrinsics: np.ndarray) -> View:
-    """A view from an OpenCV calibration: background to black, pixel centres from integers to +0.5.
-
-    Args:
-        image: [h, w, 3] uint8.
-        mask: [h, w] bool.
-        intrinsics: [3, 3] in pixels, pixel centres at integers.
-        extrinsics: [4, 4], world to camera, metres.
-    """
+    """A view from an OpenCV calibration: background to black, pixel centres from integers to +0.5. ``image``:
+    [h, w, 3] uint8. ``mask``: [h, w] bool. ``intrinsics``: [3, 3] in pixels, pixel centres at integers.
+    ``extrinsics``: [4, 4], world to camera, metres."""
     image = np.where(mask[..., None], image, 0)
     return View(image, mask, None, half_centers(intrinsics).astype(np.float32), extrinsics.astype(np.float32))
 

@@ -30,13 +30,8 @@ class Rotary(NamedTuple):
 
 
 def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
-    """Tables of all tokens.
-
-    Args:
-        positions: row and column of each token.
-        head_width: channels of a head, divisible by 4.
-        like: tokens; the tables are float32, or float64 for tokens in float64.
-    """
+    """Tables of all tokens. ``positions``: row and column of each token. ``head_width``: channels of a head,
+    divisible by 4. ``like``: tokens; the tables are float32, or float64 for tokens in float64."""
     exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
     angles = positions.float()[..., None] * (1.0 / BASE**exponents)
     angles = angles.to(at_least_float32(like).dtype)

@@ -78,14 +78,10 @@ def run_block(
     checkpointing: bool,
     rotary: Rotary | None = None,
 ) -> Float[Tensor, "t c"]:
-    """``block(x)``; no gradient is recorded where neither ``x`` nor the block needs one.
-
-    Args:
-        x: tokens of all sequences, one after another.
-        lengths: tokens of each sequence; attention stays inside it.
-        checkpointing: recompute the block's activations in the backward pass instead of keeping them.
-        rotary: tables that rotate queries and keys; None for no rotation.
-    """
+    """``block(x)``; no gradient is recorded where neither ``x`` nor the block needs one. ``x``: tokens of all
+    sequences, one after another. ``lengths``: tokens of each sequence; attention stays inside it.
+    ``checkpointing``: recompute the block's activations in the backward pass instead of keeping them.
+    ``rotary``: tables that rotate queries and keys; None for no rotation."""
     needs_grad = x.requires_grad or any(p.requires_grad for p in block.parameters())
     with torch.set_grad_enabled(needs_grad and torch.is_grad_enabled()):
         if checkpointing and torch.is_grad_enabled():

@@ -68,15 +68,10 @@ class VGGTEncoder(nn.Module):
         bounds: DepthBounds | None = None,
         kept: Bool[Tensor, "b v h w"] | None = None,
     ) -> Tokens:
-        """Tokens of all views: of all patches, or of those that are kept.
-
-        Args:
-            images: [B, V, 3, H, W], RGB in [0, 1], sides divisible by the patch size.
-            masks: [B, V, H, W]; read with ``mask_input``, ``bounds_input`` or ``semantic``, and where
-                ``tokens`` is not ``all``.
-            bounds: read with ``bounds_input``.
-            kept: which patches take part; None: those of :meth:`keeps`.
-        """
+        """Tokens of all views: of all patches, or of those that are kept. ``images``: [B, V, 3, H, W], RGB in
+        [0, 1], sides divisible by the patch size. ``masks``: [B, V, H, W]; read with ``mask_input``,
+        ``bounds_input`` or ``semantic``, and where ``tokens`` is not ``all``. ``bounds``: read with
+        ``bounds_input``. ``kept``: which patches take part; None: those of :meth:`keeps`."""
         self._check(images, masks)
         chosen = self.keeps(masks) if kept is None else kept
         kept = KeptPatches(chosen, images.device)

@@ -76,13 +76,10 @@ NORM_EPS = 1e-6
 
 
 class VisionTransformer(nn.Module):
-    """DINOv2 ViT; tokens of an image are in the order class, registers, kept patches.
-
-    Args:
-        image_size: side in pixels of the square image whose position embedding is stored, a multiple of
-            ``patch_size``; for other sizes it is resampled.
-        checkpointing: recompute activations in the backward pass instead of keeping them.
-    """
+    """DINOv2 ViT; tokens of an image are in the order class, registers, kept patches. ``image_size``: side in
+    pixels of the square image whose position embedding is stored, a multiple of ``patch_size``; for other
+    sizes it is resampled. ``checkpointing``: recompute activations in the backward pass instead of keeping
+    them."""
 
     def __init__(
         self,

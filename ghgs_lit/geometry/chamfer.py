@@ -67,13 +67,8 @@ def chamfer(
 ) -> Float[Tensor, ""]:
     """Mean squared distance from each point to its nearest reference, plus the mean the other way round.
     Returns: 0 where either set is empty (with a gradient of 0); nan where a coordinate is not finite.
-
-    Args:
-        points: the prediction, in metres.
-        references: the surface, in metres.
-        limit: points of each set that are matched at most (to all of the other set, so that the mean stays
-            unbiased); None: all.
-    """
+    ``points``: the prediction, in metres. ``references``: the surface, in metres. ``limit``: points of each
+    set that are matched at most (to all of the other set, so that the mean stays unbiased); None: all."""
     points, references = at_least_float32(points), at_least_float32(references)
     if not (torch.isfinite(points).all() and torch.isfinite(references).all()):
         return (points.sum() + references.sum()) * torch.nan

@@ -30,13 +30,9 @@ WIDEST = -0.6
 @torch.no_grad()
 def photo_consistency(batch: Batch, bounds: DepthBounds, steps: int) -> Float[Tensor, "B V S H W"]:
     """Agreement of each pixel of the subject with the best other view, in [0, 1], without a gradient.
-    Returns: 0 outside the subject, and where no other view has the point inside its mask.
-
-    Args:
-        batch: images, masks and cameras are read.
-        bounds: near and far of each pixel, in metres.
-        steps: S, how many depths are compared: the middles of S equal parts of near to far.
-    """
+    Returns: 0 outside the subject, and where no other view has the point inside its mask. ``batch``: images,
+    masks and cameras are read. ``bounds``: near and far of each pixel, in metres. ``steps``: S, how many
+    depths are compared: the middles of S equal parts of near to far."""
     near, far = (bound.flatten()[batch.pixels] for bound in (bounds.near, bounds.far))
     found = consistency_of(batch, batch.pixels, near, far, steps)
     result = found.new_zeros(batch.masks.numel(), steps).index_copy_(0, batch.pixels, found)
@@ -97,13 +93,9 @@ def _best_match(
 
 
 def _match(images: Tensor, image: Tensor, own: Tensor, rays: Tensor, shift: Tensor, depth: Tensor) -> Tensor:
-    """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W].
-
-    Args:
-        image: [n, o], the o others that each pixel is compared with.
-        rays, shift: [n, o, 3], of the pixels in the others.
-        depth: [n, S].
-    """
+    """Agreement [n, o, S] of colours ``own`` [n, 3] with ``images`` [m, 4, H, W]. ``image``: [n, o], the o
+    others that each pixel is compared with. ``rays``, ``shift``: [n, o, 3], of the pixels in the others.
+    ``depth``: [n, S]."""
     points = rays[:, :, None] * depth[:, None, :, None] + shift[:, :, None]
     z = points[..., 2]
     front = z > 0

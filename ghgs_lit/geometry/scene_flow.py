@@ -116,13 +116,9 @@ def _with_slopes(images: Float[Tensor, "V 3 h w"]) -> Float[Tensor, "V 9 h w"]:
 def scene_flow(
     points: Float[Tensor, "N 3"], shown: Bool[Tensor, "N V"], before: Instant, after: Instant
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """How points moved, in metres, and turned: rotation vectors.
-
-    Args:
-        points: on the surface, in the first instant.
-        shown: which views show them there.
-        before, after: the same views in their order; a camera may be cropped otherwise, but stands still.
-    """
+    """How points moved, in metres, and turned: rotation vectors. ``points``: on the surface, in the first
+    instant. ``shown``: which views show them there. ``before``, ``after``: the same views in their order; a
+    camera may be cropped otherwise, but stands still."""
     near = ((points - points.nanmedian(0).values).abs() < _REACH).all(-1) if len(points) else shown.any(-1)
     if not near.any():
         return torch.zeros_like(points), torch.zeros_like(points)

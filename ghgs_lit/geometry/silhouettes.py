@@ -14,13 +14,9 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A mask with the camera of its cells.
-
-    Attributes:
-        mask: [h, w] bool, true where any pixel of a cell is.
-        intrinsics: [3, 3] float64 in cells, cell centres at +0.5.
-        extrinsics: [4, 4] float64, world to camera.
-    """
+    """A mask with the camera of its cells. ``mask``: [h, w] bool, true where any pixel of a cell is.
+    ``intrinsics``: [3, 3] float64 in cells, cell centres at +0.5. ``extrinsics``: [4, 4] float64, world to
+    camera."""
 
     mask: np.ndarray
     intrinsics: np.ndarray
@@ -112,13 +108,9 @@ class HullSearch:
         focus: np.ndarray,
         radius: float,
     ) -> np.ndarray:
-        """Whether the rays of a silhouette meet the hull of ``others`` [n] bool.
-
-        Args:
-            cells: [n, 2] (column, row), through which the rays pass.
-            others: that a point of the hull is covered by, but for a share of :attr:`wrong`.
-            focus, radius: of :func:`subject_sphere`.
-        """
+        """Whether the rays of a silhouette meet the hull of ``others`` [n] bool. ``cells``: [n, 2] (column,
+        row), through which the rays pass. ``others``: that a point of the hull is covered by, but for a share
+        of :attr:`wrong`. ``focus``, ``radius``: of :func:`subject_sphere`."""
         depths = one.depths_around(focus, self.reach * radius, self.depths)
         points = one.center + one.rays(cells)[:, None] * depths[:, None]
         outside = np.zeros(points.shape[:2], int)

@@ -15,13 +15,9 @@ def undistorting_grid(
     intrinsics: np.ndarray, distortion: np.ndarray, height: int, width: int, fisheye: bool = False
 ) -> torch.Tensor:
     """Where each pixel of the undistorted image lies in the photograph. Returns: [1, h, w, 2] float32 for
-    ``grid_sample`` with ``align_corners=False``.
-
-    Args:
-        intrinsics: [3, 3] in pixels, pixel centres at +0.5; the undistorted image keeps them.
-        distortion: k1 k2 p1 p2 and up to ten more of OpenCV's model.
-        fisheye: ``distortion`` is k1 to k4 of the model of Kannala and Brandt.
-    """
+    ``grid_sample`` with ``align_corners=False``. ``intrinsics``: [3, 3] in pixels, pixel centres at +0.5; the
+    undistorted image keeps them. ``distortion``: k1 k2 p1 p2 and up to ten more of OpenCV's model.
+    ``fisheye``: ``distortion`` is k1 to k4 of the model of Kannala and Brandt."""
     # Here: kornia takes longer to import than photographs without distortion take to be read.
     from kornia.geometry.calibration import distort_points
     from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt

@@ -109,13 +109,9 @@ class DepthHead(nn.Module):
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds | None, pixels: DecodedPixels = "all"
     ) -> DepthMaps:
         """Depths of all pixels; those of the subject are valid. Returns: Values that are not finite are
-        replaced by 1 m and are not valid.
-
-        Args:
-            batch: images, masks and cameras are read.
-            bounds: None where :attr:`is_bounded` is false.
-            pixels: ``subject``: only windows around the subject are decoded; other depths have no meaning.
-        """
+        replaced by 1 m and are not valid. ``batch``: images, masks and cameras are read. ``bounds``: None
+        where :attr:`is_bounded` is false. ``pixels``: ``subject``: only windows around the subject are
+        decoded; other depths have no meaning."""
         guide = None
         if self.dpt.guide is not None:
             maps = [] if bounds is None else [relative_bounds(bounds, batch.masks)]

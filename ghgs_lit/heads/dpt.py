@@ -195,15 +195,10 @@ class Windows:
 
 
 class DPTHead(nn.Module):
-    """Tokens of four layers to ``output_dim`` raw channels for each pixel.
-
-    Args:
-        dim_latent: width of a token of ``Tokens.latent``.
-        output_dim: channels of the result; activations are the caller's.
-        guide_channels: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
-            sharp; 0: none, as published.
-        widths: in place of :func:`published_widths`.
-    """
+    """Tokens of four layers to ``output_dim`` raw channels for each pixel. ``dim_latent``: width of a token
+    of ``Tokens.latent``. ``output_dim``: channels of the result; activations are the caller's.
+    ``guide_channels``: of a guide at full resolution (:mod:`ghgs_lit.heads.guide`), which keeps a small head
+    sharp; 0: none, as published. ``widths``: in place of :func:`published_widths`."""
 
     def __init__(
         self,

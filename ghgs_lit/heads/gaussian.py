@@ -273,13 +273,10 @@ class GaussianHead(nn.Module):
         depth_maps: DepthMaps,
         pixels: DecodedPixels = "subject",
     ) -> RawGaussians:
-        """Raw attributes of the valid pixels in the order of element, view, row, column.
-
-        Args:
-            batch: images, masks and cameras are read.
-            pixels: ``subject`` decodes windows around the subject and runs the networks on its pixels,
-                ``all`` computes every pixel and selects afterwards; the result is the same.
-        """
+        """Raw attributes of the valid pixels in the order of element, view, row, column. ``batch``: images,
+        masks and cameras are read. ``pixels``: ``subject`` decodes windows around the subject and runs the
+        networks on its pixels, ``all`` computes every pixel and selects afterwards; the result is the
+        same."""
         views, height, width = points.valid.shape[1:]
         counts = points.valid.flatten(0, 1).sum((1, 2)).tolist()
         index = true_places(points.valid, sum(counts))

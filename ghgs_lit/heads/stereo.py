@@ -48,11 +48,7 @@ class StereoHeadOptions(Options):
 
 
 class StereoHead(nn.Module):
-    """Depths from correlations of neighbouring views.
-
-    Args:
-        options: of the head.
-    """
+    """Depths from correlations of neighbouring views. ``options``: of the head."""
 
     is_bounded = True
 
@@ -74,14 +70,8 @@ class StereoHead(nn.Module):
         self, tokens: Tokens, batch: Batch, bounds: DepthBounds, pixels: DecodedPixels = "all"
     ) -> DepthMaps:
         """Depths of all pixels between the nearest and the farthest bound of their view; those of the subject
-        are valid.
-
-        Args:
-            tokens: not read.
-            batch: images, masks and cameras are read.
-            bounds: of the pixels.
-            pixels: not read: the network sees whole images.
-        """
+        are valid. ``tokens``: not read. ``batch``: images, masks and cameras are read. ``bounds``: of the
+        pixels. ``pixels``: not read: the network sees whole images."""
         height, width = batch.masks.shape[2:]
         near, far = subject_range(bounds, batch)
         with without_float16(batch.masks.device.type):
@@ -122,10 +112,7 @@ def _two_layers(inputs: int, outputs: int) -> nn.Sequential:
 
 class Update(nn.Module):
     """One update: what is looked up around the estimate, a convolutional GRU, a change of the estimate.
-
-    Args:
-        channels: of the memory and of the context.
-    """
+    ``channels``: of the memory and of the context."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -143,13 +130,9 @@ class Update(nn.Module):
         levels: list[Float[Tensor, "n _ h w"]],
         fraction: Float[Tensor, "n 1 h w"],
     ) -> tuple[Float[Tensor, "n c h w"], Float[Tensor, "n 1 h w"]]:
-        """The next memory, and what is added to the raw estimate.
-
-        Args:
-            memory, context: of the cells.
-            levels: correlations from near to far, from fine to coarse.
-            fraction: the estimate, as a share of the way from near to far.
-        """
+        """The next memory, and what is added to the raw estimate. ``memory``, ``context``: of the cells.
+        ``levels``: correlations from near to far, from fine to coarse. ``fraction``: the estimate, as a share
+        of the way from near to far."""
         seen = torch.cat([*(look_up(level, fraction) for level in levels), 2 * fraction - 1], 1)
         x = torch.cat((self.seen(seen.to(memory.dtype)).relu(), context), 1)
         forget, reset = self.gates(torch.cat((memory, x), 1)).sigmoid().chunk(2, 1)
@@ -228,11 +211,8 @@ def correlations(
 
 def look_up(level: Float[Tensor, "n s h w"], fraction: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n r h w"]:
     """Values at the estimate and at :data:`RADIUS` steps to either side of it, linear between steps.
-
-    Args:
-        level: a value for each of equal parts of the way from near to far.
-        fraction: where, as a share of this way; beyond its ends lie the values at the ends.
-    """
+    ``level``: a value for each of equal parts of the way from near to far. ``fraction``: where, as a share of
+    this way; beyond its ends lie the values at the ends."""
     last = level.shape[1] - 1
     around = torch.arange(-RADIUS, RADIUS + 1, device=level.device).view(-1, 1, 1)
     at = (fraction * last + around).clamp(0, last)

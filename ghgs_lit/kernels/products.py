@@ -34,13 +34,9 @@ def _steps(builder, rows, row_stride: int, step_stride: int, panel, steps, total
 
 
 def make_product(strides: tuple[int, int], adds: bool):
-    """A product of ``ROWS`` rows and one panel.
-
-    Args:
-        strides: distances in numbers from row to row and from step to step; the compiler knows them, which
-            keeps all registers free for the tile.
-        adds: add the product to ``out`` instead of overwriting it.
-    """
+    """A product of ``ROWS`` rows and one panel. ``strides``: distances in numbers from row to row and from
+    step to step; the compiler knows them, which keeps all registers free for the tile. ``adds``: add the
+    product to ``out`` instead of overwriting it."""
 
     @intrinsic
     def product(typing_context, x, x_at, panels, panel_at, steps, out, out_at, out_stride):

@@ -79,14 +79,9 @@ def _common(*args):
 
 
 def _operator(function, family, result, emit):
-    """Define a Python operator for a ``family`` of vectors.
-
-    Args:
-        function: the operator, such as ``operator.add``.
-        family: class of the operands, floats or masks.
-        result: maps the kind of the operands to that of the value.
-        emit: writes the LLVM instruction.
-    """
+    """Define a Python operator for a ``family`` of vectors. ``function``: the operator, such as
+    ``operator.add``. ``family``: class of the operands, floats or masks. ``result``: maps the kind of the
+    operands to that of the value. ``emit``: writes the LLVM instruction."""
 
     class Template(AbstractTemplate):
         key = function

@@ -25,13 +25,8 @@ def flicker(
     cameras: Cameras,
 ) -> Float[Tensor, " t"]:
     """Mean absolute change of each error at the points that are visible at both instants; nan without any.
-
-    Args:
-        errors: renders less photographs, of images in [0, 1].
-        points: of the surface in the world, metres.
-        depths: true z-depths in metres, 0 where there is none.
-        cameras: [2, t].
-    """
+    ``errors``: renders less photographs, of images in [0, 1]. ``points``: of the surface in the world,
+    metres. ``depths``: true z-depths in metres, 0 where there is none. ``cameras``: [2, t]."""
     pixels, z = project(points[:, None], cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
     image = torch.arange(2 * z.shape[1], device=z.device).view(2, -1, 1).expand(z.shape)
     # Beside the silhouette the 0 of the background makes the depth too small: such points are left out.

@@ -65,13 +65,9 @@ class SemanticAttention(nn.Module):
     def forward(
         self, x: Float[Tensor, "N C"], neighbors: Sequence[Neighbors], cosines: Sequence[Tensor] | None
     ) -> Float[Tensor, "N C"]:
-        """Recalibrated tokens.
-
-        Args:
-            x: the tokens of all batch elements, one element after the other.
-            neighbors: for each element, the neighbours of its ``n_b`` tokens, as indices within the element.
-            cosines: ``[n_b, k_b]`` for each element; None where ``similarity`` is ``none``.
-        """
+        """Recalibrated tokens. ``x``: the tokens of all batch elements, one element after the other.
+        ``neighbors``: for each element, the neighbours of its ``n_b`` tokens, as indices within the element.
+        ``cosines``: ``[n_b, k_b]`` for each element; None where ``similarity`` is ``none``."""
         counts = [len(element.index) for element in neighbors]
         elements = zip(x.split(counts), neighbors, cosines or [None] * len(counts), strict=True)
         results = [self._recalibrate_element(*element) for element in elements]
@@ -80,14 +76,9 @@ class SemanticAttention(nn.Module):
     def attention_weights(
         self, x: Float[Tensor, "n C"], rows: slice, neighbors: Neighbors, cosines: Float[Tensor, "n k"] | None
     ) -> Float[Tensor, "m k a"]:
-        """Softmax weights of each head from some tokens to their neighbours, to look at.
-
-        Args:
-            x: the tokens of one batch element.
-            rows: the ``m`` tokens that attend.
-            neighbors: of all ``n`` tokens.
-            cosines: None where ``similarity`` is ``none``.
-        """
+        """Softmax weights of each head from some tokens to their neighbours, to look at. ``x``: the tokens of
+        one batch element. ``rows``: the ``m`` tokens that attend. ``neighbors``: of all ``n`` tokens.
+        ``cosines``: None where ``similarity`` is ``none``."""
         near, normed = neighbors.index[rows], self.norm1(x)
         q, k = at_least_float32(self.q_proj(normed[rows])), at_least_float32(self.k_proj(normed))
         changes = self._factor_and_bias(None if cosines is None else cosines[rows])

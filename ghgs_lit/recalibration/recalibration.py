@@ -45,11 +45,7 @@ class RecalibrationOptions(Options):
 
 class Recalibration(nn.Module):
     """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward.
-
-    Args:
-        options: of the stage.
-        dim_latent: width of the tokens (from the encoder).
-    """
+    ``options``: of the stage. ``dim_latent``: width of the tokens (from the encoder)."""
 
     def __init__(self, options: RecalibrationOptions, dim_latent: int):
         super().__init__()
@@ -57,12 +53,8 @@ class Recalibration(nn.Module):
         self.block = SemanticAttention(dim_latent, options.num_heads, options.similarity)
 
     def forward(self, tokens: Tokens, points: Points) -> Tokens:
-        """Tokens with recalibrated layers; the semantic features and the order stay.
-
-        Args:
-            tokens: from the encoder.
-            points: of the same tokens.
-        """
+        """Tokens with recalibrated layers; the semantic features and the order stay. ``tokens``: from the
+        encoder. ``points``: of the same tokens."""
         batch_size, views = tokens.grid[:2]
         takes_part = self.takes_part(points)
         elements = torch.arange(batch_size, device=takes_part.device)[:, None]

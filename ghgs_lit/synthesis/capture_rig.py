@@ -47,15 +47,10 @@ class RigCamera(Options):
 
 @dataclass(frozen=True)
 class CaptureRig:
-    """Cameras around a subject whose size in their unit is not known.
-
-    Attributes:
-        intrinsics: [3, 3] of each camera.
-        extrinsics: [4, 4] of each camera.
-        heights: of the photographs in pixels.
-        fill: [least, greatest] share of its photograph's height that a subject takes in the camera that sees
-            it tallest: decides how far the cameras stand.
-    """
+    """Cameras around a subject whose size in their unit is not known. ``intrinsics``: [3, 3] of each camera.
+    ``extrinsics``: [4, 4] of each camera. ``heights``: of the photographs in pixels. ``fill``: [least,
+    greatest] share of its photograph's height that a subject takes in the camera that sees it tallest:
+    decides how far the cameras stand."""
 
     intrinsics: tuple
     extrinsics: tuple
@@ -161,13 +156,8 @@ class CaptureRig:
 
 @dataclass(frozen=True)
 class PlacedRig:
-    """A rig around one subject.
-
-    Attributes:
-        scale: metres of their unit.
-        middle: the point [3] that the cameras look at, in the subject's world.
-        vertices: [n, 3] of the subject.
-    """
+    """A rig around one subject. ``scale``: metres of their unit. ``middle``: the point [3] that the cameras
+    look at, in the subject's world. ``vertices``: [n, 3] of the subject."""
 
     rig: CaptureRig
     scale: float

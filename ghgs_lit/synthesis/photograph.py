@@ -73,13 +73,8 @@ class Lights:
 
 @dataclass(frozen=True)
 class LightRig:
-    """The lights of one person.
-
-    Attributes:
-        directions: [l, 3] unit vectors towards the lights.
-        strengths: [l].
-        ambient: brightness without any light.
-    """
+    """The lights of one person. ``directions``: [l, 3] unit vectors towards the lights. ``strengths``: [l].
+    ``ambient``: brightness without any light."""
 
     directions: np.ndarray
     strengths: np.ndarray
@@ -95,13 +90,8 @@ class LightRig:
 
 @dataclass(frozen=True)
 class Photographs:
-    """Photographs from n cameras.
-
-    Attributes:
-        images: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
-        alphas: [n, h, w] float32 in [0, 1].
-        depths: [n, h, w] float32, metres, 0 where ``alphas`` are.
-    """
+    """Photographs from n cameras. ``images``: [n, h, w, 3] float32 in [0, 1], premultiplied by ``alphas``.
+    ``alphas``: [n, h, w] float32 in [0, 1]. ``depths``: [n, h, w] float32, metres, 0 where ``alphas`` are."""
 
     images: np.ndarray
     alphas: np.ndarray

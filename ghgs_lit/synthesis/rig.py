@@ -151,13 +151,9 @@ class Rig:
     def drawn(
         self, person: Person, yaws: np.ndarray, aspect: float, rng: np.random.Generator
     ) -> tuple["Rig", Poses]:
-        """The rig of one subject by ``variation``, and how its cameras deviate from it.
-
-        Args:
-            yaws: degrees [positions, 5] of all its views (:meth:`yaws`).
-            aspect: width of the images over their height.
-            rng: random numbers of the rig alone; all are drawn whatever varies.
-        """
+        """The rig of one subject by ``variation``, and how its cameras deviate from it. ``yaws``: degrees
+        [positions, 5] of all its views (:meth:`yaws`). ``aspect``: width of the images over their height.
+        ``rng``: random numbers of the rig alone; all are drawn whatever varies."""
         v, share = self.variation, rng.uniform(size=3)
         deviations = rng.uniform(-1, 1, (*yaws.shape, 5))
         deviations[:, 1] = np.roll(deviations[:, 0], -1, 0)  # view 1 is the next ring camera

@@ -93,13 +93,9 @@ def find_fits(source: Path, fits: str | None) -> Path | None:
 
 @dataclass(frozen=True)
 class THuman2Source:
-    """Raw scans with their bodies.
-
-    Attributes:
-        fits: folder of the fits (None: each scan's own folder).
-        body_model: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
-            ``smplx_param.pkl`` (None: read ``mesh_smplx.obj``, a part of the fits).
-    """
+    """Raw scans with their bodies. ``fits``: folder of the fits (None: each scan's own folder).
+    ``body_model``: folder of the licensed SMPL-X model files (package ``smplx``), to compute bodies from
+    ``smplx_param.pkl`` (None: read ``mesh_smplx.obj``, a part of the fits)."""
 
     folder: Path
     fits: Path | None

@@ -74,15 +74,10 @@ class GHGSModule(BudgetedModule):
     def load_from_checkpoint(
         cls, checkpoint_path: str | Path, map_location: Any = None, **parts: Any
     ) -> "GHGSModule":
-        """The module of a checkpoint.
-
-        Args:
-            checkpoint_path: of a run of ``ghgs train``, or of a Trainer of one's own.
-            parts: ``renderer``, ``losses`` and ``optimization`` in place of those of the configuration.
-
-        Raises:
-            InputError: the checkpoint cannot be used, or a part is neither configured nor given.
-        """
+        """The module of a checkpoint. ``checkpoint_path``: of a run of ``ghgs train``, or of a Trainer of
+        one's own. ``parts``: ``renderer``, ``losses`` and ``optimization`` in place of those of the
+        configuration. InputError: the checkpoint cannot be used, or a part is neither configured nor
+        given."""
         checkpoint = read_checkpoint(checkpoint_path)
         config = checkpoint["config"]
         for name, group in {"losses": "loss", "optimization": "optimizer", "renderer": "renderer"}.items():

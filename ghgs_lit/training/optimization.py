@@ -74,12 +74,9 @@ def _polynomials(gram: Tensor) -> Tensor:
 
 
 class Muon(torch.optim.AdamW):
-    """Muon for the matrices among ``parameters``, AdamW for all others.
-
-    Args:
-        matrix_lr: learning rate of matrices, in units of AdamW's: steps are as long as AdamW's of this rate.
-        **options: of AdamW, for the other parameters; weight decay is for both.
-    """
+    """Muon for the matrices among ``parameters``, AdamW for all others. ``matrix_lr``: learning rate of
+    matrices, in units of AdamW's: steps are as long as AdamW's of this rate. ``**options``: of AdamW, for the
+    other parameters; weight decay is for both."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], matrix_lr: float, **options: Any):
         parameters = list(parameters)

@@ -19,15 +19,9 @@ _KEYS = ("fault", "global_step", "step", "state_dict", "config")
 
 
 def replay(path: str | Path) -> tuple[int, str, Fault | None]:
-    """Run a saved step again, on the CPU.
-
-    Returns:
-        Its number, what was wrong when it was saved, and what is wrong now (None: nothing).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: the file is not one of a step.
-    """
+    """Run a saved step again, on the CPU. Returns: its number, what was wrong when it was saved, and what is
+    wrong now (None: nothing). FileNotFoundError: there is no such file. InputError: the file is not one of a
+    step."""
     content = open_file(path)
     if not isinstance(content, Mapping) or any(key not in content for key in _KEYS):
         raise InputError(f"{path}: expected a step that a training saved; found {describe(content)}")

@@ -24,14 +24,10 @@ _NEAREST = 0.1
 
 @dataclass(frozen=True)
 class Annotations:
-    """Cameras of one sequence and the photographs of its frames.
-
-    Attributes:
-        intrinsics: [n, 3, 3] in pixels as calibrated, pixel centres at integers.
-        distortions: for each camera the coefficients k1 k2 p1 p2 (k3).
-        extrinsics: [n, 4, 4], world to camera, metres.
-        frames: ``frames[f][k]`` is the path of camera k at frame f.
-    """
+    """Cameras of one sequence and the photographs of its frames. ``intrinsics``: [n, 3, 3] in pixels as
+    calibrated, pixel centres at integers. ``distortions``: for each camera the coefficients k1 k2 p1 p2 (k3).
+    ``extrinsics``: [n, 4, 4], world to camera, metres. ``frames``: ``frames[f][k]`` is the path of camera k
+    at frame f."""
 
     intrinsics: np.ndarray
     distortions: tuple[np.ndarray, ...]

@@ -23,14 +23,9 @@ _MATTE = 0.125
 def splats_at(
     batch: Batch, depth: Tensor, valid: Tensor, sigma: float = 0.3, opacity: float = 0.9
 ) -> Gaussians:
-    """Round splats for pixels of the inputs, in the order of the pixels.
-
-    Args:
-        depth: where the splats are [B, V, H, W], metres.
-        valid: pixels that get a splat [B, V, H, W].
-        sigma: standard deviation in pixels of the input.
-        opacity: in (0, 1).
-    """
+    """Round splats for pixels of the inputs, in the order of the pixels. ``depth``: where the splats are [B,
+    V, H, W], metres. ``valid``: pixels that get a splat [B, V, H, W]. ``sigma``: standard deviation in pixels
+    of the input. ``opacity``: in (0, 1)."""
     points = unproject_maps(depth, batch.cameras)[valid]
     focal = batch.cameras.intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].mean(-1)
     scale = (sigma * depth / focal[..., None, None])[valid]

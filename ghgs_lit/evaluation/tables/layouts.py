@@ -29,14 +29,10 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows (``ablation``: all four combinations, or ``methods``) and groups of columns.
-
-    Args:
-        rows: ``ablation`` or ``methods``.
-        columns: ``views`` or ``data``, one group for each.
-        heading: above each group of columns: its ``views``, its ``data`` or ``none``.
-        reported: the paper's table whose figures are shown beside the measured ones.
-    """
+    """Rows (``ablation``: all four combinations, or ``methods``) and groups of columns. ``rows``:
+    ``ablation`` or ``methods``. ``columns``: ``views`` or ``data``, one group for each. ``heading``: above
+    each group of columns: its ``views``, its ``data`` or ``none``. ``reported``: the paper's table whose
+    figures are shown beside the measured ones."""
 
     name: str
     rows: str
@@ -57,13 +53,9 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What is shown.
-
-    Args:
-        views, targets, metrics: a selection; None: those of the layout and of the runs.
-        unit: a regular expression whose first group is the person, where subjects are frames of people.
-        illustration: whether a note says that the numbers are no result, of which none is bold.
-    """
+    """What is shown. ``views``, ``targets``, ``metrics``: a selection; None: those of the layout and of the
+    runs. ``unit``: a regular expression whose first group is the person, where subjects are frames of people.
+    ``illustration``: whether a note says that the numbers are no result, of which none is bold."""
 
     layout: Layout
     views: tuple[int, ...] | None = None

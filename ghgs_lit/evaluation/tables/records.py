@@ -83,14 +83,10 @@ class Planned:
 
 @dataclass
 class Sweep:
-    """Everything below the directories of a sweep.
-
-    Args:
-        rows: a line for each subject of each method of a run, number of views and kind of targets:
-            ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file), ``run`` (the configuration's
-            hash), ``git`` (in words), ``subject``, and the metrics, averaged over the subject's targets.
-        configs: the configuration of our model by ``source``.
-    """
+    """Everything below the directories of a sweep. ``rows``: a line for each subject of each method of a run,
+    number of views and kind of targets: ``variant``, ``SETTING``, ``views``, ``seed``, ``source`` (the file),
+    ``run`` (the configuration's hash), ``git`` (in words), ``subject``, and the metrics, averaged over the
+    subject's targets. ``configs``: the configuration of our model by ``source``."""
 
     rows: pd.DataFrame = field(default_factory=pd.DataFrame)
     planned: list[Planned] = field(default_factory=list)
@@ -226,15 +222,9 @@ def _planned(path: Path, by: Sequence[str]) -> Planned | None:
 
 
 def read_sweep(folders: Sequence[Path], by: Sequence[str] = ()) -> Sweep:
-    """All runs below some folders, finished or not.
-
-    Args:
-        by: configuration keys that tell rows apart beside model, encoder and ablation.
-
-    Raises:
-        FileNotFoundError: a folder is missing.
-        InputError: there is no finished run, a ``metrics.json`` is damaged, or no run has a key of ``by``.
-    """
+    """All runs below some folders, finished or not. ``by``: configuration keys that tell rows apart beside
+    model, encoder and ablation. FileNotFoundError: a folder is missing. InputError: there is no finished run,
+    a ``metrics.json`` is damaged, or no run has a key of ``by``."""
     runs = {str(path): _read_run(path, by) for path in files_below(folders, "metrics.json")}
     planned = [p for path in files_below(folders, "config.yaml") if (p := _planned(path, by)) is not None]
     if not runs:

@@ -53,15 +53,9 @@ def vertex_parts() -> np.ndarray:
 
 
 def parts_of_points(points: Float[Tensor, "n 3"], vertices: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """The part of the body beneath each world point: that of the nearest vertex of the skin.
-
-    Args:
-        points: on clothes, hair or skin.
-        vertices: of the posed body [:data:`BODY_VERTICES`, 3], in the same world.
-
-    Raises:
-        InputError: not the vertices of a built-in body.
-    """
+    """The part of the body beneath each world point: that of the nearest vertex of the skin. ``points``: on
+    clothes, hair or skin. ``vertices``: of the posed body [:data:`BODY_VERTICES`, 3], in the same world.
+    InputError: not the vertices of a built-in body."""
     expected = f"{BODY_VERTICES}, all of a built-in person (data=synthetic)"
     require(len(vertices) == BODY_VERTICES, "vertices of the body", expected, len(vertices))
     # Made for one batch: a tree that is quick to build, not the quickest to ask.
@@ -77,12 +71,8 @@ def has_parts(batch: Batch) -> bool:
 
 
 def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N"]:
-    """The part with the largest share in the patch of each token; -1 where it shows none.
-
-    Args:
-        shares: of all patches, from :func:`part_shares`.
-        tokens: of the same photographs.
-    """
+    """The part with the largest share in the patch of each token; -1 where it shows none. ``shares``: of all
+    patches, from :func:`part_shares`. ``tokens``: of the same photographs."""
     _, _, h, w = tokens.grid
     own = shares[(tokens.image * h + tokens.row) * w + tokens.column]
     return torch.where(own.any(1), own.argmax(1), -1)
@@ -90,17 +80,9 @@ def token_parts(shares: Float[Tensor, "n P"], tokens: Tokens) -> Int[Tensor, " N
 
 def part_shares(batch: Batch, patch_size: int) -> Float[Tensor, "n P"]:
     """Shares of :data:`PARTS` among the subject's pixels of each patch; 0 where it has no such pixel.
-
-    Args:
-        batch: with true depths and the vertices of built-in bodies.
-        patch_size: in pixels.
-
-    Returns:
-        Of all patches of all images, ordered by image, row and column.
-
-    Raises:
-        InputError: the batch has no depths or no bodies, or other bodies.
-    """
+    ``batch``: with true depths and the vertices of built-in bodies. ``patch_size``: in pixels. Returns: of
+    all patches of all images, ordered by image, row and column. InputError: the batch has no depths or no
+    bodies, or other bodies."""
     require(batch.depths is not None, "data", "true depths, which the labels are made from", "none")
     require(batch.body_vertices is not None, "data", "people with bodies, as data=synthetic", "none")
     b, v, height, width = batch.depths.shape
