@@ -17,7 +17,7 @@ from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, s
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last
-from ghgs_lit.geometry.projection import at_least_float32, project
+from ghgs_lit.geometry.projection import focal_lengths, project
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
@@ -94,7 +94,7 @@ def subject_box(
     center = subject_center(masks, cameras)
     reach = _reach(masks, cameras, center).nan_to_num().amax(1, keepdim=True).clamp(min=0.05)
     lower, upper = center - reach, center + reach
-    focal, voting = _focal_lengths(cameras).amax(-1), masks.flatten(2).any(-1)
+    focal, voting = focal_lengths(cameras).amax(-1), masks.flatten(2).any(-1)
     for _ in range(2):
         cell = (upper - lower) / CELLS
         depth = _project_one((lower + upper) / 2, cameras)[1]
@@ -136,10 +136,6 @@ def _project_one(points: Float[Tensor, "B 3"], cameras: Cameras) -> tuple[Tensor
     return project(points, cameras.intrinsics, cameras.extrinsics)
 
 
-def _focal_lengths(cameras: Cameras) -> Float[Tensor, "B V 2"]:
-    return at_least_float32(cameras.intrinsics).diagonal(dim1=-2, dim2=-1)[..., :2]
-
-
 def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tensor, "B 3"]) -> Tensor:
     """A generous radius [B, V] of the subject about ``center``, as each view shows it or NaN."""
     pixel, depth = _project_one(center, cameras)
@@ -147,7 +143,7 @@ def _reach(masks: Bool[Tensor, "B V h w"], cameras: Cameras, center: Float[Tenso
         torch.where(masks.any(-2 + dim), (line - pixel[..., dim, None]).abs() + 0.5, 0).amax(-1)
         for dim, line in enumerate(pixel_axes(cameras))
     ]
-    extent = torch.stack(extents, -1) / _focal_lengths(cameras)
+    extent = torch.stack(extents, -1) / focal_lengths(cameras)
     # More than what is seen: what reaches away from a camera looks smaller than it is.
     reach = 1.4 * extent.norm(dim=-1) * depth.clamp(min=NEAREST)
     return torch.where(masks.flatten(2).any(-1), reach, torch.nan)

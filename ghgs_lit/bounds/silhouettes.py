@@ -35,12 +35,8 @@ def silhouettes(
         masks = F.max_pool2d(masks.float(), stride, stride, ceil_mode=True).bool()
     height, width = masks.shape[-2:]
     # Whole cells: the last row and column of them may reach beyond the image.
-    full = Cameras(
-        at_least_float32(cameras.intrinsics),
-        at_least_float32(cameras.extrinsics),
-        height * stride,
-        width * stride,
-    )
+    matrices = map(at_least_float32, (cameras.intrinsics, cameras.extrinsics))
+    full = Cameras(*matrices, height * stride, width * stride)
     return Silhouettes(masks, full.resized(height, width), stride, ceil(dilation * max(height, width)))
 
 

@@ -131,12 +131,8 @@ class Augmentation(Options):
             wrong = [
                 miscalibrated(cameras[b], masks[b], self.calibration, s[1]) for b, s in enumerate(streams)
             ]
-            cameras = Cameras(
-                torch.stack([one.intrinsics for one in wrong]),
-                torch.stack([one.extrinsics for one in wrong]),
-                cameras.height,
-                cameras.width,
-            )
+            matrices = zip(*((one.intrinsics, one.extrinsics) for one in wrong), strict=True)
+            cameras = Cameras(*map(torch.stack, matrices), cameras.height, cameras.width)
         if self.mask_offset or self.mask_ragged or self.mask_hole_chance:
             known = masks.to(images) if alpha is None else alpha
             segmented = [

@@ -28,12 +28,12 @@ def patches_in_window(
     """Patches of the smallest rectangle that holds the subject of a view, and of ``margin`` rows and columns
     around it; arguments as of :func:`patches_around_subject`. A view with an empty mask has none."""
     touched = F.max_pool2d(masks.float(), patch_size).bool()
-    rows, columns = _between(touched.any(-1)), _between(touched.any(-2))
+    rows, columns = between(touched.any(-1)), between(touched.any(-2))
     return _grown((rows[..., :, None] & columns[..., None, :]).float(), margin)
 
 
-def _between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
-    """From the first to the last True along the last axis."""
+def between(hits: Bool[Tensor, "*batch n"]) -> Bool[Tensor, "*batch n"]:
+    """From the first to the last True along the last axis; none where there is none."""
     first, last = first_and_last(hits)
     index = torch.arange(hits.shape[-1], device=hits.device)
     return (index >= first[..., None]) & (index <= last[..., None])

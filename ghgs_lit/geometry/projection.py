@@ -54,15 +54,20 @@ def unproject(
     )
 
 
-def unproject_maps(depth: Float[Tensor, "*batch h w"], cameras: Cameras) -> Float[Tensor, "*batch h w 3"]:
-    """World points of the pixels of a depth map in metres."""
-    centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth))
-    return unproject(
-        centers.expand(*depth.shape, 2),
-        depth,
-        cameras.intrinsics[..., None, None, :, :],
-        cameras.extrinsics[..., None, None, :, :],
-    )
+def unproject_maps(
+    depth: Float[Tensor, "*batch h w"], cameras: Cameras, pixels: Float[Tensor, "*batch h w 2"] | None = None
+) -> Float[Tensor, "*batch h w 3"]:
+    """World points of a depth map in metres at ``pixels``; None: of all pixels, at their centres."""
+    if pixels is None:
+        centers = pixel_centers(cameras.height, cameras.width, at_least_float32(depth))
+        pixels = centers.expand(*depth.shape, 2)
+    intrinsics, extrinsics = (m[..., None, None, :, :] for m in (cameras.intrinsics, cameras.extrinsics))
+    return unproject(pixels, depth, intrinsics, extrinsics)
+
+
+def focal_lengths(cameras: Cameras) -> Float[Tensor, "*batch 2"]:
+    """Focal lengths along rows and columns, in pixels."""
+    return at_least_float32(cameras.intrinsics).diagonal(dim1=-2, dim2=-1)[..., :2]
 
 
 def world_to_camera(

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, unproject, unproject_maps
+from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, unproject_maps
 from ghgs_lit.types import Batch, DepthMaps, Points, Tokens
 
 #: Pixels on each side of the image that the token grid of the release leaves out (512 + 2 x 3 = 518).
@@ -34,12 +34,7 @@ class Unprojection(Options):
         locate = subject_tokens if self.tokens == "subject" else _release_tokens
         pixels, depth, valid = locate(depth_maps, tokens.patch_size)
         cameras = batch.cameras
-        points = unproject(
-            pixels,
-            depth,
-            cameras.intrinsics[..., None, None, :, :],
-            cameras.extrinsics[..., None, None, :, :],
-        )
+        points = unproject_maps(depth, cameras, pixels)
         # Only the kept tokens; the maps hold every patch.
         index = (tokens.image, tokens.row, tokens.column)
         return Points(

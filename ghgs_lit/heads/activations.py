@@ -21,11 +21,10 @@ class _Saturate(torch.autograd.Function):
         (x,) = ctx.saved_tensors
         stopped = x.clamp(-ctx.limit, ctx.limit)
         # Not y (1 - y), which has lost most digits where y is nearly 1.
-        own = (
-            stopped.cosh().square().reciprocal()
-            if ctx.symmetric
-            else stopped.sigmoid() * (-stopped).sigmoid()
-        )
+        if ctx.symmetric:
+            own = stopped.cosh().square().reciprocal()
+        else:
+            own = stopped.sigmoid() * (-stopped).sigmoid()
         # Gradient descent subtracts: a gradient of the sign of x leads back.
         leads_back = (stopped == x) | (slope * x > 0)
         return torch.where(leads_back, slope * own, 0), None, None

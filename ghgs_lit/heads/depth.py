@@ -132,13 +132,13 @@ class DepthHead(nn.Module):
             depth = bounded_depth(value + self.start, bounds.near, bounds.far, self.options.parameterization)
         else:
             depth = inverse_linear(value)
-        finite = depth.isfinite()
-        return DepthMaps(
-            depth=torch.where(finite, depth, 1.0),
-            valid=batch.masks & finite,
-            confidence=confidence_of(confidence),
-            bounds=bounds,
-        )
+        return finite_maps(depth, batch, confidence_of(confidence), bounds)
+
+
+def finite_maps(depth: Tensor, batch: Batch, confidence: Tensor, bounds: DepthBounds | None) -> DepthMaps:
+    """Depths of which those that are not finite are 1 m and not valid."""
+    finite = depth.isfinite()
+    return DepthMaps(torch.where(finite, depth, 1.0), batch.masks & finite, confidence, bounds)
 
 
 def _whole(

@@ -214,14 +214,9 @@ class DPTHead(nn.Module):
         c0, c1, _, c3 = out_channels
         self.norm = nn.LayerNorm(dim_latent, eps=NORM_EPS)
         self.projects = nn.ModuleList(nn.Conv2d(dim_latent, c, 1) for c in out_channels)
-        self.resize_layers = nn.ModuleList(
-            (
-                nn.ConvTranspose2d(c0, c0, 4, stride=4),
-                nn.ConvTranspose2d(c1, c1, 2, stride=2),
-                nn.Identity(),
-                _Halving(c3, c3, 3, stride=2, padding=1),
-            )
-        )
+        larger = nn.ConvTranspose2d(c0, c0, 4, stride=4), nn.ConvTranspose2d(c1, c1, 2, stride=2)
+        smaller = _Halving(c3, c3, 3, stride=2, padding=1)
+        self.resize_layers = nn.ModuleList((*larger, nn.Identity(), smaller))
         self.scratch = Scratch(out_channels, features, HIDDEN, output_dim, rectified_skip)
         self.guide = GuidePyramid(guide_channels, features) if guide_channels else None
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
 from ghgs_lit.geometry.mattes import surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
-from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
 from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.geometry.rotations import multiply_quaternions, rotate, unit
 from ghgs_lit.heads import cpu
@@ -307,13 +307,7 @@ class GaussianHead(nn.Module):
         self, raw: RawGaussians, batch: Batch, points: Points, depth_maps: DepthMaps
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         image, pixel = raw.image, raw.pixel
-        focal = (
-            at_least_float32(batch.cameras.intrinsics)
-            .diagonal(dim1=-2, dim2=-1)[..., :2]
-            .prod(-1)
-            .sqrt()
-            .flatten()[image]
-        )
+        focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()[image]
         depth = depth_maps.depth.flatten(0, 1).flatten(1)[image, pixel]
         # Without a gradient: a splat that is too large must not move nearer to become smaller.
         footprint = depth.detach() / focal

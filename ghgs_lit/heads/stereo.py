@@ -18,7 +18,7 @@ from ghgs_lit.config.options import Options
 from ghgs_lit.geometry.mattes import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, project, sample, unproject
 from ghgs_lit.heads.activations import bounded_sigmoid
-from ghgs_lit.heads.depth import BOUNDED
+from ghgs_lit.heads.depth import BOUNDED, finite_maps
 from ghgs_lit.heads.dpt import ResidualUnit
 from ghgs_lit.kernels.precision import exact, without_float16
 from ghgs_lit.types import Batch, Cameras, DecodedPixels, DepthBounds, DepthMaps, Tokens, true_places
@@ -77,13 +77,7 @@ class StereoHead(nn.Module):
         with without_float16(batch.masks.device.type):
             fraction = self._fraction(batch, near, far)[..., :height, :width]
         depth = _inverse(fraction.view(batch.masks.shape), near, far)
-        finite = depth.isfinite()
-        return DepthMaps(
-            depth=torch.where(finite, depth, 1.0),
-            valid=batch.masks & finite,
-            confidence=torch.ones_like(depth),
-            bounds=bounds,
-        )
+        return finite_maps(depth, batch, torch.ones_like(depth), bounds)
 
     def _fraction(self, batch: Batch, near: Tensor, far: Tensor) -> Float[Tensor, "n h w"]:
         """Share of the way from near to far of each pixel, with those that fill the last cells."""

@@ -137,9 +137,5 @@ def subject_windows(extents: Sequence[Extent], size: tuple[int, int]) -> list[Wi
 
 def reach(*modules: nn.Module) -> int:
     """Number of cells on each side that the result of these layers, one after another, depends on."""
-    return sum(
-        layer.kernel_size[0] // 2
-        for module in modules
-        for layer in module.modules()
-        if isinstance(layer, nn.Conv2d)
-    )
+    layers = (layer for module in modules for layer in module.modules())
+    return sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))

@@ -3,8 +3,9 @@
 import os
 import threading
 from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch import Tensor, nn
@@ -72,6 +73,20 @@ def multiplies(*tensors: Tensor) -> bool:
     """Whether kernels compute products of these, and faster than PyTorch: in single precision."""
     readable = is_supported(*tensors) and have_values(*tensors)
     return readable and not torch.is_autocast_enabled("cpu") and features() >= {"avx2", "fma"}
+
+
+def run_rows(
+    kernel: Callable, arguments: Sequence, ranges: Iterable[Sequence[int]], most: int, work: int
+) -> None:
+    """:func:`run` of ``kernel(*arguments, *numbers, first, last)`` for parts of at most ``most`` rows of each
+    of ``ranges``, which are ``(*numbers, first, last)``."""
+    tasks = [
+        partial(kernel, *arguments, *numbers, first + part.start, first + part.stop)
+        for *numbers, first, last in ranges
+        for part in even_parts(last - first, most)
+        if last > first
+    ]
+    run(tasks, work)
 
 
 def run(tasks: list, work: int) -> None:

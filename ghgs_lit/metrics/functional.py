@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.masks import first_and_last
+from ghgs_lit.geometry.masks import between, first_and_last
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.precision import exact
 
@@ -48,13 +48,7 @@ def mean_inside(
 
 def box_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:
     """The bounding box of each mask, as a mask; empty where the mask is empty."""
-
-    def span(hit: Bool[Tensor, "n k"]) -> Bool[Tensor, "n k"]:
-        index = torch.arange(hit.shape[1], device=hit.device)
-        first, last = (end[:, None] for end in first_and_last(hit))
-        return (index >= first) & (index <= last) & hit.any(-1, keepdim=True)
-
-    return span(mask.any(-1))[:, :, None] & span(mask.any(-2))[:, None, :]
+    return between(mask.any(-1))[:, :, None] & between(mask.any(-2))[:, None, :]
 
 
 def crop_of(mask: Bool[Tensor, "n h w"]) -> Bool[Tensor, "n h w"]:

@@ -46,12 +46,8 @@ class SemanticAttention(nn.Module):
 
     def __init__(self, dim: int, num_heads: int = 8, similarity: Similarity = "product"):
         super().__init__()
-        require(
-            dim % (4 * num_heads) == 0,
-            "recalibration.num_heads",
-            f"heads that divide a quarter of the token width ({dim} / 4)",
-            num_heads,
-        )
+        expected = f"heads that divide a quarter of the token width ({dim} / 4)"
+        require(dim % (4 * num_heads) == 0, "recalibration.num_heads", expected, num_heads)
         self.num_heads, self.similarity = num_heads, similarity
         inner = dim // 4
         self.norm1 = nn.LayerNorm(dim)
@@ -151,12 +147,10 @@ class SemanticAttention(nn.Module):
         parts = []
         for part in rows:
             inputs = (q[part], k, v, *(x[part] for x in (neighbors.index, neighbors.valid, factor, bias)))
-            again = len(rows) > 1 and torch.is_grad_enabled()
-            parts.append(
-                checkpoint(attend, *inputs, use_reentrant=False, preserve_rng_state=False)
-                if again
-                else attend(*inputs)
-            )
+            if len(rows) > 1 and torch.is_grad_enabled():
+                parts.append(checkpoint(attend, *inputs, use_reentrant=False, preserve_rng_state=False))
+            else:
+                parts.append(attend(*inputs))
         return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     def _weights(

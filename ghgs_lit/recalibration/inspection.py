@@ -72,13 +72,9 @@ def _weights(
 ) -> tuple[Neighbors, Float[Tensor, "L m k a"]]:
     """Neighbours of the ``chosen`` tokens of one element, as indices among them, and the weights of rows;
     ``plain``: if s were 1."""
-    places = recalibration.places(tokens)
-    near = nearest_neighbors(
-        recalibration.positions(tokens, points)[chosen],
-        tokens.image[chosen],
-        recalibration.k,
-        None if places is None else places[chosen],
-    )
+    places, positions = recalibration.places(tokens), recalibration.positions(tokens, points)
+    places = None if places is None else places[chosen]
+    near = nearest_neighbors(positions[chosen], tokens.image[chosen], recalibration.k, places)
     block = recalibration.block
     plain |= block.similarity == "none"
     cosines = None if plain else neighbor_cosines(tokens.semantic[chosen], near)

@@ -64,17 +64,11 @@ class Recalibration(nn.Module):
         def part(values: Tensor) -> Tensor:
             return values if len(chosen) == len(values) else values[chosen]
 
-        image = part(tokens.image)
         places = self.places(tokens)
-        neighbors = [
-            nearest_neighbors(positions, views_of, self.k, places_of)
-            for positions, views_of, places_of in zip(
-                part(self.positions(tokens, points)).split(counts),
-                image.split(counts),
-                [None] * batch_size if places is None else part(places).split(counts),
-                strict=True,
-            )
-        ]
+        places = [None] * batch_size if places is None else part(places).split(counts)
+        pairs = (part(values).split(counts) for values in (self.positions(tokens, points), tokens.image))
+        elements = zip(*pairs, places, strict=True)
+        neighbors = [nearest_neighbors(where, view, self.k, number) for where, view, number in elements]
         cosines = None
         if self.block.similarity != "none":
             semantic = part(tokens.semantic).split(counts)

@@ -135,30 +135,14 @@ def _check_inputs(gaussians: Gaussians, cameras: Cameras) -> None:
         require(found == shape, f"gaussians.{name}", f"shape {shape}", found)
     found = tuple(gaussians.colors.shape)
     require(len(found) == 2 and found[0] == count, "gaussians.colors", f"shape ({count}, channels)", found)
-    require(
-        sum(gaussians.splits) == count and min(gaussians.splits, default=0) >= 0,
-        "gaussians.splits",
-        f"counts that add up to {count}",
-        gaussians.splits,
-    )
-    require(
-        len(cameras.shape) == 2 and cameras.shape[0] == len(gaussians.splits),
-        "cameras",
-        f"shape [{len(gaussians.splits)}, T], one row per batch element",
-        tuple(cameras.shape),
-    )
-    require(
-        cameras.height > 0 and cameras.width > 0,
-        "cameras",
-        "a positive image size",
-        (cameras.height, cameras.width),
-    )
-    require(
-        not bool((cameras.intrinsics[..., 0, 1] != 0).any()),
-        "cameras.intrinsics",
-        "no skew: K[0, 1] = 0",
-        "another value",
-    )
+    adds_up = sum(gaussians.splits) == count and min(gaussians.splits, default=0) >= 0
+    require(adds_up, "gaussians.splits", f"counts that add up to {count}", gaussians.splits)
+    found, expected = tuple(cameras.shape), f"shape [{len(gaussians.splits)}, T], one row per batch element"
+    require(len(found) == 2 and found[0] == len(gaussians.splits), "cameras", expected, found)
+    size = (cameras.height, cameras.width)
+    require(min(size) > 0, "cameras", "a positive image size", size)
+    is_skew = bool((cameras.intrinsics[..., 0, 1] != 0).any())
+    require(not is_skew, "cameras.intrinsics", "no skew: K[0, 1] = 0", "another value")
 
 
 def _in_one_dtype(gaussians: Gaussians) -> Gaussians:
@@ -208,11 +192,8 @@ def _background(background: Background, color: Float[Tensor, "B T C h w"]) -> Te
         return background
     tensor = torch.as_tensor(background, dtype=color.dtype, device=color.device)
     if tensor.ndim == 1:
-        require(
-            tensor.shape[0] in (1, color.shape[2]),
-            "renderer.background",
-            f"{color.shape[2]} channels",
-            tensor.shape[0],
-        )
+        channels = color.shape[2]
+        fits = len(tensor) in (1, channels)
+        require(fits, "renderer.background", f"{channels} channels", len(tensor))
         return tensor[:, None, None]
     return tensor

@@ -50,13 +50,9 @@ def rasterize(
     A limit of alpha below :data:`_ALPHA_MAX` applies to opacities: alphas differ by at most ``1 - alpha_max``
     from those of the other backends, where an opacity is above it.
     """
-    default = RasterSettings()
-    require(
-        settings.alpha_max <= _ALPHA_MAX,
-        "renderer.settings.alpha_max",
-        f"at most {_ALPHA_MAX}, which is compiled into gsplat",
-        settings.alpha_max,
-    )
+    default, expected = RasterSettings(), f"at most {_ALPHA_MAX}, which is compiled into gsplat"
+    allowed = settings.alpha_max <= _ALPHA_MAX
+    require(allowed, "renderer.settings.alpha_max", expected, settings.alpha_max)
     for name in _FIXED:
         value, fixed = getattr(settings, name), getattr(default, name)
         require(value == fixed, f"renderer.settings.{name}", f"{fixed}, which is compiled into gsplat", value)

@@ -14,7 +14,7 @@ from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render
 from ghgs_lit.rounds import cpu
-from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
+from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering, map_tensors
 
 #: Metres behind the rendered surface at which a Gaussian counts as hidden (tanh of the ratio).
 _BEHIND = 0.05
@@ -44,11 +44,7 @@ def slopes(
         for name in ("means", "scales", "opacities", "colors")
     ]
     quaternions = gaussians.quaternions.detach().clone()
-    cameras = dataclasses.replace(
-        batch.cameras,
-        intrinsics=batch.cameras.intrinsics.clone(),
-        extrinsics=batch.cameras.extrinsics.clone(),
-    )
+    cameras = map_tensors(batch.cameras, Tensor.clone)
     shown = dataclasses.replace(
         gaussians, means=means, scales=scales, quaternions=quaternions, opacities=opacities, colors=colors
     )

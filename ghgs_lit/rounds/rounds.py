@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from ghgs_lit.bounds.rays import ray_directions
 from ghgs_lit.config.options import Options, Width
 from ghgs_lit.geometry.photo_consistency import consistency_of
-from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
 from ghgs_lit.heads.activations import bounded_tanh
 from ghgs_lit.heads.gaussian import RAW_VALUES, RawGaussians, float32_last
 from ghgs_lit.kernels.pool import at_once, even_parts, multiplies
@@ -138,16 +138,10 @@ class State:
 def prediction_of(states: Sequence[State], keeps_drafts: bool) -> Prediction:
     """What the last of several states predicts. ``states``: before the first round and after each.
     ``keeps_drafts``: whether the prediction has the Gaussians before each round."""
-    last = states[-1]
-    return Prediction(
-        last.gaussians,
-        last.depth_maps.depth,
-        last.depth_maps.valid,
-        last.points,
-        last.depth_maps,
-        rounds=tuple(state.depth_maps for state in states),
-        drafts=tuple(state.gaussians for state in states[:-1]) if keeps_drafts else (),
-    )
+    last, maps = states[-1], tuple(state.depth_maps for state in states)
+    drafts = tuple(state.gaussians for state in states[:-1]) if keeps_drafts else ()
+    depth, valid = maps[-1].depth, maps[-1].valid
+    return Prediction(last.gaussians, depth, valid, last.points, maps[-1], rounds=maps, drafts=drafts)
 
 
 #: Gaussians from raw attributes at points: ``GaussianHead.activate``.
@@ -188,6 +182,11 @@ class RoundsOptions(Options):
         return Rounds(self, channels)
 
 
+def _two_layers(inputs: int, wide: int, outputs: int) -> nn.Sequential:
+    first, second = nn.Linear(inputs, wide), nn.Linear(wide, outputs)
+    return nn.Sequential(first, nn.ReLU(inplace=True), second, nn.ReLU(inplace=True))
+
+
 class Rounds(nn.Module):
     """Corrects Gaussians several times with the same weights; untrained, it changes nothing.
 
@@ -201,20 +200,10 @@ class Rounds(nn.Module):
         super().__init__()
         self.options, self.count = options, options.count
         hidden, depths = options.hidden, options.depths
-        self.view = nn.Sequential(
-            nn.Linear(CHANNELS, hidden),
-            nn.ReLU(inplace=True),
-            nn.Linear(hidden, hidden),
-            nn.ReLU(inplace=True),
-        )
+        self.view = _two_layers(CHANNELS, hidden, hidden)
         self.start = nn.Linear(channels, hidden)
         inputs = 4 * hidden + depths + _PLACE + 3 + (SLOPES if options.slopes else 0)
-        self.update = nn.Sequential(
-            nn.Linear(inputs, 2 * hidden),
-            nn.ReLU(inplace=True),
-            nn.Linear(2 * hidden, hidden),
-            nn.ReLU(inplace=True),
-        )
+        self.update = _two_layers(inputs, 2 * hidden, hidden)
         self.memory = nn.Linear(hidden, hidden)
         self.exchange = None if options.exchange is None else Exchange(hidden, options.exchange)
         self.change = nn.Sequential(nn.Linear(hidden, 1 + RAW_VALUES))
@@ -309,9 +298,9 @@ class Rounds(nn.Module):
 @torch.no_grad()
 def _footprints(state: State, batch: Batch, rays: Rays) -> Tensor:
     """Sizes [N, 1] of the pixels where the Gaussians are, in the unit of the world."""
-    focal = at_least_float32(batch.cameras.intrinsics.flatten(0, 1)).diagonal(dim1=-2, dim2=-1)[:, :2]
+    focal = focal_lengths(batch.cameras).prod(-1).sqrt().flatten()
     depth = at_least_float32(state.depth_maps.depth).flatten()[rays.place]
-    return (depth / focal.prod(-1).sqrt()[state.raw.image])[:, None]
+    return (depth / focal[state.raw.image])[:, None]
 
 
 def _moved(

@@ -1,13 +1,10 @@
 """Carving and marching, distributed over threads; the result has the same bits with any number of them."""
 
-from functools import partial
-
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.pool import even_parts
 
 #: Slices of a grid, or rows of an image, of one task.
 _SLICES, _ROWS = 8, 16
@@ -26,14 +23,8 @@ def carve(
     elements, cells = position.shape[0], position.shape[2]
     kept = torch.empty(elements, cells, cells, cells, dtype=torch.bool)
     arrays = [x.contiguous().numpy() for x in (outside, matrices, position, kept)]
-    pool.run(
-        [
-            partial(carve_slices(), *arrays, tolerance, element, part.start, part.stop)
-            for element in range(elements)
-            for part in even_parts(cells, _SLICES)
-        ],
-        kept.numel(),
-    )
+    ranges = [(element, 0, cells) for element in range(elements)]
+    pool.run_rows(carve_slices(), (*arrays, tolerance), ranges, _SLICES, kept.numel())
     return kept
 
 
@@ -63,12 +54,5 @@ def march(
     elements, views, height, _ = masks.shape
     tables = (outside, masks, matrices, directions, centers)
     arrays = [x.contiguous().numpy() for x in tables] + [near.numpy(), far.numpy(), steps.numpy()]
-    pool.run(
-        [
-            partial(march_rows(), *arrays, tolerance, element, view, part.start, part.stop)
-            for element in range(elements)
-            for view in range(views)
-            for part in even_parts(height, _ROWS)
-        ],
-        masks.numel(),
-    )
+    ranges = [(element, view, 0, height) for element in range(elements) for view in range(views)]
+    pool.run_rows(march_rows(), (*arrays, tolerance), ranges, _ROWS, masks.numel())

@@ -8,7 +8,7 @@ from torch import Tensor
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.measure import Estimate, Renderer
 from ghgs_lit.geometry.mattes import coverage, surface_colors, with_matte
-from ghgs_lit.geometry.projection import at_least_float32, unproject_maps, world_to_camera
+from ghgs_lit.geometry.projection import focal_lengths, unproject_maps, world_to_camera
 from ghgs_lit.geometry.rotations import rotate
 from ghgs_lit.heads.surface import surface_axes
 from ghgs_lit.types import Batch, DepthMaps, Gaussians
@@ -44,8 +44,7 @@ def discs_at(batch: Batch, depth: Tensor, valid: Tensor) -> Gaussians:
     """Discs on the surface that depth maps describe, as Gaussian heads with ``axes=surface`` start."""
     places = valid.flatten(0, 1).flatten(1).nonzero()
     image, pixel = places.unbind(1)
-    intrinsics = at_least_float32(batch.cameras.intrinsics)
-    focal = intrinsics.diagonal(dim1=-2, dim2=-1)[..., :2].prod(-1).sqrt()
+    focal = focal_lengths(batch.cameras).prod(-1).sqrt()
     footprint = (depth / focal[..., None, None])[valid][:, None]
     axes = surface_axes(DepthMaps(depth, valid, valid.to(depth)), batch.cameras, image, pixel)
     inward = rotate(axes, footprint * footprint.new_tensor([0.0, 0.0, _INWARD]))

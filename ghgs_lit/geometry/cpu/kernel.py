@@ -209,12 +209,8 @@ def _sweep_pixels(
     best = simd.aligned(len(shares) * LANES)
     for start in range(first, last, LANES):
         _load_pixels(colors, pixels, near, far, start, last, height, width, image * size, values, own)
-        u, v, low, length = (
-            memory.load(values, 0),
-            memory.load(values, LANES),
-            memory.load(values, 2 * LANES),
-            memory.load(values, 3 * LANES),
-        )
+        u, v = memory.load(values, 0), memory.load(values, LANES)
+        low, length = memory.load(values, 2 * LANES), memory.load(values, 3 * LANES)
         red, green, blue, _ = channels_of(own, 0)
         best[:] = ZERO
         for other in range(views):

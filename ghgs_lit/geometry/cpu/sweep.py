@@ -1,7 +1,6 @@
 """The plane sweep, distributed over threads; the result has the same bits with any number of them."""
 
 import math
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.pool import even_parts
 
 #: Pixels, and rows of an image, of one task.
 _PIXELS, _ROWS = 1024, 64
@@ -28,14 +26,8 @@ def padded(photo: Float[Tensor, "B V 3 H W"], masks: Bool[Tensor, "B V H W"]) ->
     elements, views, height, width = masks.shape
     flat = photo.new_zeros(elements * views * (height + 2) * (width + 2) * 4 + LANES)
     arrays = [x.flatten(0, 1).contiguous().numpy() for x in (photo, masks)]
-    pool.run(
-        [
-            partial(smooth_rows(), *arrays, flat.numpy(), image, part.start, part.stop)
-            for image in range(elements * views)
-            for part in even_parts(height, _ROWS)
-        ],
-        masks.numel() // 8,
-    )
+    ranges = [(image, 0, height) for image in range(elements * views)]
+    pool.run_rows(smooth_rows(), (*arrays, flat.numpy()), ranges, _ROWS, masks.numel() // 8)
     return flat
 
 
@@ -70,21 +62,6 @@ def sweep(
     ]
     images = np.arange(compared[..., 0].numel() + 1) * math.prod(size)
     ends = np.searchsorted(tables[1], images).tolist()
-    pool.run(
-        [
-            partial(
-                sweep_pixels(),
-                *tables,
-                tolerance,
-                result,
-                *size,
-                image,
-                first + part.start,
-                first + part.stop,
-            )
-            for image, (first, last) in enumerate(pairwise(ends))
-            for part in even_parts(last - first, _PIXELS)
-        ],
-        result.size,
-    )
+    ranges = [(image, *pair) for image, pair in enumerate(pairwise(ends))]
+    pool.run_rows(sweep_pixels(), (*tables, tolerance, result, *size), ranges, _PIXELS, result.size)
     return torch.from_numpy(result)

@@ -1,6 +1,5 @@
 """Networks and activations distributed over threads; the result has the same bits with any number of them."""
 
-from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +9,6 @@ from torch import Tensor, nn
 
 from ghgs_lit.geometry.rotations import matrix_to_quaternion
 from ghgs_lit.kernels import pool
-from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Cameras, DepthMaps, Points
 
 #: Gaussians of one task.
@@ -54,32 +52,17 @@ def activate(
     share = raw[0].new_empty(0, *photo.shape[3:]) if share is None else share.flatten(0, 1)
     turns = matrix_to_quaternion(cameras.extrinsics.flatten(0, 1)[:, :3, :3].mT)
     seen = (maps.depth, maps.valid, points.pixels, photo)
-    inputs = (
-        *raw,
-        color,
-        pixel,
-        *(x.flatten(0, 1) for x in seen),
-        share,
-        cameras.intrinsics.flatten(0, 1),
-        turns,
-    )
+    tables = (*(x.flatten(0, 1) for x in seen), share)
+    inputs = (*raw, color, pixel, *tables, cameras.intrinsics.flatten(0, 1), turns)
     count = len(pixel)
     out = [raw[0].new_empty(count, *size) for size in ((3,), (4,), (3,), (), (3,))]
     arrays = [x.detach().contiguous().numpy() for x in inputs]
     numbers = tuple(np.float32(x) for x in constants)
     ends = np.searchsorted(image.numpy(), np.arange(len(turns) + 1)).tolist()
-    pool.run(
-        [
-            partial(
-                compiled(), *arrays, numbers, on_surface, *(x.numpy() for x in out), view, first + part.start,
-                first + part.stop,
-            )
-            for view, (first, last) in enumerate(pairwise(ends))
-            for part in even_parts(last - first, _TASK)
-            if last > first
-        ],
-        count,
-    )  # fmt: skip
+    given = (*arrays, numbers, on_surface, *(x.numpy() for x in out))
+    pool.run_rows(
+        compiled(), given, [(view, *pair) for view, pair in enumerate(pairwise(ends))], _TASK, count
+    )
     return tuple(out)
 
 
@@ -102,11 +85,6 @@ def attributes(
     found = rows.new_empty(len(rows), sum(outputs))
     widths = np.array([len(networks[0][k].bias) for k in (0, 2)] + outputs)
     bends = np.array([isinstance(network[1], nn.Tanh) for network in networks])
-    pool.run(
-        [
-            partial(compiled(), rows.numpy(), layers, widths, bends, found.numpy(), part.start, part.stop)
-            for part in even_parts(len(rows), _ROWS)
-        ],
-        _WORK * len(rows),
-    )
+    given = (rows.numpy(), layers, widths, bends, found.numpy())
+    pool.run_rows(compiled(), given, [(0, len(rows))], _ROWS, _WORK * len(rows))
     return torch.split(found.view(*descriptors.shape[:-1], -1), outputs, -1)

@@ -98,12 +98,8 @@ def _rotate(q, v):
     axis = q[1], q[2], q[3]
     x, y, z = _cross(axis, v)
     twice = x + x, y + y, z + z
-    rest = _cross(axis, twice)
-    return (
-        v[0] + q[0] * twice[0] + rest[0],
-        v[1] + q[0] * twice[1] + rest[1],
-        v[2] + q[0] * twice[2] + rest[2],
-    )
+    a, b, c = _cross(axis, twice)
+    return v[0] + q[0] * twice[0] + a, v[1] + q[0] * twice[1] + b, v[2] + q[0] * twice[2] + c
 
 
 @helper
@@ -132,22 +128,9 @@ def _axes(values, camera, turn, row, column, own):
 
 @helper
 def _read(
-    offset,
-    scale,
-    rotation,
-    opacity,
-    color,
-    pixel,
-    depth,
-    valid,
-    points,
-    photo,
-    share,
-    image,
-    start,
-    last,
+    offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, image, start, last,
     values,
-):
+):  # fmt: skip
     """Fill ``values`` with Gaussians from ``start`` on; the last one repeats."""
     height, width = depth.shape[1], depth.shape[2]
     for lane in range(LANES):
@@ -168,12 +151,6 @@ def _read(
         values[OPACITY * LANES + lane] = opacity[i]
         values[DEPTH * LANES + lane] = depth[image, row, column]
         values[SHARE * LANES + lane] = share[image, row, column] if len(share) > 0 else ONE
-
-
-@helper
-def _write(lines, values, line):
-    for k in range(len(lines)):
-        memory.store(values, (line + k) * LANES, lines[k])
 
 
 def _activate(

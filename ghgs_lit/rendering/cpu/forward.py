@@ -86,11 +86,8 @@ def _add(planes, position, value):
 def _draw_block(block, todo, rows, count, pixels, planes, transmittance, alpha_max, stop, hits):
     """Blend the splats ``todo`` (bits) into one block, front to back; returns whether light still passes."""
     at, bit = block * LANES, np.int32(1) << block
-    x, y, before = (
-        memory.load(pixels, at),
-        memory.load(pixels, layout.PIXELS + at),
-        memory.load(transmittance, at),
-    )
+    x, y = memory.load(pixels, at), memory.load(pixels, layout.PIXELS + at)
+    before = memory.load(transmittance, at)
     while todo != 0:
         i = simd.trailing_zeros(todo)
         todo &= todo - 1

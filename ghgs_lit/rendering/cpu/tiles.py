@@ -60,15 +60,11 @@ def open_pixels(view, x0, y0, pixels, transmittance):
 @helper
 def read_splat(record, x0, y0):
     """Vector from a splat's centre to the tile's first pixel (2), ``K`` (3), opacity and cutoff."""
+    x, y = x0 - record[layout.COLUMN], y0 - record[layout.ROW]
     return (
-        x0 - record[layout.COLUMN] + record[layout.REST_X],
-        y0 - record[layout.ROW] + record[layout.REST_Y],
-        record[layout.K_XX],
-        record[layout.K_YX],
-        record[layout.K_YY],
-        record[layout.OPACITY],
-        record[layout.CUTOFF],
-    )
+        x + record[layout.REST_X], y + record[layout.REST_Y], record[layout.K_XX], record[layout.K_YX],
+        record[layout.K_YY], record[layout.OPACITY], record[layout.CUTOFF],
+    )  # fmt: skip
 
 
 @helper

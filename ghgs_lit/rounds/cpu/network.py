@@ -50,13 +50,8 @@ def answered(
     layers = packed(parameters((hear, change)))
     after, changed = torch.empty_like(before), before.new_empty(len(before), len(change.bias))
     rows = [x.contiguous().numpy() for x in (heard, before)]
-    pool.run(
-        [
-            partial(answer(), *rows, layers, after.numpy(), changed.numpy(), part.start, part.stop)
-            for part in even_parts(len(before), _TASK)
-        ],
-        len(before),
-    )
+    given = (*rows, layers, after.numpy(), changed.numpy())
+    pool.run_rows(answer(), given, [(0, len(before))], _TASK, len(before))
     return after, changed
 
 
@@ -68,14 +63,8 @@ class _Remember(torch.autograd.Function):
 
         layers, after = packed(numbers), torch.empty_like(before)
         rows = [x.detach().contiguous() for x in (each, known, before)]
-        arrays = [x.numpy() for x in rows]
-        pool.run(
-            [
-                partial(remember(), *arrays, layers, after.numpy(), part.start, part.stop)
-                for part in even_parts(len(before), _TASK)
-            ],
-            _WORK * len(before),
-        )
+        given = (*(x.numpy() for x in rows), layers, after.numpy())
+        pool.run_rows(remember(), given, [(0, len(before))], _TASK, _WORK * len(before))
         ctx.save_for_backward(*rows, after, *numbers)
         return after
 
@@ -120,12 +109,5 @@ def compare(
         *(photo, mask, rendering.image, rendering.alpha, rendering.depth),
     )
     arrays = [x.contiguous().numpy() for x in inputs]
-    pool.run(
-        [
-            partial(observe(), *arrays, near, out.numpy(), first + part.start, first + part.stop)
-            for first, last in pairwise((0, *accumulate(gaussians.splits)))
-            for part in even_parts(last - first, _OBSERVED)
-            if last > first
-        ],
-        len(gaussians),
-    )
+    ranges = pairwise((0, *accumulate(gaussians.splits)))
+    pool.run_rows(observe(), (*arrays, near, out.numpy()), ranges, _OBSERVED, len(gaussians))
