@@ -26,8 +26,7 @@ from torch import Tensor
 
 from ghgs_lit import GHGS
 from ghgs_lit.data.view import area_image
-from ghgs_lit.metrics.flicker import flicker_in_place
-from ghgs_lit.metrics.functional import box_of, decibels, mean_over, psnr
+from ghgs_lit.metrics.functional import box_of, decibels, flicker_in_place, mean_over, psnr
 from ghgs_lit.prediction.capture.backgrounds import Backgrounds
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.doubts import ENOUGH, doubt_of_cameras, doubt_of_masks

@@ -8,8 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.attention import Attention, Rotary, rotate
-from ghgs_lit.encoder.block import Block
+from ghgs_lit.encoder.block import Attention, Block, Rotary, rotate
 from ghgs_lit.kernels.linear import Linear
 from ghgs_lit.model import GHGS
 from ghgs_lit.recalibration import Recalibration

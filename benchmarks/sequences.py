@@ -30,8 +30,7 @@ from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import SampleSpec, evaluation_samples
 from ghgs_lit.evaluation.measure import Estimate, Flickers, Method, ModelMethod, measure
 from ghgs_lit.metrics import ImageMetrics
-from ghgs_lit.metrics.flicker import flicker_in_place
-from ghgs_lit.metrics.functional import box_of
+from ghgs_lit.metrics.functional import box_of, flicker_in_place
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs import results
 from ghgs_lit.synthesis.motion import instant_names

@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ghgs_lit.encoder.attention import rotary_tables
+from ghgs_lit.encoder.block import rotary_tables
 from ghgs_lit.geometry.rotations import unit
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.heads.activations import confidence_of

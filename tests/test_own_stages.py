@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ghgs_lit import GHGS
-from ghgs_lit.config import plugins, registry
+from ghgs_lit.config import registry
 from ghgs_lit.errors import InputError
 from ghgs_lit.prediction.export.ply import read_ply
 from ghgs_lit.training import GHGSModule

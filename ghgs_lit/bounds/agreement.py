@@ -8,8 +8,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.bounds.rays import projection_matrices, ray_directions
-from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, votes_outside
+from ghgs_lit.bounds.silhouettes import (
+    NEAREST,
+    Silhouettes,
+    dilate,
+    look_up,
+    projection_matrices,
+    ray_directions,
+    votes_outside,
+)
 from ghgs_lit.geometry.projection import world_to_camera
 
 #: Cells along the longer side of the masks, and depths along each ray: gross errors only are looked for.

@@ -12,8 +12,17 @@ from pydantic import Field
 from torch import Tensor
 
 from ghgs_lit.bounds import agreement, cpu
-from ghgs_lit.bounds.rays import depths_in_box, pixel_axes, projection_matrices
-from ghgs_lit.bounds.silhouettes import NEAREST, Silhouettes, dilate, look_up, silhouettes, votes_outside
+from ghgs_lit.bounds.silhouettes import (
+    NEAREST,
+    Silhouettes,
+    depths_in_box,
+    dilate,
+    look_up,
+    pixel_axes,
+    projection_matrices,
+    silhouettes,
+    votes_outside,
+)
 from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last

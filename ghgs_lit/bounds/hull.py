@@ -11,8 +11,15 @@ from torch import Tensor
 
 from ghgs_lit.bounds import cpu
 from ghgs_lit.bounds.box import SubjectBox
-from ghgs_lit.bounds.rays import depths_in_box, projection_matrices, ray_directions
-from ghgs_lit.bounds.silhouettes import Silhouettes, dilate, look_up, votes_outside
+from ghgs_lit.bounds.silhouettes import (
+    Silhouettes,
+    depths_in_box,
+    dilate,
+    look_up,
+    projection_matrices,
+    ray_directions,
+    votes_outside,
+)
 from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 

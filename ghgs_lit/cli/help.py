@@ -9,8 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from ghgs_lit.config import compose, conf_dir
-from ghgs_lit.config.describe import expected, meanings, options_of
-from ghgs_lit.config.options import did_you_mean
+from ghgs_lit.config.options import did_you_mean, expected, meanings, options_of
 from ghgs_lit.config.registry import KINDS, class_of, kinds_of
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError

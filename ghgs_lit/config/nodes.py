@@ -4,8 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Text
+from ghgs_lit.config.options import Count, Index, Options, Path, Positive, Share, Text, Words
 
 #: One value or several.
 Texts = Text | tuple[Text, ...]

@@ -4,7 +4,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ghgs_lit.config.describe import Words
 from ghgs_lit.config.nodes import Check, PairedTest, PerScene, Sequence, Texts, Timing, Turntable
 from ghgs_lit.config.options import (
     Count,
@@ -16,6 +15,7 @@ from ghgs_lit.config.options import (
     Positive,
     Seed,
     Text,
+    Words,
     Workers,
 )
 

@@ -4,8 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ghgs_lit.encoder.attention import rotary_tables
-from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, run_block
+from ghgs_lit.encoder.block import REGISTERS, Block, draw_normal_, rotary_tables, run_block
 from ghgs_lit.encoder.options import VGGTSettings
 from ghgs_lit.encoder.packing import KeptPatches
 

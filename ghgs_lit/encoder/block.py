@@ -1,16 +1,102 @@
-"""Pre-norm transformer block with LayerScale, used by the ViT and the aggregator."""
+"""Pre-norm transformer block with LayerScale: the ViT's, and with normalised, rotated q and k the aggregator's.
+
+The rotary position embedding (RoPE) has two dimensions: half of a head turns with the row, half with the
+column. Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would change
+its cosine by up to 6e-2, rounding the cosine itself only by 2e-3.
+"""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from einops import rearrange
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ghgs_lit.encoder.attention import Attention, Rotary
+from ghgs_lit.encoder import cpu
+from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.linear import Linear
-from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.kernels.pool import at_once, even_parts
+
+BASE = 100.0
+
+
+class Rotary(NamedTuple):
+    """Cosine and sine for every token and channel of a head; the sine has the sign of its term."""
+
+    cosine: Float[Tensor, "t d"]
+    sine: Float[Tensor, "t d"]
+
+
+def rotary_tables(positions: Int[Tensor, "t 2"], head_width: int, like: Tensor) -> Rotary:
+    """Tables of all tokens. ``positions``: row and column of each token. ``head_width``: channels of a head,
+    divisible by 4. ``like``: tokens; the tables are float32, or float64 for tokens in float64."""
+    exponents = torch.arange(0, head_width, 4, device=positions.device, dtype=torch.float32) / head_width
+    angles = positions.float()[..., None] * (1.0 / BASE**exponents)
+    angles = angles.to(at_least_float32(like).dtype)
+    cosine, sine = angles.cos(), angles.sin()
+    return Rotary(
+        torch.stack((cosine, cosine), dim=-2).flatten(-3), torch.stack((-sine, sine), dim=-2).flatten(-3)
+    )
+
+
+def rotate(x: Float[Tensor, "*batch t d"], rotary: Rotary) -> Float[Tensor, "*batch t d"]:
+    """Rotate channel ``m`` of each half of a head with its partner ``m + d/4``; in the tables' dtype."""
+    quarters = x.unflatten(-1, (2, 2, x.shape[-1] // 4))
+    return torch.addcmul(x * rotary.cosine, quarters.flip(-2).flatten(-3), rotary.sine)
+
+
+#: Values of queries or keys that are rotated at once without a gradient (bounds memory), and on a GPU.
+_ROTATED, _GPU_ROTATED = 1 << 18, 1 << 25
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention inside each of several packed sequences. ``qk_norm``: normalise q and k over
+    the channels of each head, before they are rotated."""
+
+    def __init__(self, width: int, heads: int, qk_norm: bool):
+        super().__init__()
+        self.heads = heads
+        self.qkv = Linear(width, 3 * width)
+        self.q_norm = nn.LayerNorm(width // heads) if qk_norm else nn.Identity()
+        self.k_norm = nn.LayerNorm(width // heads) if qk_norm else nn.Identity()
+        self.proj = Linear(width, width)
+
+    def forward(
+        self, x: Float[Tensor, "t c"], lengths: Sequence[int], rotary: Rotary | None = None
+    ) -> Float[Tensor, "t c"]:
+        q, k, v = rearrange(self.qkv(x), "t (s a d) -> s a t d", s=3, a=self.heads)
+        q, k = self._norm_and_rotate(q, self.q_norm, rotary), self._norm_and_rotate(k, self.k_norm, rotary)
+        if len(set(lengths)) == 1:
+            each = (rearrange(values, "a (n t) d -> n a t d", n=len(lengths)) for values in (q, k, v))
+            return self.proj(_attend(*each).flatten(0, 1))
+        # One by one: a mask of blocks would compute every product of tokens of different sequences, too.
+        parts = zip(*(values[None].split(lengths, dim=2) for values in (q, k, v)), strict=True)
+        return self.proj(torch.cat([_attend(*part)[0] for part in parts]))
+
+    def _norm_and_rotate(self, x: Float[Tensor, "a t d"], norm: nn.Module, rotary: Rotary | None) -> Tensor:
+        """Normalise queries or keys and rotate them by their positions; in place without a gradient."""
+        if rotary is None:
+            return norm(x)
+        if torch.is_grad_enabled():
+            return rotate(norm(x), rotary)
+        most = at_once(x.device, _ROTATED, _GPU_ROTATED)
+        for heads in even_parts(len(x), most // x[0].numel()):
+            x[heads] = rotate(norm(x[heads]), rotary)
+        return x
+
+
+def _attend(
+    q: Float[Tensor, "n a t d"], k: Float[Tensor, "n a t d"], v: Float[Tensor, "n a t d"]
+) -> Float[Tensor, "n t c"]:
+    """``softmax(q k^T / sqrt(d)) v`` of every head, with the heads side by side."""
+    if cpu.is_supported(q, v):
+        return cpu.attend(q, k, v).flatten(2)
+    y = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+    return rearrange(y, "n a t d -> n t (a d)")
+
 
 #: Register tokens of each view, of the ViT and of the aggregator.
 REGISTERS = 4

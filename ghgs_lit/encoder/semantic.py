@@ -6,8 +6,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options, Width
-from ghgs_lit.encoder.attention import rotary_tables
-from ghgs_lit.encoder.block import Block, draw_normal_, run_block
+from ghgs_lit.encoder.block import Block, draw_normal_, rotary_tables, run_block
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.vit import ConvStem
 from ghgs_lit.geometry.masks import patches_around_subject

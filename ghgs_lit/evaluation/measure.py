@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from ghgs_lit.data.batches import BatchBuilder
 from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import ImageMetrics, depth_error_mm
-from ghgs_lit.metrics.flicker import flicker
+from ghgs_lit.metrics.functional import flicker
 from ghgs_lit.prediction.refinement import CameraRefinement, Refinement
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row

@@ -2,6 +2,12 @@
 
 A ``region`` selects the pixels that count. Where it is empty the value is nan ("undefined"), and averages
 leave it out.
+
+Flicker is by how much the error of renders changes from one instant to the next. The field measures how
+frames change along an estimated optical flow (warping error: Lai et al. 2018, Learning Blind Video Temporal
+Consistency), or unlike the true video (tOF, tLP: Chu et al. 2020, TecoGAN). Here the motion of the surface is
+known and the truth subtracted: an error that moves with the surface does not flicker. A black render has the
+flicker of the photographs.
 """
 
 import torch
@@ -11,8 +17,9 @@ from torch import Tensor
 
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import between, first_and_last
-from ghgs_lit.geometry.projection import at_least_float32
+from ghgs_lit.geometry.projection import at_least_float32, project, sample
 from ghgs_lit.kernels.precision import exact
+from ghgs_lit.types import Cameras
 
 REGIONS = ("image", "box", "subject", "crop")
 PADDINGS = ("valid", "reflect", "zeros")
@@ -163,3 +170,36 @@ def depth_error_mm(
     region = region & (truth > 0)
     require(depth.shape == truth.shape, "depth", f"shape {tuple(truth.shape)}", tuple(depth.shape))
     return 1000 * (at_least_float32(depth)[region] - at_least_float32(truth)[region]).abs().mean()
+
+
+#: Metres that a point may lie off the depth map and be visible.
+VISIBLE = 0.005
+
+
+def flicker(
+    errors: Float[Tensor, "2 t c h w"],
+    points: Float[Tensor, "2 n 3"],
+    depths: Float[Tensor, "2 t h w"],
+    cameras: Cameras,
+) -> Float[Tensor, " t"]:
+    """Mean absolute change of each error at the points that are visible at both instants; nan without any.
+    ``errors``: renders less photographs, of images in [0, 1]. ``points``: of the surface in the world,
+    metres. ``depths``: true z-depths in metres, 0 where there is none. ``cameras``: [2, t]."""
+    pixels, z = project(points[:, None], cameras.intrinsics[:, :, None], cameras.extrinsics[:, :, None])
+    image = torch.arange(2 * z.shape[1], device=z.device).view(2, -1, 1).expand(z.shape)
+    # Beside the silhouette the 0 of the background makes the depth too small: such points are left out.
+    off = sample(depths.flatten(0, 1)[:, None], image, pixels)[..., 0] - z
+    seen = ((z > 0) & (off.abs() < VISIBLE)).all(0)
+    before, after = sample(errors.flatten(0, 1), image, pixels)
+    change = torch.where(seen, (after - before).abs().mean(-1), 0)
+    return change.sum(-1) / seen.sum(-1)
+
+
+def flicker_in_place(
+    errors: Float[Tensor, "2 t c h w"], masks: Bool[Tensor, "2 t h w"]
+) -> Float[Tensor, " t"]:
+    """Mean absolute change of each error at the pixels of the subject's box at both instants; nan without
+    any. It needs no truth but the photographs of cameras that stand still."""
+    box = box_of(masks.any(0))
+    change = torch.where(box, (errors[1] - errors[0]).abs().mean(1), 0)
+    return change.sum((1, 2)) / box.sum((1, 2))

@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor, nn
 
-from ghgs_lit.bounds.rays import ray_directions
+from ghgs_lit.bounds.silhouettes import ray_directions
 from ghgs_lit.config.options import Options, Width
 from ghgs_lit.geometry.photo_consistency import consistency_of
 from ghgs_lit.geometry.projection import at_least_float32, focal_lengths

@@ -14,8 +14,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from ghgs_lit.config import options
-from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Index, Options, Share, Size, Text, Workers
+from ghgs_lit.config.options import Index, Options, Share, Size, Text, Words, Workers
 from ghgs_lit.data.dataset import DataSet, Limit, required_folder
 from ghgs_lit.data.layout import Completeness, Layout, Rendered
 from ghgs_lit.data.reader import PHASES

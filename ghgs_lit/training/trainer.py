@@ -7,8 +7,7 @@ import torch
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
-from ghgs_lit.config.describe import Words
-from ghgs_lit.config.options import Count, Index, Options, Share, Text
+from ghgs_lit.config.options import Count, Index, Options, Share, Text, Words
 from ghgs_lit.errors import InputError
 
 #: Numbers of which no sum of days is too large for Python.

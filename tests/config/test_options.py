@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import compose, conf_dir, resolve
-from ghgs_lit.config.describe import expected, meanings, options_of
 from ghgs_lit.config.keys import flatten
+from ghgs_lit.config.options import expected, meanings, options_of
 from ghgs_lit.config.registry import KINDS, NAMED, check, class_of
 from ghgs_lit.config.verbs import VERBS as OPTIONS
 from ghgs_lit.errors import InputError

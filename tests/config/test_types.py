@@ -6,8 +6,7 @@ from typing import Literal
 import pytest
 from pydantic import Field, model_validator
 
-from ghgs_lit.config.describe import meanings
-from ghgs_lit.config.options import Count, Options, Path, Share, Size, Text, Width
+from ghgs_lit.config.options import Count, Options, Path, Share, Size, Text, Width, meanings
 from ghgs_lit.errors import InputError
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from ghgs_lit.cli.usage import VERBS as DESCRIBED
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.config.describe import meanings, options_of
+from ghgs_lit.config.options import meanings, options_of
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError

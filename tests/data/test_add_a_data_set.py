@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from ghgs_lit.config import build, plugins, registry
+from ghgs_lit.config import build, registry
 from ghgs_lit.data.check import inspect
 from ghgs_lit.errors import InputError
 from tests.helpers.training import ring
@@ -54,9 +54,9 @@ def clean(monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delenv(plugins.VARIABLE, raising=False)
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    plugins._installed.cache_clear()
+    registry._installed.cache_clear()
     yield
-    plugins._installed.cache_clear()
+    registry._installed.cache_clear()
     for name in ("my_people", "numbers_of_mine"):
         sys.modules.pop(name, None)
 
@@ -153,12 +153,12 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
         with pytest.raises(InputError, match="my_people"):
             build(node(project), "data")
         admit()
-        plugins._installed.cache_clear()
+        registry._installed.cache_clear()
         assert build(node(project), "data", **KEYS).dataset.name == "m"
         monkeypatch.delenv(plugins.VARIABLE, raising=False)
         registry._REGISTERED.clear()
         sys.modules.pop("my_people")
-        plugins._installed.cache_clear()
+        registry._installed.cache_clear()
 
 
 def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from ghgs_lit.encoder import cpu
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES, WIDTH
 from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.compile import processor_features
-from ghgs_lit.kernels.products import PANEL, ROWS
+from ghgs_lit.kernels.layers import PANEL, ROWS
 from tests.helpers.processes import run_python
 
 DTYPES = [torch.float32, torch.bfloat16]
@@ -160,7 +160,7 @@ NARROW = """
 import torch
 import torch.nn.functional as F
 from ghgs_lit.encoder import cpu
-from ghgs_lit.kernels.products import PANEL, ROWS
+from ghgs_lit.kernels.layers import PANEL, ROWS
 
 assert (ROWS, PANEL) == (6, 16)
 for n, heads, queries, keys, width in ((1, 1, 1, 1, 32), (2, 3, 7, 7, 64), (1, 2, 299, 333, 96)):

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from omegaconf import OmegaConf
 
 from ghgs_lit.encoder import VGGTEncoder
-from ghgs_lit.encoder.attention import rotary_tables, rotate
+from ghgs_lit.encoder.block import rotary_tables, rotate
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from tests.helpers.configs import composed

@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.encoder import VGGTEncoder
-from ghgs_lit.encoder.attention import rotary_tables, rotate
+from ghgs_lit.encoder.block import rotary_tables, rotate
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.masks import patches_around_subject, patches_in_window

@@ -12,8 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ghgs_lit.encoder.attention import rotary_tables, rotate
-from ghgs_lit.encoder.block import REGISTERS
+from ghgs_lit.encoder.block import REGISTERS, rotary_tables, rotate
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.encoder.vit import VisionTransformer
 from ghgs_lit.heads.dpt import DPTHead, add_positions_

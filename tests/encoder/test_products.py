@@ -8,8 +8,7 @@ import torch.nn.functional as F
 
 import ghgs_lit.kernels.linear
 from ghgs_lit.encoder import cpu
-from ghgs_lit.encoder.attention import rotary_tables
-from ghgs_lit.encoder.block import Block
+from ghgs_lit.encoder.block import Block, rotary_tables
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.compile import processor_features

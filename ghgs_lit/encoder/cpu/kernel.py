@@ -12,7 +12,7 @@ from numba.core import types
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
-from ghgs_lit.kernels.products import PANEL, ROWS, make_product, product
+from ghgs_lit.kernels.layers import PANEL, ROWS, make_product, product
 from ghgs_lit.kernels.simd import EXP2_LIMIT
 
 LANES = simd.LANES

@@ -14,8 +14,7 @@ from ghgs_lit.heads.activations import SIGMOID_LIMIT, TANH_LIMIT
 from ghgs_lit.heads.surface import OTHER, SAME
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
-from ghgs_lit.kernels.layers import bend, linear, lines, put_rows, rectify, size
-from ghgs_lit.kernels.products import PANEL
+from ghgs_lit.kernels.layers import PANEL, bend, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
 ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))

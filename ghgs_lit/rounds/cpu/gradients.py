@@ -7,8 +7,17 @@ from numba.core import types
 
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
-from ghgs_lit.kernels.layers import learn, linear, lines, put_ones, put_rows, put_slopes, rectify, unrectify
-from ghgs_lit.kernels.products import PANEL
+from ghgs_lit.kernels.layers import (
+    PANEL,
+    learn,
+    linear,
+    lines,
+    put_ones,
+    put_rows,
+    put_slopes,
+    rectify,
+    unrectify,
+)
 from ghgs_lit.kernels.simd import LANES
 from ghgs_lit.rounds.cpu.kernel import FLOATS, ONE, ZERO, see
 

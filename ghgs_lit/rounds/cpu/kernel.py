@@ -7,8 +7,7 @@ from numba.core import types
 
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import helper, kernel_for
-from ghgs_lit.kernels.layers import linear, lines, put_rows, rectify, size
-from ghgs_lit.kernels.products import PANEL
+from ghgs_lit.kernels.layers import PANEL, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.simd import LANES
 
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ghgs_lit.evaluation.tables import PREAMBLE, to_latex
-from ghgs_lit.evaluation.tables.latex import escape, prose
+from ghgs_lit.evaluation.tables.writers import escape, prose
 from tests.helpers.latex import check_balance, read_tabular
 from tests.helpers.tables import SWITCHES, start_run, tables_of, write_run
 

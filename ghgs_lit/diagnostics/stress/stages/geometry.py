@@ -5,7 +5,7 @@ from kornia.geometry.calibration import distort_points
 from torch import Generator, Tensor
 
 from ghgs_lit.bounds import VisualHull
-from ghgs_lit.bounds.rays import depths_in_box, ray_directions
+from ghgs_lit.bounds.silhouettes import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, except_for
 from ghgs_lit.geometry.frame import Frame
