@@ -54,7 +54,7 @@ def project(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(registry, "_REGISTERED", {})
-    monkeypatch.setenv(plugins.VARIABLE, "own_stages.py")
+    monkeypatch.setenv(registry.VARIABLE, "own_stages.py")
     yield tmp_path
     sys.modules.pop("own_stages", None)
 
@@ -96,7 +96,7 @@ def test_each_stage_can_be_replaced_alone(project, boxes, photographs, monkeypat
     assert ghgs("predict", *said, *photographs, *run, "check_cameras=false") == 0
     assert read_ply("splat/gaussians.ply").is_finite.all()
     if group not in ("renderer", "loss"):
-        monkeypatch.delenv(plugins.VARIABLE)
+        monkeypatch.delenv(registry.VARIABLE)
         registry._REGISTERED.clear()
-        with pytest.raises(InputError, match=rf"{group}\.kind: expected .*{plugins.VARIABLE}"):
+        with pytest.raises(InputError, match=rf"{group}\.kind: expected .*{registry.VARIABLE}"):
             GHGS.from_checkpoint(checkpoint)

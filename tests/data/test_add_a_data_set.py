@@ -52,7 +52,7 @@ def project(tmp_path):
 def clean(monkeypatch):
     """Each test starts without admitted or imported modules."""
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.delenv(plugins.VARIABLE, raising=False)
+    monkeypatch.delenv(registry.VARIABLE, raising=False)
     monkeypatch.setattr(registry, "_REGISTERED", {})
     registry._installed.cache_clear()
     yield
@@ -69,7 +69,7 @@ def node(project: Path, **changes) -> dict:
 def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, capsys):
     """The documentation's commands."""
     monkeypatch.chdir(project)
-    monkeypatch.setenv(plugins.VARIABLE, "my_people.py")
+    monkeypatch.setenv(registry.VARIABLE, "my_people.py")
     code = ghgs(
         "train", "--config-dir", "conf", "data=my_people", "data.root=photographs", "data.size=56",
         "views=v3", "targets=cameras", "evaluation.targets=[cameras]", "trainer.max_steps=2",
@@ -89,14 +89,14 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
         "evaluate", "checkpoint=run/checkpoints/last.ckpt", "views=v3", "targets=cameras",
         "evaluation.targets=[cameras]", "evaluation.pictures=0", "hydra.run.dir=measured",
     ]  # fmt: skip
-    monkeypatch.delenv(plugins.VARIABLE)
+    monkeypatch.delenv(registry.VARIABLE)
     registry._REGISTERED.clear()
     sys.modules.pop("my_people")
     assert ghgs(*arguments) == 1
     said = capsys.readouterr().err
     assert "data.kind: expected one of" in said
-    assert plugins.VARIABLE in said
-    monkeypatch.setenv(plugins.VARIABLE, "my_people.py")
+    assert registry.VARIABLE in said
+    monkeypatch.setenv(registry.VARIABLE, "my_people.py")
     assert ghgs(*arguments) == 0
     again = json.loads(Path("measured/metrics.json").read_text())
     assert {row["target"]: row["psnr"] for row in again["rows"]} == pytest.approx(before, abs=1e-3)
@@ -104,7 +104,7 @@ def test_one_file_and_one_yaml_are_trained_and_measured(project, monkeypatch, ca
 
 def test_the_template_passes_the_check(project, monkeypatch):
     """task=check asks for the static cameras alone, whatever the protocol's views, and counts the bodies."""
-    monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
+    monkeypatch.setenv(registry.VARIABLE, str(project / "my_people.py"))
     release = {"name": "release", "training_views": [2, 3, 4]}
     report = inspect(build(node(project), "data", **KEYS | {"targets": release}))
     assert report.problems == report.notes == []
@@ -113,7 +113,7 @@ def test_the_template_passes_the_check(project, monkeypatch):
 
 def test_the_template_gives_batches_of_the_photographs(project, monkeypatch):
     """Cameras, masks and bodies of the template reach the batch; what it cannot give is refused."""
-    monkeypatch.setenv(plugins.VARIABLE, str(project / "my_people.py"))
+    monkeypatch.setenv(registry.VARIABLE, str(project / "my_people.py"))
     data = build(node(project), "data", **KEYS)
     (batch,) = list(data.evaluation_loader())
     assert batch.images.shape == (1, 3, 3, 56, 56)
@@ -143,11 +143,11 @@ def test_nothing_is_admitted_by_a_configuration(project):
 def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch):
     """Both documented ways of admitting code register its kinds."""
     monkeypatch.syspath_prepend(str(project))
-    points = {plugins.GROUP: [SimpleNamespace(value="my_people")]}
+    points = {registry.GROUP: [SimpleNamespace(value="my_people")]}
     for admit in (
-        lambda: monkeypatch.setenv(plugins.VARIABLE, "my_people"),
+        lambda: monkeypatch.setenv(registry.VARIABLE, "my_people"),
         lambda: monkeypatch.setattr(
-            plugins.importlib.metadata, "entry_points", lambda group: points.get(group, [])
+            registry.importlib.metadata, "entry_points", lambda group: points.get(group, [])
         ),
     ):
         with pytest.raises(InputError, match="my_people"):
@@ -155,7 +155,7 @@ def test_a_module_and_an_installed_package_can_be_admitted(project, monkeypatch)
         admit()
         registry._installed.cache_clear()
         assert build(node(project), "data", **KEYS).dataset.name == "m"
-        monkeypatch.delenv(plugins.VARIABLE, raising=False)
+        monkeypatch.delenv(registry.VARIABLE, raising=False)
         registry._REGISTERED.clear()
         sys.modules.pop("my_people")
         registry._installed.cache_clear()
@@ -170,11 +170,11 @@ def test_a_bad_plugin_is_refused_with_its_path(tmp_path, monkeypatch):
     ):
         if name != "none.py":
             (tmp_path / name).write_text("")
-        monkeypatch.setenv(plugins.VARIABLE, str(tmp_path / name))
+        monkeypatch.setenv(registry.VARIABLE, str(tmp_path / name))
         with pytest.raises(InputError, match=said):
             build({"kind": "x"}, "bounds")
     # An error in the user's own file is shown as it is.
     (tmp_path / "numbers_of_mine.py").write_text("1 / 0")
-    monkeypatch.setenv(plugins.VARIABLE, str(tmp_path / "numbers_of_mine.py"))
+    monkeypatch.setenv(registry.VARIABLE, str(tmp_path / "numbers_of_mine.py"))
     with pytest.raises(ZeroDivisionError):
         build({"kind": "y"}, "bounds")
