@@ -105,13 +105,11 @@ class SkipOptions(Preset):
         """The presets to choose from, by name, as their files in conf/skip have them; none: no choice."""
         exact = Preset(pixels=self.pixels, budget_db=EXACT_LOSS)
         seen = {"balanced": ("window", 0), "fast": ("subject", self.margin)}
-        others = {
-            name: exact.replace(
-                name=name, tokens=seen[name][0], margin=seen[name][1], budget_db=loss, max_rel_diff=None
-            )
-            for name, loss in self.choices
-            if loss is not None
-        }
+        others = {}
+        for name, loss in self.choices:
+            if loss is not None:
+                seen_by = dict(zip(("tokens", "margin"), seen[name], strict=True))
+                others[name] = exact.replace(name=name, **seen_by, budget_db=loss, max_rel_diff=None)
         return {"exact": exact, **others} if others else {}
 
     def build(self) -> "AutoSkip | None":

@@ -115,13 +115,9 @@ class Targets(_TensorStruct):
     def of_protocol(self, name: str) -> "Targets":
         """The targets of one protocol."""
         chosen = [number for number, protocol in enumerate(self.protocols) if protocol == name]
-        return Targets(
-            self.images[:, chosen],
-            self.masks[:, chosen],
-            self.cameras[:, chosen],
-            tuple(tuple(names[number] for number in chosen) for names in self.names),
-            (name,) * len(chosen),
-        )
+        parts = (each[:, chosen] for each in (self.images, self.masks, self.cameras))
+        names = tuple(tuple(names[number] for number in chosen) for names in self.names)
+        return Targets(*parts, names, (name,) * len(chosen))
 
 
 @dataclass(frozen=True)
@@ -237,14 +233,8 @@ class Tokens(_TensorStruct):
 
     def select(self, index: Tensor | slice) -> "Tokens":
         """The tokens at ``index`` (a slice, a mask or indices) of the same grid."""
-        return dataclasses.replace(
-            self,
-            latent=tuple(layer[index] for layer in self.latent),
-            semantic=self.semantic[index],
-            image=self.image[index],
-            row=self.row[index],
-            column=self.column[index],
-        )
+        parts = {name: getattr(self, name)[index] for name in ("semantic", "image", "row", "column")}
+        return dataclasses.replace(self, latent=tuple(layer[index] for layer in self.latent), **parts)
 
     def of_images(self, images: slice) -> "Tokens":
         """The tokens of consecutive images, as of one element; the host may wait for a GPU."""
@@ -347,8 +337,7 @@ class Gaussians(_TensorStruct):
         if not -len(self.splits) <= element < len(self.splits):
             raise IndexError(f"batch element {element} of Gaussians with {len(self.splits)} elements")
         element %= len(self.splits)
-        start = sum(self.splits[:element])
-        count = self.splits[element]
+        start, count = sum(self.splits[:element]), self.splits[element]
         found = self.select(slice(start, start + count), (count,))
         metre = None if self.metre is None else self.metre[element : element + 1]
         return dataclasses.replace(found, metre=metre)

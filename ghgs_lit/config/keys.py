@@ -24,13 +24,8 @@ WITHOUT_INFLUENCE = (
 #: What may change when a run is resumed without being reported: also how far it trains (``trainer.max_*``)
 #: and what is measured after training.
 MAY_CHANGE_ON_RESUME = (
-    *WITHOUT_INFLUENCE,
-    "evaluation",
-    "metrics",
-    "sweep",
-    "trainer.max_steps",
-    "trainer.max_time",
-)
+    *WITHOUT_INFLUENCE, "evaluation", "metrics", "sweep", "trainer.max_steps", "trainer.max_time",
+)  # fmt: skip
 
 #: What loggers do not list among the hyperparameters of a run: also the name of its sweep and what is
 #: measured after training.
@@ -39,15 +34,9 @@ NOT_HYPERPARAMETERS = (*WITHOUT_INFLUENCE, "evaluation", "sweep")
 #: What differs between runs in one table on purpose: also the seed, what the ablation switches, and the
 #: views, targets and metrics, which tables keep apart by themselves.
 EXPECTED_TO_DIFFER = (
-    *WITHOUT_INFLUENCE,
-    "evaluation",
-    "metrics.kind",
-    "recalibration.neighborhood",
-    "recalibration.similarity",
-    "seed",
-    "targets",
-    "views",
-)
+    *WITHOUT_INFLUENCE, "evaluation", "metrics.kind", "recalibration.neighborhood",
+    "recalibration.similarity", "seed", "targets", "views",
+)  # fmt: skip
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:

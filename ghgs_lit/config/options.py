@@ -30,15 +30,8 @@ from pydantic.fields import FieldInfo
 
 from ghgs_lit.errors import InputError, require
 
-_NOUNS = {
-    type(None): "null",
-    bool: "true or false",
-    int: "an integer",
-    float: "a number",
-    str: "a text",
-    tuple: "a list",
-    dict: "a mapping",
-}
+_NOUNS = {type(None): "null", bool: "true or false", int: "an integer", float: "a number"}
+_NOUNS |= {str: "a text", tuple: "a list", dict: "a mapping"}
 _LIMITS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
@@ -177,11 +170,7 @@ class Options(BaseModel, metaclass=_Checked):
     @model_validator(mode="before")
     @classmethod
     def _lists_become_tuples(cls, values: Any) -> Any:
-        return (
-            {name: _immutable(value) for name, value in values.items()}
-            if isinstance(values, dict)
-            else values
-        )
+        return _immutable(values) if isinstance(values, dict) else values
 
     @classmethod
     def read(cls: type[_T], values: Any, key: str) -> _T:

@@ -31,16 +31,16 @@ class BatchBuilder:
         """Samples with equal numbers of inputs and equal protocols of targets, which may be none. ``size``,
         ``target_size``: (height, width) of inputs and targets (None: those of the photographs)."""
         inputs = [_views(self.inputs, s.subject, s.inputs, self.depths, size) for s in specs]
-        depths = [[view.depth for view in row] for row in inputs]
-        bodies = [self._body(s.subject) for s in specs]
+        bodies = [self.inputs.body(s.subject) for s in specs]
+        known = all(body is not None for body in bodies)
         return Batch(
             images=_images(inputs),
-            masks=_stack([[view.mask for view in row] for row in inputs]),
+            masks=_stacked(inputs, "mask"),
             cameras=_cameras(inputs),
             targets=self._targets(specs, target_size) if specs[0].targets else None,
-            body_vertices=None if any(body is None for body in bodies) else bodies,
-            depths=_stack_known(depths),
-            alpha=_stack_known([[view.alpha for view in row] for row in inputs]),
+            body_vertices=list(map(torch.from_numpy, bodies)) if known else None,
+            depths=_stacked(inputs, "depth"),
+            alpha=_stacked(inputs, "alpha"),
             subjects=tuple(s.subject for s in specs),
             views=tuple(tuple(map(photo_name, s.inputs)) for s in specs),
         )
@@ -49,15 +49,11 @@ class BatchBuilder:
         views = [_views(self.targets, s.subject, s.targets, False, size) for s in specs]
         return Targets(
             images=_images(views),
-            masks=_stack([[view.mask for view in row] for row in views]),
+            masks=_stacked(views, "mask"),
             cameras=_cameras(views),
             names=tuple(tuple(map(photo_name, s.targets)) for s in specs),
             protocols=specs[0].protocols,
         )
-
-    def _body(self, name: str) -> Tensor | None:
-        vertices = self.inputs.body(name)
-        return None if vertices is None else torch.from_numpy(vertices)
 
 
 def _views(
@@ -67,27 +63,19 @@ def _views(
 
 
 def _images(views: list[list[View]]) -> Tensor:
-    images = _stack([[view.image for view in row] for row in views])
-    return images.permute(0, 1, 4, 2, 3).float() / 255
+    return _stacked(views, "image").permute(0, 1, 4, 2, 3).float() / 255
 
 
-def _stack(arrays: list[list[np.ndarray]]) -> Tensor:
+def _stacked(views: list[list[View]], name: str) -> Tensor | None:
+    """An array of all views; None where one is not known."""
+    arrays = [[getattr(view, name) for view in row] for row in views]
+    if any(array is None for row in arrays for array in row):
+        return None
     return torch.from_numpy(np.stack([np.stack(row) for row in arrays]))
 
 
-def _stack_known(arrays: list[list[np.ndarray | None]]) -> Tensor | None:
-    """None where one is not known."""
-    return None if any(array is None for row in arrays for array in row) else _stack(arrays)
-
-
 def _cameras(views: list[list[View]]) -> Cameras:
-    height, width = views[0][0].mask.shape
-    return Cameras(
-        intrinsics=_stack([[view.intrinsics for view in row] for row in views]),
-        extrinsics=_stack([[view.extrinsics for view in row] for row in views]),
-        height=height,
-        width=width,
-    )
+    return Cameras(*(_stacked(views, name) for name in ("intrinsics", "extrinsics")), *views[0][0].mask.shape)
 
 
 @dataclass(frozen=True)

@@ -218,12 +218,9 @@ def cut(batch: Batch, chance: float, rngs: list[np.random.Generator]) -> Batch:
     targets = batch.targets
     if targets is not None:
         lower = _rows(targets.masks, np.broadcast_to(ends[:, None], targets.masks.shape[:2]))
-        targets = dataclasses.replace(
-            targets,
-            images=_lowered(targets.images, lower),
-            masks=_lowered(targets.masks, lower),
-            cameras=_with_lower_centers(targets.cameras, lower),
-        )
+        moved = {name: _lowered(getattr(targets, name), lower) for name in ("images", "masks")}
+        cameras = _with_lower_centers(targets.cameras, lower)
+        targets = dataclasses.replace(targets, **moved, cameras=cameras)
     return dataclasses.replace(
         batch, **maps, cameras=_with_lower_centers(batch.cameras, rows), targets=targets
     )

@@ -227,7 +227,10 @@ class Layout(Reader):
             if matte.dtype != np.uint8:
                 raise InputError(f"{path}: expected 8 bits of grey; found {matte.dtype}")
             require(matte.any() or not mask.any(), str(path), "shares above 0 at the subject", "0 everywhere")
-        intrinsics, extrinsics = _read_camera(self._folder(name, "parm", position), view)
+        path = self._folder(name, "parm", position) / f"{view}_intrinsic.npy"
+        intrinsics = check_intrinsics(path, read_array(path, [(3, 3)]))
+        path = path.with_name(f"{view}_extrinsic.npy")
+        extrinsics = check_extrinsics(path, read_array(path, [(3, 4), (4, 4)]))
         intrinsics[:2, 2] += self._shift
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
         return View(
@@ -246,13 +249,6 @@ class Layout(Reader):
 def position_name(name: str, position: int) -> str:
     """Name of the folders of a subject's ring position."""
     return f"{name}_{position:03d}"
-
-
-def _read_camera(folder: Path, view: int) -> tuple[np.ndarray, np.ndarray]:
-    path = folder / f"{view}_intrinsic.npy"
-    intrinsics = check_intrinsics(path, read_array(path, [(3, 3)]))
-    path = folder / f"{view}_extrinsic.npy"
-    return intrinsics, check_extrinsics(path, read_array(path, [(3, 4), (4, 4)]))
 
 
 def _positions(images: Path) -> dict[str, list[int]]:

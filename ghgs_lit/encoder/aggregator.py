@@ -42,11 +42,6 @@ class Aggregator(nn.Module):
 
         self.frame_blocks, self.global_blocks = blocks(), blocks()
 
-    def special_tokens(self, views: int) -> Float[Tensor, "v s c"]:
-        """Camera and register tokens: number 0 for the first view, number 1 for all others."""
-        tokens = torch.cat((self.camera_token, self.register_token), dim=2)[0]
-        return torch.cat((tokens[:1], tokens[1:].expand(views - 1, -1, -1)))
-
     def forward(
         self, images: Float[Tensor, "b v i H W"], kept: KeptPatches
     ) -> tuple[list[Pair], Float[Tensor, "N c"]]:
@@ -55,15 +50,16 @@ class Aggregator(nn.Module):
         entered. ``kept``: the patches that take part; all others are as if they did not exist."""
         b, v = images.shape[:2]
         patches = self.patch_embed(images.flatten(0, 1), kept)
-        special = self.special_tokens(v).to(patches.dtype).repeat(b, 1, 1)
+        # Camera and register tokens: number 0 for the first view, number 1 for all others.
+        tokens = torch.cat((self.camera_token, self.register_token), dim=2)[0]
+        special = torch.cat((tokens[:1], tokens[1:].expand(v - 1, -1, -1)))
+        special = special.to(patches.dtype).repeat(b, 1, 1)
         x = kept.join(special, patches)
         rotary = rotary_tables(kept.positions(self.special), self.head_width, x)
         inside, across = kept.lengths(self.special), kept.element_lengths(self.special)
 
-        pairs = []
-        for i, (frame_block, global_block) in enumerate(
-            zip(self.frame_blocks, self.global_blocks, strict=True)
-        ):
+        pairs, blocks = [], zip(self.frame_blocks, self.global_blocks, strict=True)
+        for i, (frame_block, global_block) in enumerate(blocks):
             frame = run_block(frame_block, x, inside, self.checkpointing, rotary)
             x = run_block(global_block, frame, across, self.checkpointing, rotary)
             if i in self.layers:

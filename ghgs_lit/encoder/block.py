@@ -1,4 +1,4 @@
-"""Pre-norm transformer block with LayerScale: the ViT's, and the aggregator's with normalised, rotated q and k.
+"""Pre-norm transformer block with LayerScale: the ViT's, and the aggregator's with normed, rotated q and k.
 
 The rotary position embedding (RoPE) has two dimensions: half of a head turns with the row, half with the
 column. Angles are float32 or wider for tokens of any precision: rounding an angle to bfloat16 would change

@@ -54,11 +54,8 @@ class ConvStem(nn.Module):
         self.patch_size = patch_size
         layers, rest, outputs = [], patch_size, min(channels, width)
         while rest % 2 == 0:
-            layers += [
-                nn.Conv2d(in_channels, outputs, 3, stride=2, padding=1),
-                ChannelNorm(outputs),
-                nn.GELU(),
-            ]
+            halving = nn.Conv2d(in_channels, outputs, 3, stride=2, padding=1)
+            layers += [halving, ChannelNorm(outputs), nn.GELU()]
             in_channels, outputs, rest = outputs, min(2 * outputs, width), rest // 2
         self.reduce = nn.Sequential(*layers, nn.Conv2d(in_channels, width, rest, stride=rest))
         self.mix_norm = ChannelNorm(width)

@@ -98,15 +98,9 @@ class ModelMethod:
         gaussians, depth = prediction.gaussians, prediction.depth
         if self.refinement is not None:
             gaussians, depth = self.refinement(gaussians, batch), None
-        rendering = self.renderer(gaussians, batch.targets.cameras)
-        return Estimate(
-            rendering.image,
-            depth,
-            prediction.depth_valid,
-            prediction.gaussians.splits,
-            not_finite(batch, prediction),
-            prediction.decisions,
-        )
+        image, valid = self.renderer(gaussians, batch.targets.cameras).image, prediction.depth_valid
+        counts = prediction.gaussians.splits, not_finite(batch, prediction)
+        return Estimate(image, depth, valid, *counts, prediction.decisions)
 
 
 def not_finite(batch: Batch, prediction: Prediction) -> tuple[int, ...]:

@@ -35,10 +35,6 @@ class Padding:
         """Maps without their border."""
         return F.pad(maps, [-side for side in self._sides(maps)])
 
-    def pad_bounds(self, bounds: DepthBounds | None) -> DepthBounds | None:
-        """Bounds of the padded images; in the border they are depths without a meaning."""
-        return None if bounds is None else DepthBounds(self.pad(bounds.near, 1.0), self.pad(bounds.far, 1.0))
-
     def pad_batch(self, batch: Batch) -> "PaddedBatch":
         """The batch as if every input had been photographed with the border; targets stay."""
         kept = {field.name: getattr(batch, field.name) for field in dataclasses.fields(Batch)}
@@ -91,7 +87,8 @@ def bounds_of(stage: Callable[[Batch], DepthBounds | None], batch: Batch) -> Dep
     """Bounds of all pixels, from the photographs themselves: a border invents something at their edge."""
     if not isinstance(batch, PaddedBatch):
         return stage(batch)
-    return batch.padding.pad_bounds(stage(batch.photographs))
+    bounds = stage(batch.photographs)  # in the border they are depths without a meaning
+    return bounds and map_tensors(bounds, lambda depths: batch.padding.pad(depths, 1.0))
 
 
 def pad_to_patches(masks: Bool[Tensor, "B V H W"], multiple: int) -> Padding | None:

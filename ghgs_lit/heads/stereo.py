@@ -81,7 +81,8 @@ class StereoHead(nn.Module):
 
     def _fraction(self, batch: Batch, near: Tensor, far: Tensor) -> Float[Tensor, "n h w"]:
         """Share of the way from near to far of each pixel, with those that fill the last cells."""
-        images = whole_cells(torch.cat((surface_colors(batch), coverage(batch)[:, :, None]), 2))
+        images = torch.cat((surface_colors(batch), coverage(batch)[:, :, None]), 2)
+        images = F.pad(images, (0, -images.shape[-1] % CELL, 0, -images.shape[-2] % CELL))  # whole cells
         maps = self.features(images.flatten(0, 1).nan_to_num().to(self.features[0].weight.dtype))
         features, memory, context = maps.chunk(3, 1)
         features = at_least_float32(features).unflatten(0, batch.masks.shape[:2])
@@ -137,12 +138,6 @@ class Update(nn.Module):
         # The last projection stays in float32 under autocast: a step of inverse depth is centimetres.
         with exact(hidden.device.type):
             return memory, at_least_float32(last(hidden.to(last.weight.dtype)))
-
-
-def whole_cells(maps: Float[Tensor, "*n h w"]) -> Float[Tensor, "*n h2 w2"]:
-    """Maps with zeros below and to the right, up to the next multiple of a cell's side."""
-    height, width = maps.shape[-2:]
-    return F.pad(maps, (0, -width % CELL, 0, -height % CELL))
 
 
 def subject_range(

@@ -18,13 +18,8 @@ _SMALL, _LARGE, _PIXELS = 1 << 21, 1 << 24, 20480
 _COPY = 1 << 20
 
 
-def _has_wide_products() -> bool:
-    backends = torch.backends
-    capability = backends.cpu.get_cpu_capability()
-    return backends.mkl.is_available() and backends.mkldnn.is_available() and capability == "AVX512"
-
-
-_WIDE_PRODUCTS = _has_wide_products()
+_WIDE_PRODUCTS = torch.backends.mkl.is_available() and torch.backends.mkldnn.is_available()
+_WIDE_PRODUCTS = _WIDE_PRODUCTS and torch.backends.cpu.get_cpu_capability() == "AVX512"
 
 
 def prefers_onednn(x: Tensor, weight: Tensor) -> bool:

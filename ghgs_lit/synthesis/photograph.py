@@ -19,7 +19,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from ghgs_lit.errors import InputError, require
-from ghgs_lit.synthesis.people.mesh import Person, TexturedMesh, sample_texture
+from ghgs_lit.synthesis.people.mesh import Person, sample_texture
 from ghgs_lit.synthesis.people.meshing import smooth_normals
 from ghgs_lit.types import Cameras
 
@@ -103,14 +103,6 @@ class Photographs:
         return self.alphas >= 0.5
 
 
-def _check_part(name: str, part: TexturedMesh) -> None:
-    """Refuse what :class:`TexturedMesh` does not check and Embree would render wrongly."""
-    if part.texture.dtype != np.uint8:
-        raise InputError(f"{name}: expected a texture of uint8; found {part.texture.dtype}")
-    if not np.isfinite(part.vertices).all() or not np.isfinite(part.uv).all():
-        raise InputError(f"{name}: expected finite vertices and texture coordinates; found NaN or infinity")
-
-
 class Studio:
     """A person under fixed lights, photographed from any number of cameras.
 
@@ -124,8 +116,12 @@ class Studio:
         parts = [part for part in person.parts if len(part.faces)]
         if not parts:
             raise InputError(f"{person.name}: expected a mesh with faces; found none")
-        for part in parts:
-            _check_part(person.name, part)
+        for part in parts:  # what TexturedMesh does not check and Embree would render wrongly
+            if part.texture.dtype != np.uint8:
+                raise InputError(f"{person.name}: expected a texture of uint8; found {part.texture.dtype}")
+            if not np.isfinite(part.vertices).all() or not np.isfinite(part.uv).all():
+                expected = "finite vertices and texture coordinates"
+                raise InputError(f"{person.name}: expected {expected}; found NaN or infinity")
         self.lights, self.samples = lights, samples
         counts = np.cumsum([0] + [len(part.vertices) for part in parts])
         self._vertices = np.concatenate([part.vertices for part in parts]).astype(np.float32)
@@ -153,12 +149,10 @@ class Studio:
         images, depths = np.zeros((*size, 3), np.float32), np.zeros(size, np.float32)
         alphas = np.zeros(size, np.float32)
         for n, (matrix, pose) in enumerate(zip(intrinsics, extrinsics, strict=True)):
-            if not (
-                np.isfinite(matrix).all() and np.isfinite(pose).all() and min(matrix[0, 0], matrix[1, 1]) > 0
-            ):
-                raise InputError(
-                    f"camera {n}: expected finite values and focal lengths above 0; found {matrix.tolist()}"
-                )
+            is_finite = np.isfinite(matrix).all() and np.isfinite(pose).all()
+            expected = "finite values and focal lengths above 0"
+            is_right = bool(is_finite and min(matrix[0, 0], matrix[1, 1]) > 0)
+            require(is_right, f"camera {n}", expected, matrix.tolist())
             top, bottom, left, right = self._window(matrix, pose, *size[1:])
             step = max(1, _CHUNK // max(1, (right - left) * self.samples**2))
             for row in range(top, bottom, step):

@@ -52,13 +52,8 @@ class RunProgress(ProgressBar):
         self._last = (time.monotonic(), trainer.global_step, pl_module.used_budget)
         if not bar:
             return
-        columns = (
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[text]}"),
-        )
-        self._bar = Progress(TextColumn("training"), *columns)
+        columns = BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+        self._bar = Progress(TextColumn("training"), *columns, TextColumn("{task.fields[text]}"))
         self._bar.start()
         self._task = self._bar.add_task("training", total=1.0, text="")
 

@@ -14,19 +14,9 @@ from ghgs_lit.kernels.watching import Mark, seconds_between, time_mark
 
 #: Parts of a step in their order.
 PARTS = (
-    "data",
-    "interval",
-    "encode",
-    "depth",
-    "unproject",
-    "recalibrate",
-    "gaussians",
-    "rounds",
-    "render",
-    "loss",
-    "backward",
-    "optimizer",
-)
+    "data", "interval", "encode", "depth", "unproject", "recalibrate", "gaussians", "rounds", "render",
+    "loss", "backward", "optimizer",
+)  # fmt: skip
 
 
 class StepClock:

@@ -166,13 +166,8 @@ class Optimization(Options):
             known = any(name.startswith(prefix) for name in names)
             require(known, f"optimizer.freeze_until.{prefix}", "the beginning of a parameter's name", prefix)
         parameters = [p for p in model.parameters() if p.requires_grad]
-        options = {
-            "lr": self.lr,
-            "betas": self.betas,
-            "eps": EPS,
-            "weight_decay": self.weight_decay,
-            "fused": fused,
-        }
+        options = {name: getattr(self, name) for name in ("lr", "betas", "weight_decay")}
+        options |= {"eps": EPS, "fused": fused}
         if self.matrix_scale is None:
             return torch.optim.AdamW(parameters, **options)
         return Muon(parameters, matrix_lr=self.matrix_scale * self.lr, **options)

@@ -29,23 +29,15 @@ def replay(path: str | Path) -> tuple[int, str, Fault | None]:
     model = GHGS.from_config(config)
     # Not checked for fit to be finite: the weights may be what is at fault.
     model.load_state_dict(content["state_dict"], assign=True)
-    module = GHGSModule(
-        model,
-        build(config["renderer"], "renderer"),
-        build(config["loss"], "loss"),
-        build(config["optimizer"], "optimizer"),
-        config,
-    ).train()
+    parts = (build(config[group], group) for group in ("renderer", "loss", "optimizer"))
+    module = GHGSModule(model, *parts, config).train()
     return content["global_step"], content["fault"], first_fault(module, _step(content["step"]))
 
 
 def _step(values: Mapping[str, Any]) -> Step:
     autocast = getattr(torch, values["autocast"]) if values["autocast"] else None
-    return Step(**{**values, "batch": _batch(values["batch"]), "autocast": autocast})
-
-
-def _batch(values: Mapping[str, Any]) -> Batch:
-    targets = values["targets"]
+    batch, targets = values["batch"], values["batch"]["targets"]
     if targets is not None:
         targets = Targets(**{**targets, "cameras": Cameras(**targets["cameras"])})
-    return Batch(**{**values, "cameras": Cameras(**values["cameras"]), "targets": targets})
+    batch = Batch(**{**batch, "cameras": Cameras(**batch["cameras"]), "targets": targets})
+    return Step(**{**values, "batch": batch, "autocast": autocast})

@@ -44,12 +44,8 @@ def read_annotations(path: Path) -> Annotations:
     counts = {key: len(values) for key, values in lists.items()}
     if len(set(counts.values())) != 1 or not counts["K"]:
         raise InputError(f"{path}: expected as many K, D, R and T in cams as cameras; found {counts}")
-    extrinsics = np.stack(
-        [
-            _extrinsics(f"{path}: camera {k}", *rt)
-            for k, rt in enumerate(zip(lists["R"], lists["T"], strict=True))
-        ]
-    )
+    poses = enumerate(zip(lists["R"], lists["T"], strict=True))
+    extrinsics = np.stack([_extrinsics(f"{path}: camera {k}", *pose) for k, pose in poses])
     centers = -np.einsum("nji,nj->ni", extrinsics[:, :3, :3], extrinsics[:, :3, 3])
     spread = np.linalg.norm(centers - centers[0], axis=-1).max()
     if len(centers) > 1 and spread < _NEAREST:
@@ -57,10 +53,9 @@ def read_annotations(path: Path) -> Annotations:
             f"{path}: expected translations T in millimetres; found cameras within {spread * 1000:.0f} mm of "
             "one another (metres?)"
         )
+    lenses = [check_intrinsics(f"{path}: K of camera {k}", m) for k, m in enumerate(lists["K"])]
     return Annotations(
-        intrinsics=np.stack(
-            [check_intrinsics(f"{path}: K of camera {k}", m) for k, m in enumerate(lists["K"])]
-        ),
+        intrinsics=np.stack(lenses),
         distortions=tuple(_distortion(f"{path}: D of camera {k}", d) for k, d in enumerate(lists["D"])),
         extrinsics=extrinsics,
         frames=tuple(_frame(path, f, entry, counts["K"]) for f, entry in enumerate(ims)),

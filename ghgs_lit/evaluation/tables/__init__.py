@@ -7,16 +7,6 @@ from ghgs_lit.evaluation.tables.records import read_others, read_sweep
 from ghgs_lit.evaluation.tables.writers import PREAMBLE, to_csv, to_latex, to_markdown, to_terminal
 
 __all__ = [
-    "LAYOUTS",
-    "PREAMBLE",
-    "PairedTest",
-    "Table",
-    "TableOptions",
-    "build_tables",
-    "read_others",
-    "read_sweep",
-    "to_csv",
-    "to_latex",
-    "to_markdown",
-    "to_terminal",
-]
+    "LAYOUTS", "PREAMBLE", "PairedTest", "Table", "TableOptions", "build_tables", "read_others", "read_sweep",
+    "to_csv", "to_latex", "to_markdown", "to_terminal",
+]  # fmt: skip

@@ -25,13 +25,8 @@ def fill(table: Table, figures: Sequence[Mapping[str, Any]]) -> None:
     values = values[values["source"] == values.groupby(cell_and_seed)["source"].transform("first")]
     seeds = values.groupby(cell_and_seed, sort=False)
     seeds = seeds.agg(mean=("value", "mean"), count=("count", "first"), run=("run", "first")).reset_index()
-    cells = seeds.groupby(CELL).agg(
-        mean=("mean", "mean"),
-        deviation=("mean", "std"),
-        seeds=("seed", tuple),
-        count=("count", "first"),
-        runs=("run", " ".join),
-    )
+    means = {"mean": ("mean", "mean"), "deviation": ("mean", "std"), "seeds": ("seed", tuple)}
+    cells = seeds.groupby(CELL).agg(**means, count=("count", "first"), runs=("run", " ".join))
     reported = pd.DataFrame(figures, columns=[*CELL, "mean"]).set_index(CELL)
     every = pd.MultiIndex.from_product([range(len(table.lines)), *_columns(table)], names=CELL)
     table.cells = cells.reindex(every)
@@ -54,13 +49,9 @@ def _values(table: Table) -> pd.DataFrame:
     lines = {line.variant: i for i, line in enumerate(table.lines) if not line.is_reported}
     numbers = {(g.views, g.data): i for i, g in enumerate(table.groups)}
     rows, facts = table.rows, ["line", "group", "seed", "source", "run", "subject"]
-    rows = rows.assign(
-        line=[lines[variant] for variant in rows["variant"]],
-        group=[
-            numbers.get((views, None), numbers.get((views, data_title(data)), -1))
-            for views, data in zip(rows["views"], rows["data"], strict=True)
-        ],
-    )
+    about = zip(rows["views"], rows["data"], strict=True)
+    groups = [numbers.get((n, None), numbers.get((n, data_title(data)), -1)) for n, data in about]
+    rows = rows.assign(line=[lines[variant] for variant in rows["variant"]], group=groups)
     rows = rows[rows["group"] >= 0]
     size = rows.groupby(["line", "group", "seed", "source"])["line"].transform("size")
     rows = rows.assign(count=rows.get("count", size).fillna(size), run=rows["run"].fillna(rows["source"]))
@@ -97,12 +88,9 @@ def _lacking(table: Table, cell: Any) -> tuple[int, ...]:
     line, group = table.lines[line], table.groups[group]
     if not line.is_ours or not isinstance(cell.seeds, tuple):
         return ()
-    planned = {
-        p.seed
-        for p in table.planned
-        if p.variant == line.variant and group.data in (None, data_title(p.data))
-    }
-    return tuple(sorted(planned - set(cell.seeds)))
+    planned = (p for p in table.planned if p.variant == line.variant)
+    seeds = {p.seed for p in planned if group.data in (None, data_title(p.data))}
+    return tuple(sorted(seeds - set(cell.seeds)))
 
 
 def _competing(table: Table, column: tuple) -> pd.Series:

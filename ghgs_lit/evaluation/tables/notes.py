@@ -3,7 +3,7 @@
 import pandas as pd
 
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, reported_source
-from ghgs_lit.evaluation.tables.records import Planned, differing, differing_text
+from ghgs_lit.evaluation.tables.records import differing, differing_text
 from ghgs_lit.evaluation.tables.significance import needed_errors
 
 FOOTNOTE = (
@@ -140,24 +140,20 @@ def _about_seeds(table: Table) -> list[str]:
     return [f"Rows are of different seeds ({'; '.join(rows)})."]
 
 
-def _run_name(planned: Planned) -> str:
-    variant = planned.variant
-    return f"{data_title(planned.data)} {variant.model} {variant.ablation} seed {planned.seed}"
-
-
 def _about_runs(table: Table) -> list[str]:
     """Runs that are unfinished, that differ in settings, or that are of different states of the code."""
     said = []
     if table.measured["lacking"].map(bool).any():
         said.append("(2/3): from 2 of 3 seeds; the others have no results yet.")
-    unfinished = list(dict.fromkeys(_run_name(p) for p in table.planned if not p.done))
+    runs = ((p, p.variant) for p in table.planned if not p.done)
+    names = (f"{data_title(p.data)} {v.model} {v.ablation} seed {p.seed}" for p, v in runs)
+    unfinished = list(dict.fromkeys(names))
     if unfinished:
         more = f" and {len(unfinished) - 4} more" if len(unfinished) > 4 else ""
         said.append(f"No results yet (in progress or cut off): {'; '.join(unfinished[:4])}{more}.")
     groups: dict[tuple, list] = {}
-    for source, variant, data in (
-        _of(table.rows, "model")[["source", "variant", "data"]].drop_duplicates().values
-    ):
+    ours = _of(table.rows, "model")[["source", "variant", "data"]].drop_duplicates()
+    for source, variant, data in ours.values:
         row = (variant.model, variant.encoder, variant.switches, data)
         groups.setdefault(() if table.layout.rows == "ablation" else row, []).append(table.configs[source])
     keys = {key: values for group in groups.values() for key, values in differing(group).items()}

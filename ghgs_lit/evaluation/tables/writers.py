@@ -103,11 +103,8 @@ def _terminal(table: Table, numbers: pd.DataFrame) -> str:
 
 def to_csv(tables: Sequence[Table]) -> str:
     """All cells with all digits, one for each line; the mean is empty where a run is missing."""
-    lines = [
-        _line(number, table, cell)
-        for number, table in enumerate(tables, 1)
-        for cell in table.cells.itertuples()
-    ]
+    pairs = [(n, table, cell) for n, table in enumerate(tables, 1) for cell in table.cells.itertuples()]
+    lines = [_line(*each) for each in pairs]
     frame = pd.DataFrame(lines, columns=COLUMNS)
     frame = frame.astype(dict.fromkeys(("subjects", "test_seeds", "test_subjects"), "Int64"))
     return frame.to_csv(index=False, lineterminator="\n")
