@@ -9,11 +9,13 @@ from pathlib import Path
 
 import llvmlite.binding
 import numba
-from numba.core import event
+from numba.core import event, types
 from numba.core.caching import FunctionCache
 
 # Kernels are called from Python only and helpers from kernels only, so no other entry point is compiled.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+#: Arguments of kernels: contiguous arrays of float32 by their number of dimensions, and whole numbers.
+FLOATS, NUMBER = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)], types.int64
 
 
 class _Cache(FunctionCache):
@@ -79,15 +81,23 @@ def kernel(function):
     return compiled
 
 
-def kernel_for(function, *argument_types):
-    """:func:`kernel` for one signature, compiled or read from the cache now.
+def kernel_for(*argument_types):
+    """A decorator: calls without arguments give the :func:`kernel` for one signature, compiled at the first.
 
     No other signature is compiled later: contiguous arrays would cause another compilation for no gain.
     """
-    compiled = kernel(function)
-    compiled.compile(argument_types)
-    compiled.disable_compile()
-    return compiled
+
+    def decorate(function):
+        @cache
+        def compiled():
+            found = kernel(function)
+            found.compile(argument_types)
+            found.disable_compile()
+            return found
+
+        return compiled
+
+    return decorate
 
 
 def helper(function):

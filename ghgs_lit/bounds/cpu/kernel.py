@@ -1,36 +1,16 @@
 """Votes of the views about cells and about depths along rays, one at a time."""
 
-from functools import cache
-
 import numpy as np
 from numba.core import types
 
 from ghgs_lit.bounds.silhouettes import NEAREST
-from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 
 ZERO, ONE, TWO, LEAST = np.float32(0), np.float32(1), np.float32(2), np.float32(NEAREST)
 
 
-def _array(kind, dimensions):
-    return types.Array(kind, dimensions, "C")
-
-
-FLOATS = [_array(types.float32, dimensions) for dimensions in range(6)]
-VOTES, MASKS = _array(types.uint8, 4), _array(types.boolean, 4)
-NUMBER = types.int64
-
-
-@cache
-def carve_slices():
-    """The compiled :func:`_carve_slices`."""
-    return kernel_for(_carve_slices, VOTES, FLOATS[4], FLOATS[3], MASKS, *[NUMBER] * 4)
-
-
-@cache
-def march_rows():
-    """The compiled :func:`_march_rows`."""
-    maps = (VOTES, MASKS, FLOATS[4], FLOATS[5], FLOATS[3], FLOATS[4], FLOATS[4], FLOATS[1])
-    return kernel_for(_march_rows, *maps, *[NUMBER] * 5)
+VOTES, MASKS = (types.Array(kind, 4, "C") for kind in (types.uint8, types.boolean))
+_MAPS = (VOTES, MASKS, FLOATS[4], FLOATS[5], FLOATS[3], FLOATS[4], FLOATS[4], FLOATS[1])
 
 
 @helper
@@ -46,7 +26,8 @@ def _vote(table, x, y, w):
     return table[np.uint64(np.int64(row)), np.uint64(np.int64(column))]
 
 
-def _carve_slices(outside, matrices, position, kept, tolerance, element, first, last):
+@kernel_for(VOTES, FLOATS[4], FLOATS[3], MASKS, *[NUMBER] * 4)
+def carve_slices(outside, matrices, position, kept, tolerance, element, first, last):
     """Write slices ``first`` to ``last`` of ``kept[element]``; see :func:`ghgs_lit.bounds.cpu.carve`."""
     views, cells = outside.shape[1], position.shape[2]
     line = np.empty((views, 3), np.float32)
@@ -90,7 +71,8 @@ def _product(row, vector):
     return row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2]
 
 
-def _march_rows(
+@kernel_for(*_MAPS, *[NUMBER] * 5)
+def march_rows(
     outside, masks, matrices, directions, centers, near, far, steps, tolerance, element, view, first, last
 ):
     """Change the bounds of rows ``first`` to ``last`` of a view; see :func:`ghgs_lit.bounds.cpu.march`."""

@@ -4,14 +4,13 @@ Powers of 2 replace the exponential: ``exp(x) = 2^(x log2 e)``.
 """
 
 import math
-from functools import cache
 
 import numpy as np
 from numba.core import types
 
 from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.compile import NUMBER, helper, kernel_for
 from ghgs_lit.kernels.layers import PANEL, ROWS, make_product, product
 from ghgs_lit.kernels.simd import EXP2_LIMIT
 
@@ -21,10 +20,11 @@ LOWEST = np.float32(-np.inf)
 add_values = make_product((KEYS, 1), adds=True)
 
 
-def _attend_head(q, k, v, out, first, last):
+@kernel_for(*[types.Array(types.float32, 2, "A")] * 4, NUMBER, NUMBER)
+def attend_head(q, k, v, out, first, last):
     """Write ``softmax(q k^T / sqrt(d)) v`` of queries ``first`` to ``last`` to ``out``.
 
-    Every matrix is [tokens, d], ``d`` a multiple of 32.
+    Every matrix is [tokens, d] with any strides, ``d`` a multiple of 32.
     """
     tokens, width = k.shape
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
@@ -51,13 +51,6 @@ def _attend_head(q, k, v, out, first, last):
                 _add_values(weights, values, key, seen, totals, row, width)
         for r in range(count):
             _finish(out[start + r], sums, totals, r, width)
-
-
-@cache
-def attend_head():
-    """The kernel for matrices with any strides."""
-    matrix = types.Array(types.float32, 2, "A")
-    return kernel_for(_attend_head, matrix, matrix, matrix, matrix, types.int64, types.int64)
 
 
 @helper

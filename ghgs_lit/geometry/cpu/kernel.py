@@ -1,7 +1,6 @@
 """The plane sweep of 16 pixels of four channels at once (see :mod:`ghgs_lit.geometry.photo_consistency`)."""
 
 import math
-from functools import cache
 
 import numpy as np
 from llvmlite import ir
@@ -9,7 +8,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.kernels.memory import pointer_to
 from ghgs_lit.kernels.simd import EXP2_LIMIT, I32, LANES, everywhere, floats, indices
 
@@ -90,28 +89,12 @@ def store_places(typing_context, places, at, row, column, line):
 
 ZERO, HALF, ONE, THREE = (np.float32(x) for x in (0, 0.5, 1, 3))
 
-FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
-PIXELS, PAIRS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
-MASKS = types.Array(types.boolean, 3, "C")
-NUMBER = types.int64
+PIXELS, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
+_SWEPT = (FLOATS[1], PIXELS, FLOATS[1], FLOATS[1], FLOATS[5], FLOATS[4], MASKS, FLOATS[1])
 
 
-@cache
-def smooth_rows():
-    """The compiled :func:`_smooth_rows`."""
-    return kernel_for(_smooth_rows, FLOATS[4], MASKS, FLOATS[1], NUMBER, NUMBER, NUMBER)
-
-
-@cache
-def sweep_pixels():
-    """The compiled :func:`_sweep_pixels`."""
-    rows = (PIXELS, FLOATS[1], FLOATS[1])
-    views = (FLOATS[5], FLOATS[4], PAIRS)
-    numbers = [NUMBER] * 5
-    return kernel_for(_sweep_pixels, FLOATS[1], *rows, *views, FLOATS[1], types.float32, FLOATS[2], *numbers)
-
-
-def _smooth_rows(photo, masks, out, image, first, last):
+@kernel_for(FLOATS[4], MASKS, FLOATS[1], NUMBER, NUMBER, NUMBER)
+def smooth_rows(photo, masks, out, image, first, last):
     """Write rows ``first`` to ``last`` of ``image``; see :func:`ghgs_lit.geometry.cpu.padded`."""
     height, width = masks.shape[1], masks.shape[2]
     for row in range(first, last):
@@ -181,23 +164,11 @@ def _load_pixels(colors, pixels, near, far, start, last, height, width, begin, v
             own[lane * CHANNELS + channel] = colors[at + channel]
 
 
-def _sweep_pixels(
-    colors,
-    pixels,
-    near,
-    far,
-    turn,
-    shift,
-    compared,
-    shares,
-    tolerance,
-    out,
-    height,
-    width,
-    image,
-    first,
+@kernel_for(*_SWEPT, types.float32, FLOATS[2], *[NUMBER] * 5)
+def sweep_pixels(
+    colors, pixels, near, far, turn, shift, compared, shares, tolerance, out, height, width, image, first,
     last,
-):
+):  # fmt: skip
     """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
     views = turn.shape[1]
     element, view = image // views, image % views

@@ -5,7 +5,6 @@ networks of three layers, of ``PANEL`` rows at once (see :mod:`ghgs_lit.kernels.
 """
 
 import math
-from functools import cache
 
 import numpy as np
 from numba.core import types
@@ -13,7 +12,7 @@ from numba.core import types
 from ghgs_lit.heads.activations import SIGMOID_LIMIT, TANH_LIMIT
 from ghgs_lit.heads.surface import OTHER, SAME
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.kernels.layers import PANEL, bend, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.simd import EXP2_LIMIT, LANES
 
@@ -26,19 +25,10 @@ FAR, RANGE = np.float32(OTHER), np.float32(OTHER - SAME)
 OFFSET, SCALE, ROTATION, OPACITY, COLOR = 0, 3, 6, 10, 11
 DEPTH, POINT, PHOTO, SHARE, AROUND, LINES = 14, 15, 18, 21, 22, 26
 
-FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(5)]
 PLACES, MASKS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 3, "C")
-
-
-@cache
-def activate():
-    """The compiled :func:`_activate`."""
-    raw = [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], PLACES]
-    maps = [FLOATS[3], MASKS, FLOATS[4], FLOATS[4], FLOATS[3], FLOATS[3], FLOATS[2]]
-    out = [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
-    return kernel_for(
-        _activate, *raw, *maps, types.UniTuple(types.float32, 9), types.boolean, *out, *[types.int64] * 3
-    )
+FLAGS, _EACH = types.Array(types.boolean, 1, "C"), [FLOATS[2], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2]]
+_MAPS = [FLOATS[3], MASKS, FLOATS[4], FLOATS[4], FLOATS[3], FLOATS[3], FLOATS[2]]
+_CONSTANTS = (types.UniTuple(types.float32, 9), types.boolean)
 
 
 @helper
@@ -152,7 +142,8 @@ def _read(
         values[SHARE * LANES + lane] = share[image, row, column] if len(share) > 0 else ONE
 
 
-def _activate(
+@kernel_for(*_EACH, PLACES, *_MAPS, *_CONSTANTS, *_EACH, NUMBER, NUMBER, NUMBER)
+def activate(
     offset, scale, rotation, opacity, color, pixel, depth, valid, points, photo, share, intrinsics, turns,
     constants, on_surface, means, quaternions, scales, opacities, colors, image, first, last,
 ):  # fmt: skip
@@ -203,16 +194,6 @@ def _activate(
             opacities[start + lane] = values[OPACITY * LANES + lane]
 
 
-TABLE, FLAT = types.Array(types.float32, 2, "C"), types.Array(types.float32, 1, "C")
-WIDTHS, FLAGS = types.Array(types.int64, 1, "C"), types.Array(types.boolean, 1, "C")
-
-
-@cache
-def attributes():
-    """The compiled :func:`_attributes`."""
-    return kernel_for(_attributes, TABLE, FLAT, WIDTHS, FLAGS, TABLE, types.int64, types.int64)
-
-
 @helper
 def _bend_or_rectify(bends, layers, at, outputs, inputs, values):
     """Add biases; then tanh where ``bends``, else ReLU."""
@@ -222,7 +203,8 @@ def _bend_or_rectify(bends, layers, at, outputs, inputs, values):
         rectify(layers, at, outputs, inputs, values)
 
 
-def _attributes(descriptors, layers, widths, bends, out, first, last):
+@kernel_for(FLOATS[2], FLOATS[1], PLACES, FLAGS, FLOATS[2], NUMBER, NUMBER)
+def attributes(descriptors, layers, widths, bends, out, first, last):
     """Write rows ``first`` to ``last``; see :func:`ghgs_lit.heads.cpu.attributes`."""
     channels, wide, narrow = descriptors.shape[1], widths[0], widths[1]
     widest = max(channels, lines(wide), lines(narrow), lines(widths[2:].max())) * PANEL

@@ -1,12 +1,10 @@
 """Gradients of what the rounds remember; values inside are computed again, in the cache."""
 
-from functools import cache
-
 import numpy as np
 from numba.core import types
 
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.kernels.layers import (
     PANEL,
     learn,
@@ -19,16 +17,9 @@ from ghgs_lit.kernels.layers import (
     unrectify,
 )
 from ghgs_lit.kernels.simd import LANES
-from ghgs_lit.rounds.cpu.kernel import FLOATS, ONE, ZERO, see
+from ghgs_lit.rounds.cpu.kernel import ONE, ZERO, see
 
-PLACES = types.Array(types.int64, 2, "C")
-
-
-@cache
-def remember_back():
-    """The compiled :func:`_remember_back`."""
-    rows, layers = [FLOATS[3], *[FLOATS[2]] * 4], [FLOATS[1], FLOATS[1], PLACES, FLOATS[1]]
-    return kernel_for(_remember_back, *rows, *layers, FLOATS[2], *[types.int64] * 2)
+_LAYERS = (FLOATS[1], FLOATS[1], types.Array(types.int64, 2, "C"), FLOATS[1])
 
 
 @helper
@@ -80,7 +71,8 @@ def _look(each, known, before, layers, places, start, count, given, one, two, se
     _layer(layers, places[3, 0], hidden, wide, up, narrow)
 
 
-def _remember_back(
+@kernel_for(FLOATS[3], *[FLOATS[2]] * 4, *_LAYERS, FLOATS[2], NUMBER, NUMBER)
+def remember_back(
     each, known, before, after, slopes, layers, backs, places, sums, d_before, first, last
 ):  # fmt: skip
     """Write ``d_before`` of rows ``first`` to ``last``, add up ``sums``; see :func:`.network.remembered`."""

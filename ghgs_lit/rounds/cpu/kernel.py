@@ -1,40 +1,17 @@
 """What views show of each Gaussian, and what the rounds remember of it."""
 
-from functools import cache
-
 import numpy as np
 from numba.core import types
 
 from ghgs_lit.kernels import memory, simd
-from ghgs_lit.kernels.compile import helper, kernel_for
+from ghgs_lit.kernels.compile import FLOATS, NUMBER, helper, kernel_for
 from ghgs_lit.kernels.layers import PANEL, linear, lines, put_rows, rectify, size
 from ghgs_lit.kernels.simd import LANES
 
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
-FLOATS = [types.Array(types.float32, dimensions, "C") for dimensions in range(6)]
-IMAGES = types.Array(types.int64, 1, "C")
-
-
-@cache
-def answer():
-    """The compiled :func:`_answer`."""
-    return kernel_for(_answer, FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], FLOATS[2], *[types.int64] * 2)
-
-
-@cache
-def observe():
-    """The compiled :func:`_observe`."""
-    gaussians, cameras = (FLOATS[2], FLOATS[2], IMAGES), (FLOATS[4], FLOATS[4])
-    maps = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
-    numbers = (types.float32, FLOATS[3], types.int64, types.int64)
-    return kernel_for(_observe, *gaussians, *cameras, *maps, *numbers)
-
-
-@cache
-def remember():
-    """The compiled :func:`_remember`."""
-    return kernel_for(_remember, FLOATS[3], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], *[types.int64] * 2)
+_SEEN = (FLOATS[2], FLOATS[2], types.Array(types.int64, 1, "C"), FLOATS[4], FLOATS[4])
+_MAPS = (FLOATS[5], FLOATS[4], FLOATS[5], FLOATS[5], FLOATS[5])
 
 
 @helper
@@ -55,7 +32,8 @@ def see(view, hidden, views, shown, seen):
             memory.store(seen, 2 * size + i, most)
 
 
-def _remember(each, known, before, layers, after, first, last):
+@kernel_for(FLOATS[3], FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], NUMBER, NUMBER)
+def remember(each, known, before, layers, after, first, last):
     """Write rows ``first`` to ``last`` of ``after``; see :func:`ghgs_lit.rounds.cpu.remembered`."""
     views, channels, hidden = each.shape[1], each.shape[2], before.shape[1]
     inputs = 4 * hidden + known.shape[1]
@@ -92,7 +70,8 @@ def _remember(each, known, before, layers, after, first, last):
                 after[start + lane, channel] = one[channel * PANEL + lane]
 
 
-def _answer(heard, before, layers, after, change, first, last):
+@kernel_for(FLOATS[2], FLOATS[2], FLOATS[1], FLOATS[2], FLOATS[2], NUMBER, NUMBER)
+def answer(heard, before, layers, after, change, first, last):
     """Write rows ``first`` to ``last``; see :func:`ghgs_lit.rounds.cpu.answered`."""
     channels, hidden, outputs = heard.shape[1], before.shape[1], change.shape[1]
     to_change = size(hidden, channels)
@@ -169,7 +148,8 @@ def _project(camera, pose, x, y, z, height, width, down, across, z_depth):
     return simd.bits(seen & (v >= ZERO) & (v <= np.float32(height)))
 
 
-def _observe(
+@kernel_for(*_SEEN, *_MAPS, types.float32, FLOATS[3], NUMBER, NUMBER)
+def observe(
     means, colors, image, intrinsics, extrinsics, photo, mask, drawn, alpha, depth, near, out, first, last
 ):
     """Write rows ``first`` to ``last``, of one element; see :func:`ghgs_lit.rounds.cpu.observe`."""
