@@ -43,6 +43,7 @@ from ghgs_lit.prediction.export import (
     require_free,
     write_prediction,
 )
+from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
@@ -200,6 +201,11 @@ def advice_of(directory: Path) -> Iterator[str]:
     quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
+    for edge, names in report["cut"].items():
+        yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
+    guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
+    if guessed:
+        yield f"at {', '.join(guessed)} of its height mostly one photograph shows the subject: a guess"
     low, high = min(quality), max(quality)
     if low < LOW_PSNR:
         left = [key for key in ("refine_cameras", "refine_masks") if key not in report]
