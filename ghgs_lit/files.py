@@ -89,7 +89,6 @@ def write_text_atomically(path: str | Path, text: str) -> None:
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Delete temporary files of ``path`` whose process is gone."""
     prefix = f".{path.name}.{socket.gethostname()}."
     for leftover in path.parent.glob(f"{prefix}*.tmp"):
         number = leftover.name.removeprefix(prefix).removesuffix(".tmp")

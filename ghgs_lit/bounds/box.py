@@ -79,7 +79,6 @@ class SubjectBox(Options):
     def _within(
         self, batch: Batch, coarse: Silhouettes, voting: Tensor, lower: Tensor, upper: Tensor
     ) -> DepthBounds:
-        """Bounds in the box from ``lower`` to ``upper``."""
         return self._valid(depths_in_box(batch.cameras, lower, upper))
 
     def _valid(self, bounds: DepthBounds) -> DepthBounds:

@@ -104,7 +104,6 @@ _T = TypeVar("_T", bound="Options")
 
 
 def _text(value: Any) -> Any:
-    """A path of :mod:`pathlib` as text; other values as they are."""
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 

@@ -154,7 +154,6 @@ def _import_room(group: str) -> None:
 
 
 def _load(group: str) -> None:
-    """Import what may register kinds of a group. InputError: as :func:`load_plugins`."""
     load_plugins()
     if None not in KINDS[group]:
         _import_room(group)

@@ -71,7 +71,6 @@ class KeptPatches:
         return self.join(at_patches.new_zeros(b * v, special, 2), at_patches)
 
     def _places(self, special: int) -> Int[Tensor, " N"]:
-        """Of the kept patches among packed tokens."""
         return torch.arange(len(self.index), device=self.index.device) + (self.image + 1) * special
 
 

@@ -159,7 +159,6 @@ def subject_center(masks: Bool[Tensor, "B V h w"], cameras: Cameras) -> Float[Te
 
 
 def _in_cameras(points: Float[Tensor, "B 3"], extrinsics: Float[Tensor, "B V 4 4"]) -> Float[Tensor, "B V 3"]:
-    """One point of each element in all of its cameras' axes."""
     return world_to_camera(points[:, None].expand(*extrinsics.shape[:2], 3), extrinsics)
 
 

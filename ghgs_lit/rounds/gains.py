@@ -73,7 +73,6 @@ def log_gains(gaussians: Gaussians, batch: Batch) -> Float[Tensor, "B V 3"]:
 
 
 def _thinned(gaussians: Gaussians) -> Gaussians:
-    """One in :data:`_EVERY` of the Gaussians of each element."""
     device, splits = gaussians.means.device, gaussians.splits
     ends = list(itertools.accumulate(splits))
     kept = [torch.arange(end - n, end, _EVERY, device=device) for n, end in zip(splits, ends, strict=True)]

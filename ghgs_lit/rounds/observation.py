@@ -106,7 +106,6 @@ def looked_up(
 def _in_element(
     means: Float[Tensor, "n 3"], cameras: Cameras, maps: Float[Tensor, "V c H W"]
 ) -> tuple[Float[Tensor, "n V c"], Float[Tensor, "n V 1"], Bool[Tensor, "n V 1"]]:
-    """:func:`looked_up` of one element's means."""
     size = means.new_tensor([cameras.width, cameras.height])
     pixels, z = project(
         means.expand(len(maps), -1, -1), cameras.intrinsics[:, None], cameras.extrinsics[:, None]

@@ -311,7 +311,6 @@ def _moved(
     moved: Float[Tensor, " N"],
     change: Float[Tensor, "N c"],
 ) -> State:
-    """The state with Gaussians moved by metres along their rays and raw attributes changed."""
     raw, maps, pixels = state.raw.changed(change), state.depth_maps, state.points.pixels
     depth = maps.depth.flatten().index_add(0, rays.place, moved).view_as(maps.depth)
     maps = dataclasses.replace(maps, depth=depth)

@@ -64,7 +64,6 @@ class Motion:
         return Rotation.from_matrix(above.transpose(0, 2, 1) @ rotations)
 
     def _feet(self, transforms: np.ndarray) -> np.ndarray:
-        """Where the balls of both feet are [2, 3]."""
         bones = [self.body.bone("toe2-1.L"), self.body.bone("toe2-1.R")]
         rotations, shifts = transforms[bones, :, :3], transforms[bones, :, 3]
         return np.einsum("bij,bj->bi", rotations, self.first.joints[bones]) + shifts

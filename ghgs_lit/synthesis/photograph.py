@@ -224,7 +224,6 @@ class Studio:
         return distance, face, weights
 
     def _solid(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Whether the surface is not cut away [n] at each hit."""
         solid = np.ones(len(face), bool)
         part = self._part[face]
         for k in np.flatnonzero(self._cutoff):

@@ -86,7 +86,6 @@ def _stage_of(place: str) -> str:
 
 
 def _tensors(value: Any, name: str) -> Iterator[tuple[str, Tensor]]:
-    """The floating-point tensors in ``value``, and what to call them."""
     if isinstance(value, Tensor) and value.is_floating_point():
         yield name, value
     elif isinstance(value, (tuple, list)):

@@ -146,7 +146,6 @@ class GHGSModule(BudgetedModule):
         return {"prediction": prediction, "rendering": rendering}
 
     def _rounds(self, batch: Batch, prediction: Prediction) -> dict[str, Tensor]:
-        """PSNR and depth error before each round, where the model has rounds."""
         found = {}
         for number, draft in enumerate(prediction.drafts):
             image = self.renderer(draft, batch.targets.cameras).image.clamp(0, 1).flatten(0, 1)

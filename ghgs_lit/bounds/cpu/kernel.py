@@ -67,7 +67,6 @@ def _allowed(outside, element, view, origin, along, depth, tolerance):
 
 @helper
 def _product(row, vector):
-    """The first three entries of a matrix's row times a vector."""
     return row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2]
 
 

@@ -120,7 +120,6 @@ def _highest(scores, r, seen):
 
 @helper
 def _scale_down(exponent, sums, totals, r, width):
-    """Multiply the weighted values and the sum of weights of query ``r`` by ``2^exponent``."""
     factor = simd.exp2_minus(simd.full(min(-exponent, EXP2_LIMIT)))
     memory.store(sums, r * LANES, memory.load(sums, r * LANES) * factor)
     for i in range(r * width, (r + 1) * width, LANES):
@@ -150,7 +149,6 @@ def _add_values(weights, values, key, seen, totals, row, width):
 
 @helper
 def _finish(out, sums, totals, r, width):
-    """Write the weighted values of query ``r``, divided by the sum of its weights, to ``out``."""
     share = np.float32(1) / simd.lane_sum(memory.load(sums, r * LANES))
     for i in range(0, width, LANES):
         memory.store_anywhere(out, i, memory.load(totals, r * width + i) * simd.full(share))

@@ -70,7 +70,6 @@ def _of(rows: pd.DataFrame, kind: str) -> pd.DataFrame:
 
 
 def _about_others(table: Table) -> list[str]:
-    """Where the numbers of other methods are from, and whether their number of subjects differs from ours."""
     said = []
     ours = set(_of(table.rows, "model").groupby(["source", "views"]).size())
     for name, rows in _of(table.rows, "other").groupby("variant", sort=False):
@@ -88,7 +87,6 @@ def _range(counts: list[int]) -> str:
 
 
 def _about_test(table: Table) -> list[str]:
-    """Which test was made of how many seeds and subjects, or why nothing is marked."""
     tests = [comparison for comparison in table.cells["test"] if comparison is not None]
     if not tests:
         return []
@@ -115,7 +113,6 @@ def _about_test(table: Table) -> list[str]:
 
 
 def _about_steps(table: Table) -> list[str]:
-    """That rows were not trained equally long, where they were not."""
     if "steps" not in table.rows:
         return []
     rows = table.rows.dropna(subset="steps")
@@ -128,7 +125,6 @@ def _about_steps(table: Table) -> list[str]:
 
 
 def _about_seeds(table: Table) -> list[str]:
-    """That our rows are means over different seeds, where they are."""
     seeds = _of(table.rows, "model").groupby("variant", sort=False)["seed"].unique().map(sorted)
     if len({tuple(each) for each in seeds}) < 2:
         return []
@@ -141,7 +137,6 @@ def _about_seeds(table: Table) -> list[str]:
 
 
 def _about_runs(table: Table) -> list[str]:
-    """Runs that are unfinished, that differ in settings, or that are of different states of the code."""
     said = []
     if table.measured["lacking"].map(bool).any():
         said.append("(2/3): from 2 of 3 seeds; the others have no results yet.")

@@ -119,7 +119,6 @@ def smooth_rows(photo, masks, out, image, first, last):
 
 @helper
 def _rays(turn, u, v):
-    """The directions of pixels in another view, not normalised."""
     return (
         turn[0, 0] * u + (turn[0, 1] * v + turn[0, 2]),
         turn[1, 0] * u + (turn[1, 1] * v + turn[1, 2]),

@@ -68,7 +68,6 @@ def _unit(w, x, y, z):
 
 @helper
 def _multiply(p, q):
-    """Products of quaternions."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -196,7 +195,6 @@ def activate(
 
 @helper
 def _bend_or_rectify(bends, layers, at, outputs, inputs, values):
-    """Add biases; then tanh where ``bends``, else ReLU."""
     if bends:
         bend(layers, at, outputs, inputs, values)
     else:

@@ -69,7 +69,6 @@ def _read_gradients(
 def _differentiate_splat(
     records, s, colors, n, count, x0, y0, hit, pixels, transmittance, upstream, suffix, sums, alpha_max, stop
 ):
-    """Sum one splat's gradients over a tile into the rows of ``sums``."""
     channels, zero = simd.length(count), simd.full(ZERO)
     numbers, depth = tiles.read_splat(records[s], np.float32(x0), np.float32(y0)), records[s, layout.DEPTH]
     h, h_p, h_q, h_pp, h_pq, h_qq, d_depth = zero, zero, zero, zero, zero, zero, zero

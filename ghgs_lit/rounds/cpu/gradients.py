@@ -40,7 +40,6 @@ def _unsee(view, hidden, views, shown, seen, slopes, own):
 
 @helper
 def _of(view, views, buffer):
-    """The part of a buffer that a view has."""
     each = len(buffer) // views
     return buffer[view * each : (view + 1) * each]
 

@@ -100,7 +100,6 @@ def answer(heard, before, layers, after, change, first, last):
 
 @helper
 def _axis(row, x, y, z):
-    """A coordinate of points in a camera's axes."""
     return row[0] * x + (row[1] * y + (row[2] * z + row[3]))
 
 
@@ -118,7 +117,6 @@ def _put_cells(place, side, cells):
 
 @helper
 def _between(plane, rows, columns, weights):
-    """Sum of four cells of a plane times their weights."""
     upper = weights[0] * plane[rows[0], columns[0]] + weights[1] * plane[rows[0], columns[1]]
     return upper + (weights[2] * plane[rows[1], columns[0]] + weights[3] * plane[rows[1], columns[1]])
 

@@ -34,7 +34,6 @@ PARTS = (*_TRUNK, *(f"{side} {name}" for name in _LIMBS for side in ("left", "ri
 
 
 def _part_of(bone: str) -> str:
-    """The part that a bone moves."""
     for name, beginnings in _TRUNK.items():
         if bone.startswith(beginnings):
             return name
