@@ -20,7 +20,7 @@ from ghgs_lit.cli.inputs import build_renderer, pick_device
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.config.options import image_size
 from ghgs_lit.evaluation.baselines import nearest_view, splatted
-from ghgs_lit.evaluation.baselines.photo_depth import hull_depth
+from ghgs_lit.evaluation.baselines.splats import hull_depth
 from ghgs_lit.evaluation.measure import Method, ModelMethod, measure
 from ghgs_lit.geometry.frame import Frame
 from ghgs_lit.prediction.capture.predict import trained_size

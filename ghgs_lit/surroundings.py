@@ -12,7 +12,7 @@ from torch import Tensor
 from ghgs_lit.config.options import Options, Text
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.geometry.mattes import with_matte
+from ghgs_lit.geometry.masks import with_matte
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.kernels.precision import precision_of
 from ghgs_lit.skipping import AutoSkip
@@ -140,7 +140,7 @@ class Checks(Surrounding):
 
 
 class Mattes(Surrounding):
-    """Masks become those of soft mattes (:mod:`ghgs_lit.geometry.mattes`)."""
+    """Masks become those of soft mattes (:mod:`ghgs_lit.geometry.masks`)."""
 
     def __init__(self, least: float | None) -> None:
         self.least = least

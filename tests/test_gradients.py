@@ -14,9 +14,9 @@ from torch import Generator, Tensor
 from torch.autograd import gradcheck
 
 from ghgs_lit.bounds import SubjectBox, VisualHull
+from ghgs_lit.geometry.masks import relative_bounds, relative_depth
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import inverse_intrinsics, project, unproject, world_to_camera
-from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens

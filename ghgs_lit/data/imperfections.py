@@ -13,8 +13,7 @@ from scipy.ndimage import zoom
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.masks import signed_distance
-from ghgs_lit.geometry.mattes import unmultiplied
+from ghgs_lit.geometry.masks import signed_distance, unmultiplied
 from ghgs_lit.geometry.projection import look_at_point, project, unproject
 from ghgs_lit.geometry.rotations import after_motions, motions_between, quaternion_to_matrix, without_common
 from ghgs_lit.types import Batch, Cameras, extents

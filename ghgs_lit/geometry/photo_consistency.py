@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry import cpu
-from ghgs_lit.geometry.mattes import surface_colors
+from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
 from ghgs_lit.kernels.pool import even_parts
 from ghgs_lit.kernels.precision import exact

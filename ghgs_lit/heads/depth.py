@@ -10,10 +10,9 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.geometry.masks import patches_around_subject
+from ghgs_lit.geometry.masks import BOUNDS_CHANNELS, patches_around_subject, relative_bounds
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32
-from ghgs_lit.geometry.relative_depth import BOUNDS_CHANNELS, relative_bounds
 from ghgs_lit.heads.activations import bounded_sigmoid, confidence_of
 from ghgs_lit.heads.dense import Part, decode
 from ghgs_lit.heads.dpt import DPTHead

@@ -14,10 +14,9 @@ from pydantic import model_validator
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Amount, Options, Positive, Share, Width
-from ghgs_lit.geometry.mattes import surface_colors
+from ghgs_lit.geometry.masks import relative_depth, surface_colors
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import at_least_float32, focal_lengths
-from ghgs_lit.geometry.relative_depth import relative_depth
 from ghgs_lit.geometry.rotations import multiply_quaternions, rotate, unit
 from ghgs_lit.heads import cpu
 from ghgs_lit.heads.activations import bounded_sigmoid, bounded_tanh

@@ -15,7 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ghgs_lit.config.options import Options
-from ghgs_lit.geometry.mattes import coverage, surface_colors
+from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, pixel_centers, project, sample, unproject
 from ghgs_lit.heads.activations import bounded_sigmoid
 from ghgs_lit.heads.depth import BOUNDED, finite_maps

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghgs_lit.geometry.mattes import coverage, surface_colors
+from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import at_least_float32
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.rendering import render

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.rotations import rotate, unit
 from ghgs_lit.kernels.pool import is_supported

@@ -9,7 +9,7 @@ from ghgs_lit.config.registry import read_node
 from ghgs_lit.data.augmentation import Augmentation
 from ghgs_lit.data.imperfections import cut
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.mattes import surface_colors
+from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.types import Batch
 from tests.helpers.people import RELEASE, V4, equal, render_boxes, rendered
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import torch
 
-from ghgs_lit.geometry.mattes import coverage, surface_colors, with_matte
+from ghgs_lit.geometry.masks import coverage, surface_colors, with_matte
 from tests.helpers.scenes import make_batch
 
 

@@ -8,7 +8,7 @@ import torch
 from ghgs_lit.bounds import VisualHull
 from ghgs_lit.encoder import VGGTOptions
 from ghgs_lit.errors import InputError
-from ghgs_lit.geometry.relative_depth import UNIT, relative_bounds, relative_depth
+from ghgs_lit.geometry.masks import UNIT, relative_bounds, relative_depth
 from ghgs_lit.heads.guide import GuidePyramid, photo_guide
 from ghgs_lit.heads.window import Window
 from ghgs_lit.types import DepthBounds

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import project, unproject_maps
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.rendering import render

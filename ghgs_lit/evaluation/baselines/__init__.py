@@ -9,8 +9,14 @@ import torch.nn.functional as F
 
 from ghgs_lit.errors import choice
 from ghgs_lit.evaluation.baselines.per_scene import PerScene
-from ghgs_lit.evaluation.baselines.photo_depth import hull_depth, photo_depth
-from ghgs_lit.evaluation.baselines.splats import body_depth, splats_at, splatted, true_depth
+from ghgs_lit.evaluation.baselines.splats import (
+    body_depth,
+    hull_depth,
+    photo_depth,
+    splats_at,
+    splatted,
+    true_depth,
+)
 from ghgs_lit.evaluation.measure import Estimate, Method, ModelMethod, Renderer
 from ghgs_lit.types import Batch
 

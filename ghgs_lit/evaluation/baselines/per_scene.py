@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from ghgs_lit.evaluation.baselines.photo_depth import photo_depth
-from ghgs_lit.evaluation.baselines.splats import splats_at
+from ghgs_lit.evaluation.baselines.splats import photo_depth, splats_at
 from ghgs_lit.evaluation.measure import Estimate, Renderer
 from ghgs_lit.prediction.refinement import Change, Refinement
 from ghgs_lit.types import Batch, Gaussians

@@ -2,9 +2,9 @@
 
 import pandas as pd
 
+from ghgs_lit.evaluation.tables.cells import needed_errors
 from ghgs_lit.evaluation.tables.layouts import Table, data_title, reported_source
 from ghgs_lit.evaluation.tables.records import differing, differing_text
-from ghgs_lit.evaluation.tables.significance import needed_errors
 
 FOOTNOTE = (
     "All four combinations are listed. The paper's Table 4 prints three and has (✗, ✓) among them, while its"

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from ghgs_lit.geometry.mattes import unmultiplied
+from ghgs_lit.geometry.masks import unmultiplied
 from ghgs_lit.prediction.export.ply import vertices_ply
 from ghgs_lit.prediction.export.subject import ExportedSubject
 from ghgs_lit.visualization.pictures import to_uint8

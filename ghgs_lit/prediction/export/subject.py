@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghgs_lit.errors import choice, require
-from ghgs_lit.geometry.mattes import coverage, surface_colors
+from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
 from ghgs_lit.prediction.refinement import Change, Descent

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.geometry.frame import HEIGHT, Frame
-from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project
 from ghgs_lit.geometry.rotations import after_motions, rigid, without_common
 from ghgs_lit.kernels.precision import exact

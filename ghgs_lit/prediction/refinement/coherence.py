@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghgs_lit.geometry.frame import HEIGHT, subject_center
-from ghgs_lit.geometry.mattes import coverage
+from ghgs_lit.geometry.masks import coverage
 from ghgs_lit.geometry.projection import project, unproject, world_to_camera
 from ghgs_lit.geometry.rotations import after_motions, without_common
 from ghgs_lit.kernels.precision import exact

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.errors import require
-from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import world_to_camera
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.metrics.functional import psnr, ssim

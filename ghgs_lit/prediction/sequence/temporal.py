@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghgs_lit.geometry.mattes import coverage, on_black
+from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project, sample, unproject_maps
 from ghgs_lit.geometry.rotations import multiply_quaternions, unit
 from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow

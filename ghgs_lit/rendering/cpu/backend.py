@@ -10,9 +10,9 @@ from torch import Tensor
 
 from ghgs_lit.errors import require
 from ghgs_lit.kernels import pool, simd
-from ghgs_lit.rendering.cpu import binning, layout, projection
+from ghgs_lit.rendering.cpu import layout, projection
 from ghgs_lit.rendering.cpu.backward import backward
-from ghgs_lit.rendering.cpu.forward import forward
+from ghgs_lit.rendering.cpu.forward import forward, scatter
 from ghgs_lit.rendering.cpu.gradients import collect
 from ghgs_lit.rendering.settings import RasterSettings
 from ghgs_lit.types import Cameras, Gaussians, Rendering
@@ -169,13 +169,13 @@ def _prepare(plan: Plan, means, quaternions, scales, opacities, colors, differen
     next_free = tile_starts[:-1].reshape(elements, 1, *counts.shape[2:]) + np.cumsum(counts, 1) - counts
     entries, entry_starts = np.empty((size, layout.ENTRY), np.int32), np.empty(total, np.int32)
 
-    def scatter(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
-        binning.scatter(
+    def list_part(b: int, p: int, first: int, last: int, seen_by: slice) -> None:
+        scatter(
             first, last, plan.shifts[seen_by], depths, boxes, tiles_x, slots[b, p], entry_starts,
             next_free[b, p], entries,
         )  # fmt: skip
 
-    pool.run([partial(scatter, *part) for part in parts], size)
+    pool.run([partial(list_part, *part) for part in parts], size)
     drawn, reached = np.zeros(len(tile_starts) - 1, np.int64), np.zeros(size, np.uint8)
     return _Splats(records, boxes, entry_starts, tile_starts, entries, drawn, reached)
 

@@ -17,7 +17,7 @@ from ghgs_lit.geometry.padding import Padding
 from ghgs_lit.metrics import functional
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.rendering import reference
-from ghgs_lit.rendering.cpu import binning
+from ghgs_lit.rendering.cpu import backend
 
 
 @dataclass(frozen=True)
@@ -138,11 +138,11 @@ def test_a_norm_without_its_epsilon_is_reported(monkeypatch):
 
 def test_tiles_from_back_to_front_are_reported(monkeypatch):
     """The order of the splats of a tile is that of their depths."""
-    right = binning.scatter
+    right = backend.scatter
 
     def reversed_(first, last, shifts, depths, *rest):
         with np.errstate(all="ignore"):
             return right(first, last, shifts, (1 / depths).astype(np.float32), *rest)
 
-    monkeypatch.setattr(binning, "scatter", reversed_)
+    monkeypatch.setattr(backend, "scatter", reversed_)
     assert failures("compositing", "ordinary", "float32") > 0

@@ -1,6 +1,6 @@
 """The visual hull as a baseline."""
 
-from ghgs_lit.evaluation.baselines.photo_depth import hull_bounds, hull_depth
+from ghgs_lit.evaluation.baselines.splats import hull_bounds, hull_depth
 from tests.helpers.scenes import make_batch
 
 SIZE = 160

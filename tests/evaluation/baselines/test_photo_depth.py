@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ghgs_lit.evaluation.baselines.photo_depth import _shared, hull_bounds, hull_depth, photo_depth
+from ghgs_lit.evaluation.baselines.splats import _shared, hull_bounds, hull_depth, photo_depth
 from ghgs_lit.types import Batch
 from tests.helpers.scenes import painted_ellipsoid, ring
 

@@ -7,7 +7,7 @@ import torch
 
 from ghgs_lit.config import build, compose, resolve
 from ghgs_lit.evaluation.baselines.splats import discs_at, splats_at, splatted, true_depth
-from ghgs_lit.geometry.mattes import with_matte
+from ghgs_lit.geometry.masks import with_matte
 from ghgs_lit.geometry.projection import unproject_maps
 from ghgs_lit.heads.gaussian import RawGaussians
 from ghgs_lit.metrics import psnr

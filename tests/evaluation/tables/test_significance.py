@@ -10,7 +10,7 @@ from scipy import stats
 from ghgs_lit.config.nodes import PairedTest
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables import to_markdown
-from ghgs_lit.evaluation.tables.significance import compare, holm, needed_errors
+from ghgs_lit.evaluation.tables.cells import compare, holm, needed_errors
 from tests.helpers.tables import body, tables_of, write_run
 
 RNG = np.random.default_rng(0)

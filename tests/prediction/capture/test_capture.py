@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from ghgs_lit import Capture, predict
 from ghgs_lit.geometry.frame import Frame
-from ghgs_lit.geometry.mattes import on_black
+from ghgs_lit.geometry.masks import on_black
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.metrics.functional import psnr

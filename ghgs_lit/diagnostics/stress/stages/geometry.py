@@ -9,10 +9,10 @@ from ghgs_lit.bounds.silhouettes import depths_in_box, ray_directions
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, except_for
 from ghgs_lit.geometry.frame import Frame
+from ghgs_lit.geometry.masks import relative_bounds, relative_depth
 from ghgs_lit.geometry.padding import pad_to_patches
 from ghgs_lit.geometry.photo_consistency import photo_consistency
 from ghgs_lit.geometry.projection import project, sample, unproject, world_to_camera
-from ghgs_lit.geometry.relative_depth import relative_bounds, relative_depth
 from ghgs_lit.geometry.undistortion import undistorting_grid
 from ghgs_lit.geometry.unprojection import subject_tokens
 from ghgs_lit.kernels.precision import exact
