@@ -98,13 +98,9 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
     low, high = -center / focal - margin, (size - center) / focal + margin
     tangents = torch.minimum(torch.maximum(tangents, low), high)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        (
-            torch.stack((focal[0] / z, zero, -focal[0] / z * tangents[:, 0]), dim=-1),
-            torch.stack((zero, focal[1] / z, -focal[1] / z * tangents[:, 1]), dim=-1),
-        ),
-        dim=-2,
-    )
+    across = torch.stack((focal[0] / z, zero, -focal[0] / z * tangents[:, 0]), dim=-1)
+    down = torch.stack((zero, focal[1] / z, -focal[1] / z * tangents[:, 1]), dim=-1)
+    jacobian = torch.stack((across, down), dim=-2)
     root = quaternion_to_matrix(gaussians.quaternions) * gaussians.scales[:, None, :]
     row_x, row_y = (jacobian @ rotation @ root).unbind(-2)
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)

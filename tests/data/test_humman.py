@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from scipy import sparse
 
-from ghgs_lit.data.humman.dataset import HuMManReader
+from ghgs_lit.data.humman.dataset import HuMMan
 from ghgs_lit.data.humman.smpl import read_model, read_parameters
 from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS
@@ -33,7 +33,8 @@ def root(tmp_path_factory) -> Path:
 
 
 def photographs(root: Path, size=None, **options) -> Photographs:
-    return Photographs(HuMManReader(root, [TEST], range(0, 97, 6), **options), size)
+    data = HuMMan(root=root, split={"val": [TEST]}, frames=(0, 97, 6), **{"body": "none", **options})
+    return Photographs(data.reader("val"), size)
 
 
 def test_frames_are_multiples_of_6_and_some_lack(root):

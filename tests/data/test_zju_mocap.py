@@ -16,7 +16,7 @@ from ghgs_lit.data.reader import Photographs
 from ghgs_lit.data.sampling import CAMERAS
 from ghgs_lit.data.view import half_centers, resize_view
 from ghgs_lit.data.zju_mocap.annotations import frame_number, read_annotations
-from ghgs_lit.data.zju_mocap.dataset import Frames, ZJUMoCapReader
+from ghgs_lit.data.zju_mocap.dataset import ZJUMoCap
 from ghgs_lit.errors import InputError
 from ghgs_lit.geometry.undistortion import undistort, undistorting_grid
 from scripts.miniatures import zju_mocap
@@ -36,7 +36,8 @@ def root(tmp_path_factory) -> Path:
 
 
 def photographs(root: Path, sequence: str = "386", frames=(0, 2, 1), size=None, **options) -> Photographs:
-    return Photographs(ZJUMoCapReader(root, [Frames(sequences=(sequence,), frames=frames)], **options), size)
+    split = {key: [{"sequences": [sequence], "frames": list(frames)}] for key in ("train", "val")}
+    return Photographs(ZJUMoCap(root=root, split=split, **options).reader("val"), size)
 
 
 def test_bodies_project_into_every_mask(root):

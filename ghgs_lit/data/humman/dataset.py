@@ -39,38 +39,21 @@ class _Frame:
 
 
 class HuMManReader(FrameReader):
-    """Frames of ``sequences``, each a subject ``<sequence>_<frame>``; positions are the colour cameras.
-    InputError: all sequences are missing, cameras are bad, or the body model cannot be loaded.
+    """Frames of the sequences of a phase, each a subject ``<sequence>_<frame>``; positions are the colour
+    cameras. Sequences and frames that are missing are left out, and cameras of a frame. InputError: all
+    sequences are missing, cameras are bad, or the body model cannot be loaded."""
 
-    Args:
-        sequences: names of folders; missing ones are left out.
-        frames: numbers of frames; those that a sequence lacks are left out, and of a frame the cameras.
-        body: ``smpl``: vertices of the licensed model at ``smpl_model``; ``depth``: points of the depth
-            cameras inside all masks; ``none``.
-        limit: number of frames in all, the first ones (None: all).
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        sequences: Sequence[str],
-        frames: Sequence[int],
-        masks: str = "kinect_mask",
-        body: str = "none",
-        smpl_model: Path | None = None,
-        limit: int | None = None,
-        strict: bool = True,
-    ) -> None:
+    def __init__(self, data: "HuMMan", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
-        self.masks, self.body_kind = masks, body
+        self.data, folder, names = data, data.folder, data.sequences(phase)
         self._body: Body | None = None
-        if body == "smpl":
+        if data.body == "smpl":
             with self.collecting():
-                self._body = _load_model(smpl_model)
-        for name in self.existing(folder, sequences, "p000455_a000986"):
+                self._body = _load_model(data.smpl_model)
+        for name in self.existing(folder, names, "p000455_a000986"):
             with self.collecting():
-                self._add(folder / name, frames)
-        self.subjects = dict(list(self.subjects.items())[:limit])
+                self._add(folder / name, range(*data.frames))
+        self.subjects = dict(list(self.subjects.items())[: data.limit.of(phase)])
 
     def _add(self, path: Path, frames: Sequence[int]) -> None:
         cameras = read_calibration(path / "cameras.json", "color")
@@ -104,7 +87,7 @@ class HuMManReader(FrameReader):
 
     def read_body(self, name: str) -> np.ndarray | None:
         frame = self.frames[name]
-        if self.body_kind == "depth":
+        if self.data.body == "depth":
             masks = {position: self._mask(frame, position) for position in self.subjects[name]}
             depth_cameras = read_calibration(frame.folder / "cameras.json", "depth")
             return surface_points(frame.folder, frame.number, depth_cameras, frame.cameras, masks)
@@ -114,24 +97,24 @@ class HuMManReader(FrameReader):
 
     def place(self, name: str, position: int, view: int) -> str:
         frame = self.frames[name]
-        return str(_file(frame.folder, self.masks, position, frame.number))
+        return str(_file(frame.folder, self.data.masks, position, frame.number))
 
     def _mask(self, frame: _Frame, position: int, size: tuple[int, int] | None = None) -> np.ndarray:
-        path = _file(frame.folder, self.masks, position, frame.number)
+        path = _file(frame.folder, self.data.masks, position, frame.number)
         if size is None:
             image = read_image(path)
             size = (image.height, image.width)
         return read_map(path, size) != 0
 
 
-def _load_model(path: Path | None) -> Body:
+def _load_model(path: str | None) -> Body:
     if path is None:
         raise InputError(
             "data.smpl_model: expected the licensed SMPL_NEUTRAL.pkl for body=smpl; found null "
             "(body=depth takes points of the depth cameras in its place; body=none with "
             "loss.weights.chamfer=0 trains without)"
         )
-    return Body(path)
+    return Body(Path(path).expanduser())
 
 
 def _file(folder: Path, kind: str, kinect: int, number: int) -> Path:
@@ -205,11 +188,7 @@ class HuMMan(DataSet):
         return len(self.sequences(phase)) > 0
 
     def reader(self, phase: str, strict: bool = True) -> HuMManReader:
-        names, limit = self.sequences(phase), self.limit.of(phase)
-        model = None if self.smpl_model is None else Path(self.smpl_model).expanduser()
-        return HuMManReader(
-            self.folder, names, range(*self.frames), self.masks, self.body, model, limit, strict
-        )
+        return HuMManReader(self, phase, strict)
 
     def inspections(self) -> Sequence[Callable[[], None]]:
         names = {name for phase in PHASES for name in self.sequences(phase)} if self.root else set()

@@ -7,7 +7,7 @@
 
 import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, ClassVar
@@ -62,28 +62,19 @@ class ZJUMoCapReader(FrameReader):
     """Chosen frames, each a subject ``CoreView_<id>_<frame number>``; positions are the cameras.
 
     Missing sequences are left out (``ghgs prepare task=check`` counts them). InputError: all sequences are
-    missing, or annotations are bad. ``limit``: number of frames in all, the first ones (None: all).
+    missing, or annotations are bad.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        chosen: Sequence[Frames],
-        cameras: int | None = 20,
-        undistorted: bool = True,
-        masks: Sequence[str] = ("mask_cihp",),
-        limit: int | None = None,
-        strict: bool = True,
-    ) -> None:
+    def __init__(self, data: "ZJUMoCap", phase: str, strict: bool = True) -> None:
         super().__init__(strict)
-        self.undistorted, self.masks = undistorted, tuple(masks)
-        wanted = [(f"CoreView_{s}", some.frames) for some in chosen for s in some.sequences]
+        self.data, folder = data, data.folder
+        wanted = [(f"CoreView_{s}", some.frames) for some in data.split.of(phase) for s in some.sequences]
         there = self.existing(folder, [name for name, _ in wanted], wanted[0][0])
         for name, frames in wanted:
             if name in there:
                 with self.collecting():
-                    self._add(folder / name, frames, cameras)
-        self.subjects = dict(list(self.subjects.items())[:limit])
+                    self._add(folder / name, frames, data.cameras)
+        self.subjects = dict(list(self.subjects.items())[: data.limit.of(phase)])
 
     def _add(self, path: Path, frames: tuple[int, int, int], cameras: int | None) -> None:
         annotations = read_annotations(path / "annots.npy")
@@ -112,7 +103,7 @@ class ZJUMoCapReader(FrameReader):
         mask = self._mask(frame.folder, photograph, image.shape[:2])
         intrinsics = frame.annotations.intrinsics[position]
         check_center(path, intrinsics, *image.shape[:2])
-        if self.undistorted:
+        if self.data.undistorted:
             distortion = frame.annotations.distortions[position]
             grid = undistorting_grid(half_centers(intrinsics), distortion, *image.shape[:2])
             image, matte = undistort(image, mask * np.uint8(255), grid)
@@ -132,9 +123,11 @@ class ZJUMoCapReader(FrameReader):
         return str(_find(self._mask_folders(frame.folder)[0], photograph, ".png"))
 
     def _mask_folders(self, folder: Path) -> list[Path]:
-        folders = [path for name in self.masks if (path := folder / name).is_dir()]
+        folders = [path for name in self.data.masks if (path := folder / name).is_dir()]
         if not folders:
-            raise InputError(f"{folder}: expected a folder of masks, {' or '.join(self.masks)}; found none")
+            raise InputError(
+                f"{folder}: expected a folder of masks, {' or '.join(self.data.masks)}; found none"
+            )
         return folders
 
     def _mask(self, folder: Path, photograph: PurePosixPath, size: tuple[int, int]) -> np.ndarray:
@@ -195,5 +188,4 @@ class ZJUMoCap(DataSet):
         return self.cameras or _ALL
 
     def reader(self, phase: str, strict: bool = True) -> ZJUMoCapReader:
-        frames, limit = self.split.of(phase), self.limit.of(phase)
-        return ZJUMoCapReader(self.folder, frames, self.cameras, self.undistorted, self.masks, limit, strict)
+        return ZJUMoCapReader(self, phase, strict)
