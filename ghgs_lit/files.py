@@ -123,14 +123,9 @@ def lock(path: str | Path, wait: bool = False) -> Iterator[bool]:
     """Lock the file ``path`` for this process; gives whether that succeeded.
 
     A POSIX record lock: the system frees it however the process ends, forked children do not inherit it, and
-    NFS shares it among machines. A process that holds it already gets False. Folders are made.
-
-    Args:
-        path: the lock file; :func:`lock_owner` reads from it who locked it last.
-        wait: whether to wait until another process frees the lock.
-
-    Raises:
-        InputError: the file system has no locks.
+    NFS shares it among machines. A process that holds it already gets False. Folders are made. The file tells
+    :func:`lock_owner` who locked it last. ``wait``: whether to wait until another process frees the lock.
+    InputError: the file system has no locks.
     """
     path = Path(path).resolve()
     if path in _HELD:

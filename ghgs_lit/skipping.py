@@ -128,12 +128,8 @@ class AutoSkip:
 
     The encoder's products decide: the heads compute windows around the subject in every preset. Presets lose
     what ``skip.choices`` says. The machine has no say: half precision is a choice of its own for every preset
-    (``precision=auto``).
-
-    Args:
-        presets: by name, those in the budget, the most accurate first.
-        budget_db: PSNR that may be lost against ``skip=none``.
-        left_out: why the other presets are none of them, by name.
+    (``precision=auto``). ``presets``: those in the budget, the most accurate first. ``budget_db``: PSNR that
+    may be lost against ``skip=none``. ``left_out``: why the other presets are none of them, by name.
     """
 
     presets: Mapping[str, Preset]

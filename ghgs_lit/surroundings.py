@@ -27,16 +27,12 @@ Finding = tuple[str, str, Tensor]
 
 
 def check_batch(batch: Batch, patch_size: int, values: bool = True) -> None:
-    """Refuse a batch that the stages cannot work on.
+    """Refuse a batch that the stages cannot work on; its targets are not looked at.
 
-    Values are looked at together, so that the host waits for a GPU once. InputError: names the field, what
-    was expected and what was found, and where.
-
-    Args:
-        batch: the inputs; targets are not looked at.
-        patch_size: must divide height and width, in pixels.
-        values: look also at every value, which would spread through every view: one NaN in the background
-            leaves no Gaussian.
+    Values are looked at together, so that the host waits for a GPU once. ``patch_size``: must divide height
+    and width, in pixels. ``values``: look also at every value, which would spread through every view: one NaN
+    in the background leaves no Gaussian. InputError: names the field, what was expected and what was found,
+    and where.
     """
     _check_shapes(batch, patch_size)
     findings = _findings_of_cameras(batch) + (_findings_of_values(batch) if values else [])
@@ -194,9 +190,11 @@ def computing(
     precision: str, auto: AutoSkip | None, encoder: Encoder, masks: Bool[Tensor, "B V H W"]
 ) -> Iterator[tuple[tuple[Decision, ...], Bool[Tensor, "B V h w"] | None]]:
     """How much is computed while the context lasts: in which precision, and which patches take part.
-    ``precision``: one of :data:`ghgs_lit.kernels.precision.PRECISIONS`. ``auto``: chooses what the encoder
-    sees of each subject (``skip=auto``); None: the encoder does itself. Yields: the choices, and the patches
-    that take part, None where the encoder decides."""
+
+    Gives the choices, and the patches that take part, None where the encoder decides. ``precision``: one of
+    :data:`ghgs_lit.kernels.precision.PRECISIONS`. ``auto``: chooses what the encoder sees of each subject
+    (``skip=auto``); None: the encoder does itself.
+    """
     decisions, kept = ((), None) if auto is None else auto.decide(encoder, masks)
     with precision_of(precision, torch.device(masks.device)):
         yield decisions, kept

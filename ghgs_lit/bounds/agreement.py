@@ -33,12 +33,9 @@ def trusted_views(
 
     A mask that is cut leaves rays of the others unexplained, one with more than the subject has such rays
     itself. Where more than :data:`_SHARE` allows is unexplained, the view without which at most half of that
-    is left has no vote. Of two views nobody can tell which one is wrong.
-
-    Args:
-        coarse: masks of at most :data:`RESOLUTION` cells.
-        reach: a generous radius of the subject.
-        tolerance: how many views may say "outside" of a point that is kept.
+    is left has no vote. Of two views nobody can tell which one is wrong. ``coarse``: masks of at most
+    :data:`RESOLUTION` cells. ``reach``: a generous radius of the subject. ``tolerance``: how many views may
+    say "outside" of a point that is kept.
     """
     masks = coarse.masks
     voting = masks.flatten(2).any(-1)

@@ -123,8 +123,8 @@ class StepSampler(DistributedSampler):
     """The steps of one epoch, counted from the beginning of the run.
 
     Samples are already divided among processes by step. It is a ``DistributedSampler`` because Lightning
-    replaces any other sampler by its own when there are several processes. ``dataset``: its length is the
-    number of steps. ``first_step``: gives the first step; called when the epoch starts.
+    replaces any other sampler by its own when there are several processes. ``first_step``: gives the first
+    step; called when the epoch starts.
     """
 
     def __init__(self, dataset: Dataset, first_step: Callable[[], int]) -> None:

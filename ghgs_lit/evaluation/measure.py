@@ -174,17 +174,10 @@ def measure(
 ) -> list[Row]:
     """Measure one method; the targets of all protocols come from one prediction.
 
-    Args:
-        pictures: folder for pictures (None: none are written).
-        picture_count: the number of subjects, the first ones, that are drawn.
-        flickers: compares people in motion with the instant before (None: nothing does).
-
-    Returns:
-        One row for each subject and target. ``seconds`` is the time of the prediction and all renders of a
-        subject, in a batch as the loader gives it.
-
-    Raises:
-        InputError: a batch has no targets.
+    One row for each subject and target; ``seconds`` is the time of the prediction and all renders of a
+    subject, in a batch as the loader gives it. ``pictures``: folder for pictures of the first
+    ``picture_count`` subjects (None: none are written). ``flickers``: compares people in motion with the
+    instant before (None: nothing does). InputError: a batch has no targets.
     """
     rows: list[Row] = []
     for batch in loader:

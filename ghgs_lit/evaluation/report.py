@@ -36,14 +36,12 @@ def measure_and_write(
     device: torch.device,
     **facts: Any,
 ) -> Path:
-    """Measure methods as configured; print the means and write the results.
+    """Measure methods as configured; print the means and write the results. Returns: the path of
+    ``metrics.json``.
 
-    What :func:`check_evaluation` checks is not checked again. Returns: the path of ``metrics.json``.
-
-    Args:
-        config: the run's full configuration (``evaluation``, ``metrics`` and ``targets`` are used, and the
-            model's where one is measured).
-        directory: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
+    What :func:`check_evaluation` checks is not checked again. ``config``: the run's full configuration
+    (``evaluation``, ``metrics`` and ``targets`` are used, and the model's where one is measured).
+    ``directory``: gets ``metrics.json``, ``metrics.csv`` and ``pictures/``.
     """
     evaluation = config["evaluation"]
     targets = target_protocols(config)

@@ -16,13 +16,10 @@ _DISTANCES, _CANDIDATES = 1 << 26, 4
 
 
 def nearest(queries: Float[Tensor, "n 3"], references: Float[Tensor, "m 3"]) -> Int[Tensor, " n"]:
-    """Index of the nearest reference of each query.
+    """Index of the nearest reference of each query, of any one where the query is not finite.
 
     On the CPU by a k-d tree in float64; elsewhere by matrix products, see :func:`nearest_by_products`.
-
-    Args:
-        queries: a point that is not finite gets any reference; its distance is not finite either.
-        references: finite coordinates, one point at least.
+    ``references``: finite coordinates, one point at least.
     """
     queries, references = at_least_float32(queries.detach()), at_least_float32(references.detach())
     queries = queries.nan_to_num(0.0, 0.0, 0.0)

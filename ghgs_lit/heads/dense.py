@@ -35,12 +35,9 @@ def decode(
     """Maps of the windows of the images, in their order.
 
     Images whose maps are small share one window. Without a gradient, larger maps are computed one after
-    another, each in a window of its own, to save memory and work.
-
-    Args:
-        guide: of all images, for a head with a guide.
-        windows: of each image; None: all of every image. An image without a window is left out; where none
-            has one, a single pixel is decoded: there is always a part, through which gradients of 0 flow.
+    another, each in a window of its own, to save memory and work. ``windows``: of each image; None: all of
+    every image. An image without a window is left out; where none has one, a single pixel is decoded: there
+    is always a part, through which gradients of 0 flow.
     """
     b, v, rows, columns = tokens.grid
     size = (tokens.patch_size * rows, tokens.patch_size * columns)

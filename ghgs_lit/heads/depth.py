@@ -86,8 +86,7 @@ class DepthHeadOptions(Options):
 
 
 class DepthHead(nn.Module):
-    """Depth and confidence of each pixel from the four layers of tokens, by a dense head. ``options``: of the
-    head. ``dim_latent``: width of the tokens (from the encoder)."""
+    """Depth and confidence of each pixel from the four layers of tokens, by a dense head."""
 
     def __init__(self, options: DepthHeadOptions, dim_latent: int):
         super().__init__()

@@ -155,7 +155,9 @@ class FootprintAttributes(Options):
         return _logit((OPACITY_START - self.opacity_floor) / (1 - self.opacity_floor))
 
     def constants(self, color_limit: float) -> tuple[float, ...]:
-        """What :func:`ghgs_lit.heads.cpu.activate` is told."""
+        """What :func:`ghgs_lit.heads.cpu.activate` is told: limit of offsets, distance inwards, least scale,
+        logarithm of the largest over it, biases of scales, least opacity, its bias, limit of changes of
+        colours."""
         size = (self.scale_floor, self.scale_range, *self.scale_biases)
         return OFFSET_LIMIT, self.inward, *size, self.opacity_floor, self.opacity_bias, color_limit
 
@@ -237,7 +239,6 @@ class GaussianHead(nn.Module):
 
     Colours are the input pixels', unless ``color_limit`` lets them change. Published names of the networks:
     ``offset_header``, ``scale_header``, ``rot_header``, ``opacity_header``, with linear layers 0, 2 and 4.
-    ``options``: of the head. ``dim_latent``: width of the tokens (from the encoder).
     """
 
     def __init__(self, options: GaussianHeadOptions, dim_latent: int):

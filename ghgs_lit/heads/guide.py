@@ -30,11 +30,8 @@ def photo_guide(batch: Batch, *maps: Float[Tensor, "B V _ H W"]) -> Guide:
 
 
 class GuidePyramid(nn.Module):
-    """A guide at full, half and quarter resolution, by three convolutions.
-
-    The maps have ``features / 2``, ``features`` and ``features`` channels and are added to a dense head's.
-    ``channels``: of the guide. ``features``: of the dense head.
-    """
+    """A guide at full, half and quarter resolution, by three convolutions: maps of ``features / 2``,
+    ``features`` and ``features`` channels, which are added to a dense head's."""
 
     def __init__(self, channels: int, features: int):
         super().__init__()

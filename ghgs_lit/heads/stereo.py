@@ -48,7 +48,7 @@ class StereoHeadOptions(Options):
 
 
 class StereoHead(nn.Module):
-    """Depths from correlations of neighbouring views. ``options``: of the head."""
+    """Depths from correlations of neighbouring views."""
 
     is_bounded = True
 
@@ -106,8 +106,7 @@ def _two_layers(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Update(nn.Module):
-    """One update: what is looked up around the estimate, a convolutional GRU, a change of the estimate.
-    ``channels``: of the memory and of the context."""
+    """One update: what is looked up around the estimate, a convolutional GRU, a change of the estimate."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -172,14 +171,9 @@ def correlations(
     """Products of the features of cells with those at their places in neighbouring views, over ``sqrt(c)``.
 
     Of the pairs that a view belongs to, the larger: a surface is often hidden from one neighbour. 0 where no
-    neighbour has the place before it and inside its image.
-
-    Args:
-        features: of all cells.
-        cameras: [B, V], of images whose pixels are the cells.
-        cells: indices among those of all images.
-        near, far: of the views, in metres.
-        steps: S, how many depths, with equal steps of inverse depth from near to far.
+    neighbour has the place before it and inside its image. ``cameras``: [B, V], of images whose pixels are
+    the cells. ``cells``: indices among those of all images. ``near``, ``far``: in metres. ``steps``: S, how
+    many depths, with equal steps of inverse depth from near to far.
     """
     height, width = features.shape[-2:]
     flat = features.flatten(0, 1)

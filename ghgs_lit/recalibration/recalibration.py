@@ -44,8 +44,7 @@ class RecalibrationOptions(Options):
 
 
 class Recalibration(nn.Module):
-    """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward.
-    ``options``: of the stage. ``dim_latent``: width of the tokens (from the encoder)."""
+    """One :class:`SemanticAttention` for all layers; neighbours and cosines are computed once per forward."""
 
     def __init__(self, options: RecalibrationOptions, dim_latent: int):
         super().__init__()

@@ -65,12 +65,8 @@ def slopes(
 
 @torch.no_grad()
 def observe(gaussians: Gaussians, batch: Batch, rendering: Rendering | None = None) -> Float[Tensor, "N V c"]:
-    """:data:`CHANNELS` values of each input view at each Gaussian of its element.
-
-    The first view is that of the Gaussian's own image; the others follow in their order, from the last to the
-    first again. ``gaussians``: with the images that they come from. ``batch``: photographs, masks and
-    cameras.
-    """
+    """:data:`CHANNELS` values of each input view at each Gaussian of its element. The first view is that of
+    the Gaussian's own image; the others follow in their order, from the last to the first again."""
     with exact(gaussians.means.device.type):
         return _compare(gaussians, batch, rendering or render(gaussians, batch.cameras))
 

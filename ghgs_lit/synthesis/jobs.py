@@ -185,19 +185,13 @@ def render_people(
     workers: int | None = None,
     shown: bool = True,
 ) -> int:
-    """Render people below ``root``; those that are already there are kept.
+    """Render people below ``root``; those that are already there are kept. Returns: how many were rendered
+    now.
 
     It is safe to kill, to repeat, and to start twice at once: a second process waits for the first.
-
-    Args:
-        names: names of the subjects of each phase: of people, or of their instants if they are in motion.
-        workers: number of processes (None: one for each core; 0: this one).
-
-    Returns:
-        How many people were rendered now.
-
-    Raises:
-        InputError: ``root`` holds something else, a person is bad, or the script has no main guard.
+    ``names``: of the subjects of each phase: of people, or of their instants if they are in motion.
+    ``workers``: number of processes (None: one for each core; 0: this one). InputError: ``root`` holds
+    something else, a person is bad, or the script has no main guard.
     """
     _check_main_guard()
     positions = settings.positions

@@ -74,17 +74,11 @@ def initialize(
 ) -> list[str]:
     """Load the weights at ``path`` that fit into ``model``.
 
-    Args:
-        strict: every tensor must fit.
-        random_frozen: parameters that do not learn may stay as initialised.
-
-    Returns:
-        One line for each tensor: ``loaded``, ``wrong shape`` and ``missing`` (both stay as initialised) or
-        ``ignored`` (the model has no such tensor).
-
-    Raises:
-        InputError: not a checkpoint of this project; nothing fits; a parameter that does not learn stays as
-            initialised; with ``strict``, a tensor that does not fit or is missing on either side (names it).
+    One line for each tensor: ``loaded``, ``wrong shape`` and ``missing`` (both stay as initialised) or
+    ``ignored`` (the model has no such tensor). ``strict``: every tensor must fit. ``random_frozen``:
+    parameters that do not learn may stay as initialised. InputError: not a checkpoint of this project;
+    nothing fits; a parameter that does not learn stays as initialised; with ``strict``, a tensor that does
+    not fit or is missing on either side (names it).
     """
     state, own = model_state(read_checkpoint(path, whole=True)), model.state_dict()
     if strict:

@@ -39,16 +39,10 @@ def march(
     steps: Float[Tensor, " s"],
     tolerance: int,
 ) -> None:
-    """Change ``near`` and ``far`` to the first and the last depth that the other views allow.
-
-    Args:
-        outside: 1 where a view says "outside".
-        masks: rays of their pixels are searched.
-        directions: of the rays, per metre of depth.
-        near, far: contiguous; rays that miss the hull keep theirs.
-        steps: shares of the way from near to far that are tried.
-        tolerance: votes that an allowed depth may have.
-    """
+    """Change ``near`` and ``far`` to the first and the last depth that the other views allow. ``outside``: 1
+    where a view says "outside". ``near``, ``far``: contiguous; rays that miss the hull keep theirs.
+    ``steps``: shares of the way from near to far that are tried. ``tolerance``: votes that an allowed depth
+    may have."""
     from ghgs_lit.bounds.cpu.kernel import march_rows
 
     elements, views, height, _ = masks.shape

@@ -43,17 +43,10 @@ def sweep(
     shares: Float[Tensor, " S"],
     tolerance: float,
 ) -> Float[Tensor, "N S"]:
-    """Agreement of pixels with the best other view.
-
-    Args:
-        colors: of all views, :func:`padded`.
-        pixels: indices among those of all images, in ascending order.
-        near, far: of the depths that are compared.
-        turn, shift: from pixels of a view (second axis) to those of another (third axis).
-        compared: which pairs of views are compared.
-        shares: of the way from near to far.
-        tolerance: difference of colours at which the agreement is 1 / e.
-    """
+    """Agreement of pixels with the best other view; arguments as in
+    :mod:`ghgs_lit.geometry.photo_consistency`. ``colors``: of all views, :func:`padded`. ``pixels``: in
+    ascending order. ``turn``, ``shift``: from pixels of a view (second axis) to those of another (third
+    axis). ``shares``: of the way from near to far."""
     from ghgs_lit.geometry.cpu.kernel import sweep_pixels  # here: it loads a compiler
 
     result = np.empty((len(pixels), len(shares)), np.float32)

@@ -33,18 +33,11 @@ def activate(
     constants: tuple[float, ...],
     on_surface: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Means, quaternions, scales, opacities and colours of Gaussians; see :func:`is_supported`.
-
-    Args:
-        raw: offsets, scales, rotations, opacities and, where there are some, colours before activations.
-        image, pixel: that they belong to, in ascending order.
-        maps, points: of all pixels.
-        photo, share: colours of pixels, and what opacities are multiplied by; None: by nothing.
-        constants: limit of offsets, distance inwards, least scale, logarithm of the largest over it, what is
-            added to raw scales across and along the normal, least opacity, what is added to raw opacities,
-            limit of changes of colours.
-        on_surface: axes are those of the surface.
-    """
+    """Means, quaternions, scales, opacities and colours of Gaussians; see :func:`is_supported`. ``raw``:
+    offsets, scales, rotations, opacities and, where there are some, colours before activations. ``image``,
+    ``pixel``: that they belong to, in ascending order. ``photo``, ``share``: colours of pixels, and what
+    opacities are multiplied by. ``constants``: of ``FootprintAttributes``. ``on_surface``: axes are those of
+    the surface."""
     from ghgs_lit.heads.cpu.kernel import activate as compiled  # here: it loads a compiler
 
     *raw, color = raw

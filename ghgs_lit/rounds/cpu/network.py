@@ -26,15 +26,9 @@ def remembered(
     before: Float[Tensor, "N h"],
 ) -> Float[Tensor, "N h"]:
     """``tanh(before + memory(update(seen, known, before)))``; see :meth:`ghgs_lit.rounds.Rounds._remembered`.
-
-    Differentiable in ``before`` and the layers.
-
-    Args:
-        view, update: of two layers each; ``seen`` is ``view`` of the own view, and of the others the mean and
-            the largest.
-        each: what each view shows, the own one first.
-        known: what is known beside it.
-    """
+    Differentiable in ``before`` and the layers. ``view``, ``update``: of two layers each; ``seen`` is
+    ``view`` of the own view, and of the others the mean and the largest. ``each``: what each view shows, the
+    own one first."""
     from ghgs_lit.kernels.layers import parameters  # here, like the kernels: it loads a compiler
 
     return _Remember.apply(each, known, before, *parameters((*view, *update, memory)))
