@@ -54,8 +54,7 @@ def exact(device: str) -> Iterator[None]:
     """Float32 as it is: no autocast, and products that round their factors neither to TF32 nor to bfloat16.
 
     ``torch.set_float32_matmul_precision`` asks for such products (TF32 on CUDA has 11 bits: 1 mm at 2 m).
-    ``device``: its type.
-    """
+    ``device``: its type."""
     backends = [b.matmul for b in (torch.backends.cuda, torch.backends.mkldnn) if hasattr(b, "matmul")]
     before = {b: getattr(b, "fp32_precision", "ieee") for b in backends}  # PyTorch 2.9 and later
     rounding = [b for b, value in before.items() if value not in ("ieee", "none")]
