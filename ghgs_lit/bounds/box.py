@@ -27,6 +27,7 @@ from ghgs_lit.config.options import Index, Options
 from ghgs_lit.geometry.frame import subject_center
 from ghgs_lit.geometry.masks import first_and_last
 from ghgs_lit.geometry.projection import focal_lengths, project
+from ghgs_lit.kernels.pool import is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
@@ -128,7 +129,7 @@ def _carve(
     steps = torch.arange(CELLS, device=lower.device, dtype=lower.dtype) + 0.5
     position = lower[..., None] + cell[..., None] * steps
     matrices = projection_matrices(cameras)
-    if cpu.is_supported(matrices, position):
+    if is_supported(matrices, position):
         return cpu.carve(outside, matrices, position, tolerance)
     x, y, z = (matrices[..., axis, None] * position[:, None, None, axis] for axis in range(3))
     z = z + matrices[..., 3, None]

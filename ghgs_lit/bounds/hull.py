@@ -20,7 +20,7 @@ from ghgs_lit.bounds.silhouettes import (
     ray_directions,
     votes_outside,
 )
-from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.kernels.pool import even_parts, is_supported
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
 #: Depths that are held at once (bounds memory).
@@ -77,7 +77,7 @@ def hull_bounds(
     near, far = (bound.clone(memory_format=torch.contiguous_format) for bound in (start.near, start.far))
     steps = (torch.arange(samples, device=near.device, dtype=near.dtype) + 0.5) / samples
     directions, matrices = ray_directions(cameras), projection_matrices(cameras)
-    if cpu.is_supported(near, directions, matrices):
+    if is_supported(near, directions, matrices):
         cpu.march(outside, masks, matrices, directions, cameras.centers, near, far, steps, tolerance)
         return DepthBounds(near, far)
     rays = masks.flatten().nonzero()[:, 0] if rays is None else rays

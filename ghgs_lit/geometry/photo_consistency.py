@@ -12,7 +12,7 @@ from torch import Tensor
 from ghgs_lit.geometry import cpu
 from ghgs_lit.geometry.masks import surface_colors
 from ghgs_lit.geometry.projection import at_least_float32, inverse_intrinsics, pixel_centers, sample
-from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.kernels.pool import even_parts, is_supported
 from ghgs_lit.kernels.precision import exact
 from ghgs_lit.types import Batch, Cameras, DepthBounds
 
@@ -50,7 +50,7 @@ def consistency_of(
     # All of it: half a pixel in bfloat16 is a different colour.
     with exact(batch.masks.device.type):
         views = [x.to(near) if x.is_floating_point() else x for x in batch.once(_pairs)]
-        if cpu.is_supported(near, far):
+        if is_supported(near, far):
             size = tuple(batch.masks.shape[2:])
             return cpu.sweep(batch.once(_padded), pixels, near, far, size, *views, shares, TOLERANCE)
         colors, result = batch.once(_smooth).to(near), near.new_zeros(len(pixels), steps)

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.encoder import cpu
-from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES, WIDTH
+from ghgs_lit.encoder.cpu import KEYS, QUERIES, WIDTH
 from ghgs_lit.kernels import pool
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.kernels.layers import PANEL, ROWS

@@ -36,7 +36,7 @@ def kernels(monkeypatch):
     """Use the attention kernel for any size, also where the processor lacks features that make it fast."""
     features = processor_features() | {"avx2", "fma"}
     for limit in ("_SMALL", "_LARGE"):
-        monkeypatch.setattr(f"ghgs_lit.encoder.cpu.attention.{limit}", 0)
+        monkeypatch.setattr(f"ghgs_lit.encoder.cpu.{limit}", 0)
     monkeypatch.setattr("ghgs_lit.kernels.pool.features", lambda: features)
     calls, attend = [], cpu.attend
     monkeypatch.setattr(cpu, "attend", lambda *args: calls.append(1) or attend(*args))

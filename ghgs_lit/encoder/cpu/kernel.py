@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba.core import types
 
-from ghgs_lit.encoder.cpu.layout import KEYS, QUERIES
+from ghgs_lit.encoder.cpu import KEYS, QUERIES
 from ghgs_lit.kernels import memory, simd
 from ghgs_lit.kernels.compile import NUMBER, helper, kernel_for
 from ghgs_lit.kernels.layers import PANEL, ROWS, make_product, product

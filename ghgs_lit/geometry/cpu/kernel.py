@@ -168,7 +168,7 @@ def sweep_pixels(
     colors, pixels, near, far, turn, shift, compared, shares, tolerance, out, height, width, image, first,
     last,
 ):  # fmt: skip
-    """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu.sweep`."""
+    """Write rows ``first`` to ``last``, pixels of ``image``; see :func:`ghgs_lit.geometry.cpu`."""
     views = turn.shape[1]
     element, view = image // views, image % views
     line = (width + 2) * CHANNELS

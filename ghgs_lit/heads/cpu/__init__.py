@@ -1,5 +1,83 @@
 """The Gaussian head for CPUs: all that is done with a few Gaussians, then with the next."""
 
-from ghgs_lit.heads.cpu.activation import activate, attributes, is_supported
+from itertools import pairwise
 
-__all__ = ["activate", "attributes", "is_supported"]
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.geometry.rotations import matrix_to_quaternion
+from ghgs_lit.kernels import pool
+from ghgs_lit.types import Cameras, DepthMaps, Points
+
+#: Gaussians of one task.
+_TASK = 1024
+
+
+def is_supported(*tensors: Tensor | None) -> bool:
+    """Whether the kernel can compute with these: without a gradient, in float32."""
+    given = [x for x in tensors if x is not None]
+    return not torch.is_grad_enabled() and pool.is_supported(*given) and pool.have_values(*given)
+
+
+def activate(
+    raw: tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None],
+    image: Tensor,
+    pixel: Tensor,
+    maps: DepthMaps,
+    points: Points,
+    photo: Float[Tensor, "B V 3 H W"],
+    share: Float[Tensor, "B V H W"] | None,
+    cameras: Cameras,
+    constants: tuple[float, ...],
+    on_surface: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Means, quaternions, scales, opacities and colours of Gaussians; see :func:`is_supported`. ``raw``:
+    offsets, scales, rotations, opacities and, where there are some, colours before activations. ``image``,
+    ``pixel``: that they belong to, in ascending order. ``photo``, ``share``: colours of pixels, and what
+    opacities are multiplied by. ``constants``: of ``FootprintAttributes``. ``on_surface``: axes are those of
+    the surface."""
+    from ghgs_lit.heads.cpu.kernel import activate as compiled  # here: it loads a compiler
+
+    *raw, color = raw
+    color = raw[0].new_empty(0, 3) if color is None else color
+    share = raw[0].new_empty(0, *photo.shape[3:]) if share is None else share.flatten(0, 1)
+    turns = matrix_to_quaternion(cameras.extrinsics.flatten(0, 1)[:, :3, :3].mT)
+    seen = (maps.depth, maps.valid, points.pixels, photo)
+    tables = (*(x.flatten(0, 1) for x in seen), share)
+    inputs = (*raw, color, pixel, *tables, cameras.intrinsics.flatten(0, 1), turns)
+    count = len(pixel)
+    out = [raw[0].new_empty(count, *size) for size in ((3,), (4,), (3,), (), (3,))]
+    arrays = [x.detach().contiguous().numpy() for x in inputs]
+    numbers = tuple(np.float32(x) for x in constants)
+    ends = np.searchsorted(image.numpy(), np.arange(len(turns) + 1)).tolist()
+    given = (*arrays, numbers, on_surface, *(x.numpy() for x in out))
+    pool.run_rows(
+        compiled(), given, [(view, *pair) for view, pair in enumerate(pairwise(ends))], _TASK, count
+    )
+    return tuple(out)
+
+
+#: Rows of one task, and how many of the pool's pieces of work one of them is.
+_ROWS, _WORK = 1024, 2
+
+
+def attributes(
+    networks: list[nn.Sequential], descriptors: Float[Tensor, "*n c"]
+) -> tuple[Float[Tensor, "*n _"], ...]:
+    """What each of the networks makes of the descriptors; see :func:`ghgs_lit.kernels.pool.multiplies`.
+    ``networks``: of three layers, of equal widths but for the last, with ``nn.Tanh`` or ``nn.ReLU`` between.
+    ``descriptors``: of pixels."""
+    from ghgs_lit.heads.cpu.kernel import attributes as compiled  # here: it loads a compiler
+    from ghgs_lit.kernels.layers import packed, parameters
+
+    layers = packed(parameters([layer for network in networks for layer in network]))
+    outputs = [len(network[4].bias) for network in networks]
+    rows = descriptors.reshape(-1, descriptors.shape[-1]).contiguous()
+    found = rows.new_empty(len(rows), sum(outputs))
+    widths = np.array([len(networks[0][k].bias) for k in (0, 2)] + outputs)
+    bends = np.array([isinstance(network[1], nn.Tanh) for network in networks])
+    given = (rows.numpy(), layers, widths, bends, found.numpy())
+    pool.run_rows(compiled(), given, [(0, len(rows))], _ROWS, _WORK * len(rows))
+    return torch.split(found.view(*descriptors.shape[:-1], -1), outputs, -1)

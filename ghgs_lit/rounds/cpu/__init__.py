@@ -1,5 +1,107 @@
 """Rounds for CPUs: all that is done with a few Gaussians, then with the next."""
 
-from ghgs_lit.rounds.cpu.network import answered, compare, remembered
+from functools import partial
+from itertools import accumulate, pairwise
 
-__all__ = ["answered", "compare", "remembered"]
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ghgs_lit.kernels import pool
+from ghgs_lit.kernels.pool import even_parts
+from ghgs_lit.types import Cameras, Gaussians, Rendering
+
+#: Gaussians of one task, and how many of the pool's pieces of work one of them is.
+_TASK, _WORK = 512, 8
+#: Gaussians of one task of the gradients: each adds up sums of its own.
+_LEARNED = 2048
+
+
+def remembered(
+    view: nn.Sequential,
+    update: nn.Sequential,
+    memory: nn.Linear,
+    each: Float[Tensor, "N V c"],
+    known: Float[Tensor, "N k"],
+    before: Float[Tensor, "N h"],
+) -> Float[Tensor, "N h"]:
+    """``tanh(before + memory(update(seen, known, before)))``; see :meth:`ghgs_lit.rounds.Rounds._remembered`.
+    Differentiable in ``before`` and the layers. ``view``, ``update``: of two layers each; ``seen`` is
+    ``view`` of the own view, and of the others the mean and the largest. ``each``: what each view shows, the
+    own one first."""
+    from ghgs_lit.kernels.layers import parameters  # here, like the kernels: it loads a compiler
+
+    return _Remember.apply(each, known, before, *parameters((*view, *update, memory)))
+
+
+def answered(
+    hear: nn.Linear, change: nn.Linear, heard: Float[Tensor, "N e"], before: Float[Tensor, "N h"]
+) -> tuple[Float[Tensor, "N h"], Float[Tensor, "N c"]]:
+    """``after = before + hear(relu(heard))``, and ``change(after)``; without a gradient."""
+    from ghgs_lit.kernels.layers import packed, parameters
+    from ghgs_lit.rounds.cpu.kernel import answer
+
+    layers = packed(parameters((hear, change)))
+    after, changed = torch.empty_like(before), before.new_empty(len(before), len(change.bias))
+    rows = [x.contiguous().numpy() for x in (heard, before)]
+    given = (*rows, layers, after.numpy(), changed.numpy())
+    pool.run_rows(answer(), given, [(0, len(before))], _TASK, len(before))
+    return after, changed
+
+
+class _Remember(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, each, known, before, *numbers):
+        from ghgs_lit.kernels.layers import packed
+        from ghgs_lit.rounds.cpu.kernel import remember
+
+        layers, after = packed(numbers), torch.empty_like(before)
+        rows = [x.detach().contiguous() for x in (each, known, before)]
+        given = (*(x.numpy() for x in rows), layers, after.numpy())
+        pool.run_rows(remember(), given, [(0, len(before))], _TASK, _WORK * len(before))
+        ctx.save_for_backward(*rows, after, *numbers)
+        return after
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, slope):
+        from ghgs_lit.kernels.layers import Sums, packed
+        from ghgs_lit.rounds.cpu.gradients import remember_back
+
+        *rows, numbers = *ctx.saved_tensors[:4], ctx.saved_tensors[4:]
+        parts = even_parts(len(slope), _LEARNED)
+        sums, d_before = Sums(numbers, len(parts)), torch.empty_like(slope)
+        arrays = [x.numpy() for x in (*rows, slope.contiguous())]
+        layers = packed(numbers), packed(numbers, transposed=True), sums.places
+        tasks = [
+            partial(remember_back(), *arrays, *layers, own, d_before.numpy(), part.start, part.stop)
+            for own, part in zip(sums.of_task, parts, strict=True)
+        ]
+        pool.run(tasks, 4 * _WORK * len(slope))
+        return None, None, d_before, *sums.gradients()
+
+
+#: Gaussians of one task.
+_OBSERVED = 1024
+
+
+def compare(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    photo: Float[Tensor, "B V 3 H W"],
+    mask: Float[Tensor, "B V H W"],
+    rendering: Rendering,
+    near: float,
+    out: Float[Tensor, "N V 11"],
+) -> None:
+    """Write the values of :func:`ghgs_lit.rounds.observation.observe`. ``rendering``: of the Gaussians, by
+    ``cameras``. ``near``: metres behind the rendered surface at which a Gaussian counts as hidden."""
+    from ghgs_lit.rounds.cpu.kernel import observe  # here: it loads a compiler
+
+    inputs = (
+        *(gaussians.means, gaussians.colors, gaussians.image, cameras.intrinsics, cameras.extrinsics),
+        *(photo, mask, rendering.image, rendering.alpha, rendering.depth),
+    )
+    arrays = [x.contiguous().numpy() for x in inputs]
+    ranges = pairwise((0, *accumulate(gaussians.splits)))
+    pool.run_rows(observe(), (*arrays, near, out.numpy()), ranges, _OBSERVED, len(gaussians))

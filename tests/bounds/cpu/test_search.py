@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghgs_lit.bounds import VisualHull, cpu
+from ghgs_lit.bounds import VisualHull
 from ghgs_lit.bounds.box import subject_box
 from ghgs_lit.bounds.hull import hull_bounds
 from ghgs_lit.types import Batch, DepthBounds
@@ -26,7 +26,8 @@ def plain(monkeypatch):
 
     def call(function, *arguments):
         with monkeypatch.context() as patch:
-            patch.setattr(cpu, "is_supported", lambda *_: False)
+            for module in ("box", "hull"):
+                patch.setattr(f"ghgs_lit.bounds.{module}.is_supported", lambda *_: False)
             return function(*arguments)
 
     return call

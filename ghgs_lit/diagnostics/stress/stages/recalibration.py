@@ -5,7 +5,7 @@ from torch import Generator, Tensor
 
 from ghgs_lit.diagnostics.stress import inputs
 from ghgs_lit.diagnostics.stress.stage import FLOAT32_ONLY, Stage, Values, case_by_case, except_for
-from ghgs_lit.encoder.cpu.attention import attend as attend_heads
+from ghgs_lit.encoder.cpu import attend as attend_heads
 from ghgs_lit.kernels.compile import processor_features
 from ghgs_lit.recalibration import SemanticAttention, nearest_neighbors
 from ghgs_lit.recalibration.neighbors import Neighbors
