@@ -5,21 +5,11 @@ from typing import Any
 
 #: Where a run writes, what it shows and how it shares the machine: no number depends on these.
 WITHOUT_INFLUENCE = (
-    "hydra",
-    "allow_random_encoder",
-    "dry_run",
-    "overwrite",
-    "resume",
-    "logger",
-    "callbacks",
-    "data.cache_dir",
-    "data.cache_images_mb",
-    "data.render_workers",
-    "data.workers",
+    "hydra", "allow_random_encoder", "dry_run", "overwrite", "resume", "logger", "callbacks",
+    "data.cache_dir", "data.cache_images_mb", "data.render_workers", "data.workers",
     "encoder.weights",  # repeats the origin of init_from's weights, which counts
-    "evaluation.pictures",
-    "trainer.log_every_n_steps",
-)
+    "evaluation.pictures", "trainer.log_every_n_steps",
+)  # fmt: skip
 
 #: What may change when a run is resumed without being reported: also how far it trains (``trainer.max_*``)
 #: and what is measured after training.

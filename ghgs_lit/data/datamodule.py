@@ -159,14 +159,9 @@ class PhotographsDataModule(LightningDataModule):
     def _evaluation_samples(
         self, subjects: Mapping[str, tuple[int, ...]], protocols: Sequence[TargetProtocol], views: int | None
     ) -> list[SampleSpec]:
-        return evaluation_samples(
-            subjects,
-            self.views.evaluation_count if views is None else views,
-            [self._possible(protocol) for protocol in protocols],
-            self.dataset.ring,
-            self.seed,
-            self.dataset.evaluation_positions,
-        )
+        data, count = self.dataset, self.views.evaluation_count if views is None else views
+        possible = [self._possible(protocol) for protocol in protocols]
+        return evaluation_samples(subjects, count, possible, data.ring, self.seed, data.evaluation_positions)
 
     def val_dataloader(self) -> DataLoader:
         return self.evaluation_loader()

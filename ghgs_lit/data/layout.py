@@ -166,11 +166,8 @@ class Layout(Reader):
         planned = self._complete.plan.get(phase, [])
         wanted = (sorted({*stored[phase], *planned}) if names is None else list(names))[:limit]
         homes = {name: next((p for p in phases if name in stored[p]), phase) for name in wanted}
-        missing = [
-            name
-            for name, home in homes.items()
-            if name not in stored[home] or self._complete.missing(home, [name])
-        ]
+        half = self._complete.missing
+        missing = [name for name, home in homes.items() if name not in stored[home] or half(home, [name])]
         if missing and self.strict:
             raise InputError(
                 f"{images}: expected {len(wanted)} whole subjects; found {len(wanted) - len(missing)} "
@@ -232,15 +229,9 @@ class Layout(Reader):
         path = path.with_name(f"{view}_extrinsic.npy")
         extrinsics = check_extrinsics(path, read_array(path, [(3, 4), (4, 4)]))
         intrinsics[:2, 2] += self._shift
+        matrices = (matrix.astype(np.float32) for matrix in (intrinsics, extrinsics))
         # Half of the maximum reads 0/1, 0/255 and compressed masks alike.
-        return View(
-            image=image,
-            mask=mask > mask.max() / 2,
-            inverse_depth=inverse,
-            intrinsics=intrinsics.astype(np.float32),
-            extrinsics=extrinsics.astype(np.float32),
-            matte=matte,
-        )
+        return View(image, mask > mask.max() / 2, inverse, *matrices, matte)
 
     def _folder(self, name: str, kind: str, position: int) -> Path:
         return self._folders[name] / kind / position_name(name, position)

@@ -139,15 +139,10 @@ class VGGTEncoder(nn.Module):
         chosen = self.keeps(masks) if kept is None else kept
         kept = KeptPatches(chosen, images.device)
         pairs, patches = self.aggregator(self._normalized(images, masks, bounds), kept)
-        return Tokens(
-            latent=tuple(_joined(pairs, kept, self.aggregator.special)),
-            semantic=patches.detach() if self.semantic is None else self.semantic(images, masks, chosen),
-            image=kept.image,
-            row=kept.row,
-            column=kept.column,
-            grid=kept.grid,
-            patch_size=self.patch_size,
-        )
+        latent = tuple(_joined(pairs, kept, self.aggregator.special))
+        semantic = patches.detach() if self.semantic is None else self.semantic(images, masks, chosen)
+        places = (kept.image, kept.row, kept.column)
+        return Tokens(latent, semantic, *places, kept.grid, self.patch_size)
 
     def keeps(self, masks: Bool[Tensor, "b v H W"]) -> Bool[Tensor, "b v h w"]:
         """Which patches ``tokens`` and ``margin`` let take part; on the CPU where the masks are not read."""

@@ -48,32 +48,24 @@ def measure_and_write(
     metrics = build(config["metrics"], "metrics").to(device)
     for name, reason in metrics.left_out.items():
         print_once(f"{name} is left out: {reason}")
-    rows = measure_all(
-        methods,
-        data,
-        views=evaluation["views"],
-        targets=targets,
-        split=evaluation["split"],
-        metrics=metrics,
-        device=device,
-        pictures=directory / "pictures",
-        picture_count=evaluation["pictures"],
-    )
+    views, split = evaluation["views"], evaluation["split"]
+    pictures = directory / "pictures", evaluation["pictures"]
+    rows = measure_all(methods, data, views, targets, split, metrics, device, *pictures)
     if METHOD in methods:
         facts["ablation"] = ablation_of(config)
     source = provenance(
         config,
         seed=config["seed"],
-        data={**data.facts, **data.dataset.split_facts(evaluation["split"])},
+        data={**data.facts, **data.dataset.split_facts(split)},
         protocol={
             "metrics": metrics.protocol,
-            "views": evaluation["views"],
+            "views": views,
             "targets": list(targets),
             "target_protocols": targets,
             "reported": metrics.names,
             "left_out": metrics.left_out,
             "definitions": metrics.definitions,
-            "split": SPLITS.get(evaluation["split"], "unseen in training"),
+            "split": SPLITS.get(split, "unseen in training"),
         },
         **facts,
     )

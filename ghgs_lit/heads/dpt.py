@@ -166,9 +166,8 @@ class Scratch(nn.Module):
             setattr(self, f"layer{i}_rn", _conv3(channels, features, bias=False))
             setattr(self, f"refinenet{i}", Fusion(features, i < LEVELS, rectified_skip))
         self.output_conv1 = _conv3(features, features // 2)
-        self.output_conv2 = nn.Sequential(
-            _conv3(features // 2, hidden), nn.ReLU(), nn.Conv2d(hidden, output_dim, 1)
-        )
+        hidden_layer, last = _conv3(features // 2, hidden), nn.Conv2d(hidden, output_dim, 1)
+        self.output_conv2 = nn.Sequential(hidden_layer, nn.ReLU(), last)
 
 
 @dataclass(frozen=True)

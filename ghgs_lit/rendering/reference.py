@@ -112,14 +112,9 @@ def project(gaussians: Gaussians, camera: Cameras, settings: RasterSettings) -> 
         ratio = bare / determinant
         is_flat = ~(ratio > 0)
         opacities = opacities * torch.where(is_flat, zero, torch.where(is_flat, 1, ratio).sqrt())
-    return Splats(
-        centers=focal * points[:, :2] / z[:, None] + center,
-        covariances=torch.stack((xx + settings.low_pass, xy, yy + settings.low_pass), dim=-1),
-        determinants=determinant,
-        depths=z,
-        opacities=opacities,
-        colors=gaussians.colors,
-    )
+    centers = focal * points[:, :2] / z[:, None] + center
+    covariances = torch.stack((xx + settings.low_pass, xy, yy + settings.low_pass), dim=-1)
+    return Splats(centers, covariances, determinant, z, opacities, gaussians.colors)
 
 
 def _blend(splats: Splats, pixels: Float[Tensor, "P 2"], settings: RasterSettings) -> Float[Tensor, "P c"]:

@@ -63,12 +63,8 @@ class Lights:
         )
         # Mean of max((n.l + s)/(1 + s), 0) over the sphere of normals n is (1 + s) / 4.
         share = (1 - self.ambient) * strength / strength.sum() * 4 / (1 + self.softness)
-        return LightRig(
-            directions=directions.astype(np.float32),
-            strengths=(self.exposure * share).astype(np.float32),
-            ambient=self.exposure * self.ambient,
-            softness=self.softness,
-        )
+        arrays = directions.astype(np.float32), (self.exposure * share).astype(np.float32)
+        return LightRig(*arrays, self.exposure * self.ambient, self.softness)
 
 
 @dataclass(frozen=True)

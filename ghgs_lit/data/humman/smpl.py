@@ -25,14 +25,9 @@ VERTICES = 6890
 #: What a sequence's ``smpl_params/<frame>.npz`` holds.
 PARAMETERS = {"betas": 10, "body_pose": 69, "global_orient": 3, "transl": 3}
 _SHAPES = {
-    "v_template": (VERTICES, 3),
-    "shapedirs": (VERTICES, 3, None),
-    "posedirs": (VERTICES, 3, 207),
-    "J_regressor": (24, VERTICES),
-    "kintree_table": (2, 24),
-    "weights": (VERTICES, 24),
-    "f": (None, 3),
-}
+    "v_template": (VERTICES, 3), "shapedirs": (VERTICES, 3, None), "posedirs": (VERTICES, 3, 207),
+    "J_regressor": (24, VERTICES), "kintree_table": (2, 24), "weights": (VERTICES, 24), "f": (None, 3),
+}  # fmt: skip
 _FILES = ("smpl/SMPL_NEUTRAL.pkl", "smpl/SMPL_NEUTRAL.npz", "SMPL_NEUTRAL.pkl", "SMPL_NEUTRAL.npz")
 
 

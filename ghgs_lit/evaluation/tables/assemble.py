@@ -101,12 +101,8 @@ def _table(rows: pd.DataFrame, sweep: Sweep, options: TableOptions) -> Table:
 
 def _planned_here(rows: pd.DataFrame, sweep: Sweep, layout: Layout) -> list[Planned]:
     models, data = {variant.trained for variant in rows["variant"]}, set(rows["data"])
-    return [
-        p
-        for p in sweep.planned
-        if (layout.columns == "data" or p.data in data)
-        and (layout.rows != "ablation" or p.variant.trained in models)
-    ]
+    planned = [p for p in sweep.planned if layout.columns == "data" or p.data in data]
+    return [p for p in planned if layout.rows != "ablation" or p.variant.trained in models]
 
 
 def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -> list[Group]:

@@ -44,18 +44,10 @@ class Plan:
         firsts = np.cumsum(counts) - counts
         # Each view has whole vectors of splats, so that two threads never write to the same vector.
         sizes = np.repeat(-(-counts // simd.DOUBLES) * simd.DOUBLES, views_each)
-        return cls(
-            views=_view_rows(cameras, settings),
-            edges=_part_edges(firsts, counts),
-            shifts=np.cumsum(sizes) - sizes - np.repeat(firsts, views_each),
-            splats=int(sizes.sum()),
-            shape=tuple(cameras.shape),
-            height=cameras.height,
-            width=cameras.width,
-            settings=settings,
-            near=near,
-            far=far,
-        )
+        views, edges = _view_rows(cameras, settings), _part_edges(firsts, counts)
+        shifts = np.cumsum(sizes) - sizes - np.repeat(firsts, views_each)
+        numbers = int(sizes.sum()), tuple(cameras.shape), cameras.height, cameras.width
+        return cls(views, edges, shifts, *numbers, settings, near, far)
 
     @property
     def tiles(self) -> tuple[int, int]:
