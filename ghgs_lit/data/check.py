@@ -154,12 +154,8 @@ def _inspect_phase(
     reader = photographs.reader
     # Views that the protocol may ask for are read even where no file of theirs is there to be listed.
     needed = {RING_VIEW} | targets.view_numbers
-    listed = [
-        (name, position, view)
-        for name, positions in reader.subjects.items()
-        for position in positions
-        for view in sorted(needed | set(reader.views_at(name, position)))
-    ]
+    places = [(name, position) for name, positions in reader.subjects.items() for position in positions]
+    listed = [(*place, view) for place in places for view in sorted(needed | set(reader.views_at(*place)))]
     items = _Readings(photographs, listed, _pictured(reader), min_iou)
     seen = _read_all(items, workers, f"checking {phase}") if listed else []
     bodies = len({s.name for s in seen if s.body})

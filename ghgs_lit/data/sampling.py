@@ -7,6 +7,7 @@ index in the batch) alone, so that a run resumes exactly where it stopped, whate
 """
 
 import hashlib
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -239,11 +240,7 @@ def evaluation_samples(
                 f"evaluation with {count} views: expected ring positions {inputs} of subject {name}; "
                 f"found no position {lacking[0]}"
             )
-        chosen = [
-            (photo, protocol.name)
-            for protocol in protocols
-            for photo in protocol.evaluation(available, inputs, ring, subject_rng(seed, name))
-        ]
-        targets, names = (tuple(pair[part] for pair in chosen) for part in range(2))
-        specs.append(SampleSpec(name, ring_photos(inputs), targets, names))
+        each = [p.evaluation(available, inputs, ring, subject_rng(seed, name)) for p in protocols]
+        names = tuple(p.name for p, photos in zip(protocols, each, strict=True) for _ in photos)
+        specs.append(SampleSpec(name, ring_photos(inputs), tuple(itertools.chain(*each)), names))
     return specs

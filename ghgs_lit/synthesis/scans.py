@@ -83,13 +83,8 @@ def _part(path: Path, name: str, mesh: trimesh.Trimesh, transform: np.ndarray) -
         raise InputError(f"{path}: expected texture coordinates for the mesh {name!r}; found none")
     vertices = trimesh.transform_points(mesh.vertices, transform)
     check_extent(f"{path}: {name}", vertices)
-    return TexturedMesh(
-        vertices=vertices.astype(np.float32),
-        faces=np.asarray(mesh.faces, np.int64),
-        uv=np.asarray(uv, np.float32),
-        texture=texture,
-        alpha_cutoff=cutoff,
-    )
+    arrays = vertices.astype(np.float32), np.asarray(mesh.faces, np.int64), np.asarray(uv, np.float32)
+    return TexturedMesh(*arrays, texture, cutoff)
 
 
 def _texture(path: Path, material: object) -> tuple[np.ndarray | None, float | None]:

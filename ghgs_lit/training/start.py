@@ -62,11 +62,8 @@ def _check_optimizer(
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """``key: old value -> new value`` of everything that the weights depend on."""
     old, new = flatten(before), flatten(now)
-    return [
-        f"{key}: {old.get(key)} -> {new.get(key)}"
-        for key in sorted(old.keys() | new.keys())
-        if old.get(key) != new.get(key) and not is_below(key, MAY_CHANGE_ON_RESUME)
-    ]
+    keys = (key for key in sorted(old.keys() | new.keys()) if not is_below(key, MAY_CHANGE_ON_RESUME))
+    return [f"{key}: {old.get(key)} -> {new.get(key)}" for key in keys if old.get(key) != new.get(key)]
 
 
 def initialize(

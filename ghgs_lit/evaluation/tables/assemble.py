@@ -112,12 +112,8 @@ def _groups(rows: pd.DataFrame, planned: list[Planned], options: TableOptions) -
         return [Group(name if layout.heading == "data" else f"{n}-view", n) for n in views]
     names = reported_data(layout.reported) if options.reported else []
     names += [*rows["data"], *(p.data for p in planned)]
-    several = len(views) > 1
-    return [
-        Group(f"{name}, {n}-view" if several else name, n, name)
-        for name in dict.fromkeys(map(data_title, names))
-        for n in views
-    ]
+    titles, text = dict.fromkeys(map(data_title, names)), "{}, {}-view" if len(views) > 1 else "{}"
+    return [Group(text.format(name, n), n, name) for name in titles for n in views]
 
 
 def _reported(layout: Layout, reported: str, groups: list[Group]) -> tuple[list[Line], list[dict]]:

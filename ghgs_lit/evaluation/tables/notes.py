@@ -128,11 +128,8 @@ def _about_seeds(table: Table) -> list[str]:
     seeds = _of(table.rows, "model").groupby("variant", sort=False)["seed"].unique().map(sorted)
     if len({tuple(each) for each in seeds}) < 2:
         return []
-    rows = [
-        f"{' '.join(line.stub)}: {', '.join(map(str, seeds[line.variant]))}"
-        for line in table.ours
-        if line.variant in seeds
-    ]
+    lines = [line for line in table.ours if line.variant in seeds]
+    rows = [f"{' '.join(line.stub)}: {', '.join(map(str, seeds[line.variant]))}" for line in lines]
     return [f"Rows are of different seeds ({'; '.join(rows)})."]
 
 
