@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ghgs_lit.cli.inputs import build_data, build_renderer
 from ghgs_lit.config import compose, resolve
-from ghgs_lit.evaluation.baselines.per_scene import PerScene
+from ghgs_lit.evaluation.baselines.splats import PerScene
 from ghgs_lit.evaluation.protocols import target_protocols
 from ghgs_lit.geometry.masks import on_black
 from ghgs_lit.metrics import psnr

@@ -24,7 +24,7 @@ from ghgs_lit.cli.inputs import build_data
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.data.datamodule import PhotographsDataModule
 from ghgs_lit.data.imperfections import backgrounds, imperfect_mask
-from ghgs_lit.data.matting.mattes import WEIGHTS, MattingNetwork
+from ghgs_lit.data.matting import WEIGHTS, MattingNetwork
 from ghgs_lit.files import write_atomically
 
 _CROP = 160

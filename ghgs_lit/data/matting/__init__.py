@@ -1,5 +1,150 @@
-"""Mattes of photographs whose masks are a few pixels off, ragged or have holes."""
+"""Mattes of photographs whose masks are a few pixels off, ragged or have holes.
 
-from ghgs_lit.data.matting.mattes import refined_matte
+A mask that is off by a pixel paints the background's colours on the subject's outline, other ones in every
+view. The photograph itself says where the subject ends. A network tells it that learned from generated people
+before backgrounds of many kinds (``scripts/bake_matting.py``): a U-Net (Ronneberger et al., MICCAI 2015) with
+a rough mask beside the colours, as in Deep Image Matting (Xu et al., CVPR 2017). It also sees how
+far each colour is from those of the subject and of the background nearby.
+"""
 
-__all__ = ["refined_matte"]
+import functools
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from ghgs_lit.geometry.masks import signed_distance
+from ghgs_lit.kernels.precision import exact
+
+#: Channels at the full size of the image and at each half of it.
+_WIDTHS = (16, 32, 48, 64)
+#: Distances in pixels from the mask's outline that the network tells apart.
+FARTHEST = 8.0
+#: Colours nearby are averaged in images smaller by this factor, over squares of these sides, twice.
+_COARSER, _SIDES = 4, (3, 7)
+#: Colours, mask, distance from its outline, and colours less those of two sides in two neighbourhoods.
+_FEATURES = 5 + 3 * 2 * len(_SIDES)
+
+
+class MattingNetwork(nn.Module):
+    """Mattes, and colours of the subject alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.down = nn.ModuleList(_convolutions(*pair) for pair in pairwise((_FEATURES, *_WIDTHS)))
+        self.up = nn.ModuleList(_convolutions(fine + coarse, fine) for fine, coarse in pairwise(_WIDTHS))
+        self.out = nn.Conv2d(_WIDTHS[0], 4, 1)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(
+        self, images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
+    ) -> tuple[Float[Tensor, "B h w"], Float[Tensor, "B 3 h w"]]:
+        """The mattes, in [0, 1] in evaluation alone, and the subject's colours multiplied by them.
+        ``images``: photographs with what is behind the subject, in [0, 1]. ``mattes``: what is known of it,
+        such as masks of 0 and 1."""
+        height, width = images.shape[2:]
+        whole = 2 ** (len(_WIDTHS) - 1)
+        x = F.pad(_features(images, mattes), (0, -width % whole, 0, -height % whole), mode="replicate")
+        finer = []
+        for level, block in enumerate(self.down):
+            x = block(F.avg_pool2d(x, 2) if level else x)
+            finer.append(x)
+        finer.pop()
+        for block in reversed(self.up):
+            x = block(torch.cat((finer.pop(), F.interpolate(x, scale_factor=2.0, mode="nearest")), 1))
+        out = self.out(x)[..., :height, :width].float()
+        # A mask of 0 or 1 can be turned around, and a matte that is right is the easiest answer.
+        found = mattes + 1.1 * torch.tanh(out[:, 0])
+        share = found.clamp(0, 1)
+        # A pixel shows its share of the subject's colour and the rest of the background's; the network
+        # gives the difference of the two colours.
+        colors = images + (1 - share.detach())[:, None] * out[:, 1:]
+        if not self.training:
+            found, colors = share, colors.clamp(0, 1)
+        return found, found[:, None] * colors
+
+
+def _convolutions(before: int, after: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(before, after, 3, padding=1), nn.ReLU(), nn.Conv2d(after, after, 3, padding=1), nn.ReLU()
+    )
+
+
+def _features(
+    images: Float[Tensor, "B 3 h w"], mattes: Float[Tensor, "B h w"]
+) -> Float[Tensor, "B features h w"]:
+    with exact(images.device.type):
+        inside = np.stack([_insideness(mask) for mask in (mattes > 0.5).cpu().numpy()])
+        depth = torch.from_numpy(inside).to(images)[:, None]
+        parts = [images - 0.5, mattes[:, None] - 0.5, depth]
+        for side_of_outline in (depth, -depth):
+            weight = side_of_outline.clamp(min=0) ** 2
+            sums = torch.cat((images * weight, weight), 1)
+            sums = F.avg_pool2d(sums, _COARSER, ceil_mode=True, count_include_pad=False)
+            parts += [images - _near(sums, side, images.shape[2:]) for side in _SIDES]
+        return torch.cat(parts, 1).contiguous(memory_format=torch.channels_last)
+
+
+def _insideness(mask: np.ndarray) -> np.ndarray:
+    """Distance from the outline over :data:`FARTHEST`, from -1 outside to 1 inside; float32."""
+    return (signed_distance(mask) / FARTHEST).clip(-1, 1).astype(np.float32)
+
+
+def _near(sums: Float[Tensor, "B 4 m n"], side: int, size: torch.Size) -> Float[Tensor, "B 3 h w"]:
+    """Means of colours in squares, from sums of weighted colours and weights; black where none weighs."""
+    for _ in range(2):
+        sums = F.avg_pool2d(sums, side, 1, side // 2)
+    means = sums[:, :3] / (sums[:, 3:] + 1e-4)
+    return F.interpolate(means, size, mode="bilinear", align_corners=False)
+
+
+#: The tensors of the network that comes with the package, in half precision.
+WEIGHTS = Path(__file__).with_name("weights.safetensors")
+#: Pixels of the background around what may change, which the network sees too.
+_AROUND = 16
+
+
+def refined_matte(
+    image: UInt8[np.ndarray, "h w 3"], matte: UInt8[np.ndarray, "h w"], pixels: float
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]:
+    """The subject on black (premultiplied), and its matte.
+
+    Args:
+        image: the photograph, with its background; best where the subject is 170 to 330 pixels tall, as in
+            training.
+        matte: 255 times the share of each pixel that shows the subject, a mask's 0 and 255 for instance.
+        pixels: by how much the outline may be wrong, above 0 (8 in training); holes of twice that width are
+            filled, too, where the photograph does not speak against it.
+    """
+    window = _window(matte > 127, int(pixels) + _AROUND)
+    colors, given = (torch.from_numpy(part[window] / np.float32(255)) for part in (image, matte))
+    with torch.inference_mode():
+        found, subject = _network()(colors.permute(2, 0, 1)[None], given[None])
+    # Pixels whose nearest one on the other side of the outline is so near.
+    is_open = np.abs(signed_distance(matte[window] > 127)) + 0.5 <= pixels
+    result = np.zeros_like(image), np.zeros_like(matte)
+    kept = given.numpy(), (given[..., None] * colors).numpy()
+    alpha = np.where(is_open, found[0].numpy(), kept[0])
+    premultiplied = np.where(is_open[..., None], subject[0].permute(1, 2, 0).numpy(), kept[1])
+    for whole, part in zip(result, (premultiplied, alpha), strict=True):
+        whole[window] = np.round(255 * part)
+    return result
+
+
+@functools.cache
+def _network() -> MattingNetwork:
+    network = MattingNetwork().eval()
+    network.load_state_dict(load_file(WEIGHTS))
+    return network.to(memory_format=torch.channels_last)
+
+
+def _window(inside: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+    """The part of an image around its mask; all of it where the mask is empty."""
+    lines = (np.nonzero(inside.any(axis))[0] for axis in (1, 0))
+    return tuple(slice(max(n[0] - margin, 0), n[-1] + margin + 1) if len(n) else slice(None) for n in lines)

@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 
 from ghgs_lit.errors import choice
-from ghgs_lit.evaluation.baselines.per_scene import PerScene
 from ghgs_lit.evaluation.baselines.splats import (
+    PerScene,
     body_depth,
     hull_depth,
     photo_depth,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ghgs_lit.data.matting.mattes import MattingNetwork
+from ghgs_lit.data.matting import MattingNetwork
 
 SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "bake_matting.py"
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from ghgs_lit.data.matting.mattes import FARTHEST, MattingNetwork, _insideness, _near
+from ghgs_lit.data.matting import FARTHEST, MattingNetwork, _insideness, _near
 
 
 @pytest.fixture

@@ -2,8 +2,7 @@
 
 import torch
 
-from ghgs_lit.evaluation.baselines.per_scene import CHANGES, PerScene
-from ghgs_lit.evaluation.baselines.splats import photo_depth
+from ghgs_lit.evaluation.baselines.splats import CHANGES, PerScene, photo_depth
 from ghgs_lit.geometry.projection import project
 from ghgs_lit.metrics import psnr
 from ghgs_lit.rendering import Renderer
