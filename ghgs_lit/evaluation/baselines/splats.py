@@ -1,4 +1,4 @@
-"""Baselines that are splats: at a depth (of a hull, a plane sweep, bodies, the truth), or fitted per scene."""
+"""Baselines that are splats: at a depth (of a hull, a plane sweep, bodies, the truth) or fitted per scene."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
