@@ -67,7 +67,7 @@ class Verb:
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
         sys.argv = list(self.argv)
-        from ghgs_lit.cli.paths import require_paths  # here: --help needs no NumPy
+        from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
         try:
             config = own_keys(cfg, self.name)

@@ -12,8 +12,7 @@ from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_checkpoint
-from ghgs_lit.weights.exporting import export_weights
-from ghgs_lit.weights.inference import write_inference
+from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.switches import differences
 
 _PATCHES = 8  # along each side of the photographs that two models are compared on

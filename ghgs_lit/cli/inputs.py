@@ -18,8 +18,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.stages import OPTIONS, STAGES
 from ghgs_lit.surroundings import side_multiple
-from ghgs_lit.weights.checkpoint import read_checkpoint
-from ghgs_lit.weights.loading import load_weights
+from ghgs_lit.weights.checkpoint import load_weights, read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds

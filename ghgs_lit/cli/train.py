@@ -23,9 +23,9 @@ from ghgs_lit.evaluation.check import check_evaluation
 from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
-from ghgs_lit.runs.checks import check_config
 from ghgs_lit.runs.job import (
     Train,
+    check_config,
     in_sweep,
     is_multirun,
     needs_own_process,

@@ -19,8 +19,7 @@ from ghgs_lit.config.compose import saved_text
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.checks import check_config
-from ghgs_lit.runs.job import BUSY, trains_in_several_processes
+from ghgs_lit.runs.job import BUSY, check_config, trains_in_several_processes
 from ghgs_lit.runs.plan import PlannedRun, print_plan, print_results
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State

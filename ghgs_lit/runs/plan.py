@@ -9,8 +9,7 @@ from typing import Any
 from tabulate import tabulate
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.checks import check_config
-from ghgs_lit.runs.job import is_multirun
+from ghgs_lit.runs.job import check_config, is_multirun
 from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State

@@ -1,7 +1,7 @@
 """Finished pieces of work are kept, whatever happens to the process that writes them."""
 
+from ghgs_lit.diagnostics.stress.run import Journal
 from ghgs_lit.runs import journal
-from ghgs_lit.runs.journal import Journal
 
 
 def test_what_is_done_is_there_after_a_kill(tmp_path):

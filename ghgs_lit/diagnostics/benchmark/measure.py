@@ -11,10 +11,8 @@ import pandas as pd
 import torch
 
 from ghgs_lit.diagnostics.benchmark.error import differences
-from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
-from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.presets import Case
-from ghgs_lit.diagnostics.benchmark.stages import SecondsProbe, forward
+from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe, PeakProbe, SecondsProbe, forward
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
 from ghgs_lit.prediction.export.ply import write_ply

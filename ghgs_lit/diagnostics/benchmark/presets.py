@@ -12,12 +12,11 @@ from torch import Tensor
 from ghgs_lit.config import build
 from ghgs_lit.config.groups import read_option
 from ghgs_lit.config.keys import flatten, is_below
-from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.weights.checkpoint import read_checkpoint, require_fit
-from ghgs_lit.weights.loading import check_preset, load_weights
+from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
 #: The preset that all others are compared with.
 YARDSTICK = "none"

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES
-from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import has_bfloat16
 from ghgs_lit.kernels.watching import Results, watched

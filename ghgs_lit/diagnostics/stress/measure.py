@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ghgs_lit.diagnostics.stress.families import FAMILIES, PLANTED
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, stack
+from ghgs_lit.diagnostics.stress.stage import FAMILIES, PLANTED, Stage, Values, stack
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import plain
 

@@ -11,8 +11,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ghgs_lit.diagnostics.output import document, save_figure, texts
-from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row
+from ghgs_lit.diagnostics.stress.stage import FAMILIES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.files import write_text_atomically
 

@@ -10,7 +10,7 @@ import torch
 from ghgs_lit.errors import require
 from ghgs_lit.prediction.export.compact import rgba
 from ghgs_lit.prediction.export.ply import SH_CONSTANT, stored_values
-from ghgs_lit.prediction.export.world import AXES, turn
+from ghgs_lit.prediction.export.subject import AXES, turn
 from ghgs_lit.types import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"

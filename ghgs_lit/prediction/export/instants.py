@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from ghgs_lit.files import write_atomically
-from ghgs_lit.prediction.export.packed import COARSE, pack, unpack
-from ghgs_lit.prediction.export.page import page
+from ghgs_lit.prediction.export.page import COARSE, pack, page, unpack
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
 from ghgs_lit.prediction.export.video import mp4_bytes

@@ -1,17 +1,85 @@
 """A single HTML file that shows Gaussians in any browser with WebGL 2, without a network."""
 
 import base64
+import dataclasses
 import html
 import json
 import re
-from collections.abc import Sequence
+import zlib
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from ghgs_lit.prediction.export.packed import COARSE, FINE, pack
+from ghgs_lit.prediction.export.ply import stored_values
 from ghgs_lit.types import Cameras, Gaussians
 from ghgs_lit.visualization.turntable import pixel_size
+
+#: Steps of a centre in a photograph's pixel, of a standard deviation in a factor of e, of an opacity, and of
+#: each number of a rotation to each side of 0: of one instant, and of each of several that are played.
+FINE = {"center": 64, "scale": 24, "opacity": 255, "rotation": 127}
+COARSE = {"center": 12, "scale": 12, "opacity": 127, "rotation": 31}
+#: Numbers of a Gaussian that take four bytes (its centre) and one (the others).
+_WIDE, _NARROW = 3, 10
+_LARGEST = 1 << 29
+
+
+def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
+    """Gaussians of one subject (RGB colours) as few bytes, which ``page.html`` unpacks: deflated planes [22, N].
+
+    A Gaussian is whole numbers: its centre from ``center`` [3] in parts of ``pixel``, the side of a
+    photograph's pixel at the subject; the logarithms of its standard deviations, colour and opacity; and its
+    rotation as ``v / (1 + w)`` of the unit quaternion ``(w, v)`` with ``w >= 0``. Each is stored as its
+    change from the Gaussian before, mostly that of the pixel beside. ``steps``: ``FINE`` or ``COARSE``.
+    """
+    values = stored_values(gaussians, torch.float64)
+    w, v = values["quaternions"].split((1, 3), dim=1)
+    parts = (
+        ((values["means"] - center.cpu()) * (steps["center"] / pixel)).clamp(-_LARGEST, _LARGEST),
+        ((values["scales"] / pixel).log() * steps["scale"]).clamp(-128, 127),
+        values["colors"].clamp(0, 1) * 255,
+        values["opacities"].clamp(0, 1)[:, None] * steps["opacity"],
+        v * torch.where(w < 0, -1, 1) / (1 + w.abs()) * steps["rotation"],
+    )
+    numbers = torch.cat([part.round().long() for part in parts], dim=1).numpy()
+    numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue go with green
+    wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
+    wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")  # the sign is the last bit: high bytes are mostly 0
+    packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
+    return (
+        packer.compress(wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes())
+        + packer.flush()
+    )
+
+
+def unpack(
+    packed: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians
+) -> Gaussians:
+    """The Gaussians of :func:`pack`, on the CPU. ``like``: has their constants."""
+    planes = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
+    wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
+    centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
+    narrow = planes[4 * _WIDE :].T.astype(np.int64).cumsum(0)
+    narrow[:, [3, 5]] += narrow[:, [4]]
+    scales, colors, rotations = (torch.from_numpy(part) for part in np.split(narrow, [3, 7], axis=1))
+    turned = _signed(rotations) / steps["rotation"]
+    square = turned.square().sum(1, keepdim=True)
+    values = {
+        "means": center.cpu() + centers * (pixel / steps["center"]),
+        "scales": pixel * (_signed(scales) / steps["scale"]).exp(),
+        "quaternions": torch.cat([1 - square, 2 * turned], dim=1) / (1 + square),
+        "colors": (colors[:, :3] & 255) / 255,
+        "opacities": (colors[:, 3] & 255) / steps["opacity"],
+    }
+    values = {name: value.float() for name, value in values.items()}
+    return dataclasses.replace(like, **values, image=None, pixel=None, splits=(len(centers),))
+
+
+def _signed(numbers: Tensor) -> Tensor:
+    """Whole numbers modulo 256 as those from -128 to 127."""
+    return (numbers + 128 & 255) - 128
 
 
 def page(

@@ -19,7 +19,7 @@ from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
 from ghgs_lit.prediction.export.compact import visible_first
 from ghgs_lit.prediction.export.ply import read_ply
-from ghgs_lit.prediction.export.world import AXES
+from ghgs_lit.prediction.export.subject import AXES
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import colorize, to_uint8

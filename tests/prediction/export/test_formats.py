@@ -23,8 +23,7 @@ from ghgs_lit.metrics import psnr
 from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
 from ghgs_lit.prediction.export.gltf import EXTENSION, glb_bytes
 from ghgs_lit.prediction.export.maps import input_files
-from ghgs_lit.prediction.export.packed import unpack
-from ghgs_lit.prediction.export.page import page
+from ghgs_lit.prediction.export.page import page, unpack
 from ghgs_lit.prediction.export.ply import SH_CONSTANT, ply_bytes, read_ply
 from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import render
