@@ -1,11 +1,11 @@
 """``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
 
 import contextlib
-import dataclasses
 import json
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
@@ -271,7 +271,7 @@ def write_result(
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)
     if result.refined is not None:
-        facts["refine"] = dataclasses.asdict(result.refined)
+        facts["refine"] = asdict(result.refined)
         print(result.refined, flush=True)
     begin = time.perf_counter()
     paths = write_prediction(directory, result.batch, prediction, renderer, options, facts)

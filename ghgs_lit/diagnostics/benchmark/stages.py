@@ -1,8 +1,8 @@
 """The stages of a forward pass as they are measured: their names, and a pass that is watched."""
 
-import dataclasses
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -51,7 +51,7 @@ def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
 def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tuple[Prediction, Rendering]:
     """Predict the Gaussians of a batch and render its targets, while ``probe`` watches."""
     with watched(model, probe), inside(TOTAL, probe):
-        prediction = model(dataclasses.replace(batch, targets=None))
+        prediction = model(replace(batch, targets=None))
         with inside(RENDER, probe):
             rendering = renderer(prediction.gaussians, batch.targets.cameras)
     return prediction, rendering

@@ -1,9 +1,8 @@
 """Whether a device computes as the CPU does in float64: renderer, stages, gradient of all weights."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -184,11 +183,11 @@ CHECKS = (renderer, stages, gradient)
 def _small_batch(config: Mapping[str, Any]) -> Batch:
     """Two elements of three views of four by four patches, without targets."""
     batch = ellipsoid_batch(0.15, 3, 4 * config["encoder"]["patch_size"], 2)
-    return dataclasses.replace(batch, targets=None)
+    return replace(batch, targets=None)
 
 
 def _in_float64(batch: Batch) -> Batch:
-    return dataclasses.replace(batch, images=batch.images.double(), cameras=batch.cameras.to(torch.float64))
+    return replace(batch, images=batch.images.double(), cameras=batch.cameras.to(torch.float64))
 
 
 def _unsupported(precision: str, device: torch.device) -> str | None:

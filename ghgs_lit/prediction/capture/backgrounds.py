@@ -5,10 +5,9 @@ without the subject. Large parts of a mask that show the background are not the 
 beside it that do not, are. Outlines stay as they are: to say where they run is what mattes are for.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -67,7 +66,7 @@ class _Background:
             return photograph
         matte = photograph.matte.copy()
         matte[box] = found
-        return dataclasses.replace(photograph, matte=matte)
+        return replace(photograph, matte=matte)
 
 
 def _mended(
@@ -150,9 +149,7 @@ class Backgrounds:
     def applied(self, capture: Capture) -> Capture:
         """The capture with masks that are mended where large parts contradict the background."""
         with ThreadPoolExecutor(allowed_cores()) as pool:
-            return dataclasses.replace(
-                capture, photographs=tuple(pool.map(self._mended, capture.photographs))
-            )
+            return replace(capture, photographs=tuple(pool.map(self._mended, capture.photographs)))
 
     def _mended(self, photograph: Photograph) -> Photograph:
         background = self.cameras.get(photograph.name)

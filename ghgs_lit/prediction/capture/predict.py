@@ -1,11 +1,10 @@
 """Gaussians of a capture in the user's world, and of any batch after its cameras are corrected."""
 
-import dataclasses
 import functools
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -101,7 +100,7 @@ def predict(
     forward = functools.partial(in_frame, model)
     result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, forward, temporal)
     why = {name: doubt for name, doubt in why.items() if doubt}
-    return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
+    return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
 
 
 def in_frame(model: GHGS, batch: Batch) -> Prediction:
@@ -135,16 +134,16 @@ def predict_batch(
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
-    prediction = (temporal or forward)(dataclasses.replace(batch, targets=None))
+    prediction = (temporal or forward)(replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
     refined = None
     if refine:
         refinement, before, start = Refinement(refine, renderer), prediction.gaussians, time.perf_counter()
-        prediction = dataclasses.replace(prediction, gaussians=refinement(before, batch))
+        prediction = replace(prediction, gaussians=refinement(before, batch))
         seconds["refine"] = time.perf_counter() - start
-        untold = dataclasses.replace(batch, targets=None)
+        untold = replace(batch, targets=None)
         refined = refinement.report(before, prediction.gaussians, untold, lambda b: forward(b).gaussians)
     return TimedPrediction(batch, prediction, seconds, moved, refined=refined)
 

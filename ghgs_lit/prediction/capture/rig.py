@@ -4,11 +4,10 @@ One instant shows one pose, often with a mask that is wrong somewhere; several t
 cameras, and cameras that are the same in all of them do not flicker.
 """
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -53,14 +52,14 @@ class Rig:
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with the corrected cameras."""
-        return dataclasses.replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
+        return replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
 
     def _corrected(self, photograph: Photograph) -> Photograph:
         """A camera that most instants lack stays as it is."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
         lens = self._zoomed(photograph.name, photograph.intrinsics)
         gains = self.gains.get(photograph.name, photograph.gains)
-        return dataclasses.replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
+        return replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
 
     def _zoomed(self, name: str, intrinsics: np.ndarray) -> np.ndarray:
         zoom = self.zoom.get(name, 1.0)
@@ -84,7 +83,7 @@ class Rig:
             moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
             lens, pose = self._zoomed(name, given.intrinsics), given.extrinsics @ moved
             changed = {"intrinsics": lens, "extrinsics": pose, "gains": corrected.gains}
-            found[name] = (dataclasses.replace(given, **changed), size)
+            found[name] = (replace(given, **changed), size)
         return found
 
 

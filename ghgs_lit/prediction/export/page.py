@@ -1,12 +1,12 @@
 """A single HTML file that shows Gaussians in any browser with WebGL 2, without a network."""
 
 import base64
-import dataclasses
 import html
 import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
@@ -27,7 +27,7 @@ _LARGEST = 1 << 29
 
 
 def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str, int]) -> bytes:
-    """Gaussians of one subject (RGB colours) as few bytes, which ``page.html`` unpacks: deflated planes [22, N].
+    """Gaussians of one subject (RGB colours) as few bytes, which ``page.html`` unpacks: planes [22, N].
 
     A Gaussian is whole numbers: its centre from ``center`` [3] in parts of ``pixel``, the side of a
     photograph's pixel at the subject; the logarithms of its standard deviations, colour and opacity; and its
@@ -74,7 +74,7 @@ def unpack(
         "opacities": (colors[:, 3] & 255) / steps["opacity"],
     }
     values = {name: value.float() for name, value in values.items()}
-    return dataclasses.replace(like, **values, image=None, pixel=None, splits=(len(centers),))
+    return replace(like, **values, image=None, pixel=None, splits=(len(centers),))
 
 
 def _signed(numbers: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
 """One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,12 +47,12 @@ def rotate_world(
     extrinsics = cameras.extrinsics.double().clone()
     extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotation.to(extrinsics.device).mT
     return (
-        dataclasses.replace(
+        replace(
             gaussians,
             means=means.to(gaussians.means.dtype),
             quaternions=quaternions.to(gaussians.quaternions.dtype),
         ),
-        dataclasses.replace(cameras, extrinsics=extrinsics.to(cameras.extrinsics.dtype)),
+        replace(cameras, extrinsics=extrinsics.to(cameras.extrinsics.dtype)),
     )
 
 
@@ -104,9 +103,7 @@ def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
     if gaussians.antialiased:
         ratio = variances / torch.where(wider > 0, wider, 1.0)
         opacities = opacities * ratio.prod(-1).pow(1 / 3)
-    return dataclasses.replace(
-        gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False
-    )
+    return replace(gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False)
 
 
 def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
@@ -121,7 +118,7 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     drawn = smoothed(gaussians, pixel)
     variances = drawn.scales.square() - VIEWER_LOW_PASS * pixel**2
     scales = variances.clamp(min=(_SMALLEST * pixel) ** 2).sqrt()
-    return dataclasses.replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
+    return replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
 
 
 def fitted(

@@ -11,9 +11,8 @@ Photographs do not tell where the whole rig is, so cameras only move beside one 
 (:mod:`ghgs_lit.geometry.motion`); where a minority of them explains the silhouettes, beside the others.
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -94,10 +93,10 @@ class CameraRefinement:
             cameras, is_better = self._corrected(prediction, inside, free, worth)
             if not bool(is_better.any()):
                 break
-            inside, moved = dataclasses.replace(inside, cameras=cameras), moved | is_better
+            inside, moved = replace(inside, cameras=cameras), moved | is_better
         # To the frame and back is not exact.
         left = frame.leave_cameras(inside.cameras, batch.cameras)
-        return dataclasses.replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
+        return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()
     def _coherent(
@@ -113,12 +112,12 @@ class CameraRefinement:
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
             return batch, moved, free, first
-        proposal = dataclasses.replace(batch, cameras=cameras)
+        proposal = replace(batch, cameras=cameras)
         before, after = map(self._disagreement, (batch, proposal))
         is_better = moved & (after < (1 - _FIRST) * before)
         free = free | ~is_better[:, None]
         cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
-        return dataclasses.replace(batch, cameras=cameras), is_better, free, first
+        return replace(batch, cameras=cameras), is_better, free, first
 
     def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
         """The loss of the rounds with the cameras as they are."""
@@ -155,7 +154,7 @@ class CameraRefinement:
         with exact(axes.device.type):
             motion = _of_free(raw.detach().expand(len(axes), -1, -1), axes, free)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
-        corrected = dataclasses.replace(cameras, extrinsics=extrinsics)
+        corrected = replace(cameras, extrinsics=extrinsics)
         return _chosen(is_better[:, None] & free, corrected, cameras), is_better
 
 
@@ -170,7 +169,7 @@ def _of_free(
 def _chosen(which: Bool[Tensor, "B V"], first: Cameras, second: Cameras) -> Cameras:
     """The first cameras of some views, the second of the others."""
     which = which[..., None, None]
-    return dataclasses.replace(
+    return replace(
         first,
         intrinsics=torch.where(which, first.intrinsics, second.intrinsics),
         extrinsics=torch.where(which, first.extrinsics, second.extrinsics),
@@ -201,7 +200,7 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
     counts = tuple(map(len, kept))
     others = gaussians.select(torch.cat(kept), counts)
     if others.metre is not None:
-        others = dataclasses.replace(others, metre=others.metre.repeat_interleave(v))
+        others = replace(others, metre=others.metre.repeat_interleave(v))
     owner = torch.repeat_interleave(torch.tensor(counts, device=element.device))
     cameras = batch.cameras
     lenses, poses = (matrix.flatten(0, 1)[:, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
@@ -221,7 +220,7 @@ def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
     """The Gaussians of each view, moved as if its camera had moved the other way; their axes stay."""
     rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
-    return dataclasses.replace(views.gaussians, means=means)
+    return replace(views.gaussians, means=means)
 
 
 def _loss(drawn: Rendering, views: _Views, batch: Batch) -> Float[Tensor, " B"]:

@@ -6,10 +6,9 @@ near the outlines have none: how far their best points lie beside the other silh
 steps make small. This needs no model and no surface that two photographs share.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from itertools import combinations
 from operator import add
@@ -142,7 +141,7 @@ def coherent_cameras(
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count, device = len(pose) // len(rigs), batch.masks.device
     poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
-    moved = dataclasses.replace(
+    moved = replace(
         cameras, intrinsics=torch.cat(lenses).to(cameras.intrinsics), extrinsics=poses.to(cameras.extrinsics)
     )
     return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
@@ -200,7 +199,7 @@ class _Equations:
         return self.total / max(self.rays, 1)
 
     def __add__(self, other: "_Equations") -> "_Equations":
-        sums = (getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(self))
+        sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
         return _Equations(*sums)
 
     def solved(self, free: Bool[Tensor, " V"]) -> Float[Tensor, "V 7"]:

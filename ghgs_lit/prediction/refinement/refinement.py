@@ -6,10 +6,9 @@ are reproduced, too), so :meth:`Refinement.report` holds one out and predicts ag
 where that one is best was worse than a fixed number of steps: fewer inputs want fewer steps.
 """
 
-import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -125,7 +124,7 @@ class Descent:
             # No step could leave an opacity of exactly 0 or 1.
             logit = torch.logit(start.opacities.clamp(1e-4, 1 - 1e-4))
             changed["opacities"] = torch.sigmoid(logit + change["opacities"])
-        return dataclasses.replace(start, **changed)
+        return replace(start, **changed)
 
 
 class Refinement:

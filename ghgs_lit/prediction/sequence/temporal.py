@@ -8,9 +8,8 @@ renders, and so is a mask that changes more than the body: where they no longer 
 every few instants, all is predicted anew.
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -138,7 +137,7 @@ def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]
     shown = _shown(points, before.cameras, (last.depth[0] / metre).to(points))
     moved, turned = scene_flow(points, shown, before, after)
     half = torch.cat((torch.ones_like(turned[:, :1]), turned / 2), -1)
-    return dataclasses.replace(
+    return replace(
         gaussians,
         means=gaussians.means + (metre * moved).to(gaussians.means),
         quaternions=multiply_quaternions(unit(half).to(gaussians.quaternions), gaussians.quaternions),
@@ -149,7 +148,7 @@ def _around(cameras: Cameras, origin: Float[Tensor, " 3"], metre: float) -> Came
     """The cameras [V] of one element in metres around a point of the world."""
     extrinsics = cameras.extrinsics[0].double().clone()
     extrinsics[:, :3, 3] = (extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]) / metre
-    return dataclasses.replace(cameras, intrinsics=cameras.intrinsics[0], extrinsics=extrinsics)
+    return replace(cameras, intrinsics=cameras.intrinsics[0], extrinsics=extrinsics)
 
 
 def _shown(
@@ -172,9 +171,9 @@ def _as_drawn(
     mean = torch.where(counts > 0, sums / counts.clamp(min=1), 1)
     depth = torch.where(valid, torch.where(drawn, depth, mean), 1)
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
-    points = dataclasses.replace(prediction.points, pixels=pixels, valid=valid)
-    maps = dataclasses.replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
-    return dataclasses.replace(
+    points = replace(prediction.points, pixels=pixels, valid=valid)
+    maps = replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
+    return replace(
         prediction,
         gaussians=gaussians,
         depth=depth,

@@ -1,7 +1,7 @@
 """Finished pieces of work are kept, whatever happens to the process that writes them."""
 
+from ghgs_lit.diagnostics.stress import run
 from ghgs_lit.diagnostics.stress.run import Journal
-from ghgs_lit.runs import journal
 
 
 def test_what_is_done_is_there_after_a_kill(tmp_path):
@@ -25,5 +25,5 @@ def test_rows_of_other_code_are_not_taken_over(tmp_path, monkeypatch, capsys):
     Journal(path).add("a", [])
     Journal(path).say_done(["a", "b"], "pieces")
     assert capsys.readouterr().out == f"{path}: 1 of 2 pieces are done already\n"
-    monkeypatch.setattr(journal, "code_digest", lambda: "other")
+    monkeypatch.setattr(run, "code_digest", lambda: "other")
     assert "a" not in Journal(path)
