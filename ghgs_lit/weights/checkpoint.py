@@ -31,16 +31,10 @@ _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     """Read a checkpoint of this package, with frozen weights that it shares with others (:mod:`.frozen`).
-
-    Args:
-        path: the file; its tensors are mapped from the disk, not read.
-        whole: read every byte once and refuse a file that was damaged since it was written (2 s for 1 GB).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: the file is not a checkpoint of this package, or its frozen weights are missing; names
-            what was expected and found.
-    """
+    ``path``: the file; its tensors are mapped from the disk, not read. ``whole``: read every byte once and
+    refuse a file that was damaged since it was written (2 s for 1 GB). FileNotFoundError: there is no such
+    file. InputError: the file is not a checkpoint of this package, or its frozen weights are missing; names
+    what was expected and found."""
     _check_sums(path, whole)
     checkpoint = open_file(path)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
@@ -172,18 +166,15 @@ def write_checkpoint(
 def load_weights(
     model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
 ) -> None:
-    """Give a model the weights of a checkpoint, mapped from the file, not copied.
+    """Give a model the weights of a checkpoint, mapped from the file, not copied. FileNotFoundError: there is
+    no such file. InputError: the file is not a checkpoint of this package, or its weights are not finite or
+    do not fit the model.
 
     Args:
         model: a :class:`ghgs_lit.model.GHGS`; its own weights may be on the meta device.
         dtype: of the encoder (None: as in the file, on a CPU float32 in place of a half precision that it
             lacks); the heads are float32 or wider.
         device: where the weights will be moved to.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: the file is not a checkpoint of this package, or its weights are not finite or do not fit
-            the model.
     """
     checkpoint = read_checkpoint(path, whole=True)
     require_fit(model, model_state(checkpoint), path)

@@ -168,17 +168,14 @@ def import_weights(
 ) -> list[str]:
     """Write a checkpoint with published weights; returns a report.
 
-    The published tensors are mapped from their files and written from there.
+    The published tensors are mapped from their files and written from there. FileNotFoundError: a file is
+    missing. InputError: a tensor does not fit; names the file, the tensor and both shapes.
 
     Args:
         state: the model's tensors. Those on the meta device must come from the files, others may keep
             their values.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
         dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
     files = list(sources(vggt, release))
     for source in files:

@@ -74,15 +74,8 @@ class Case:
 
 
 def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The values of presets by name.
-
-    Args:
-        names: files of ``conf/skip``.
-        configured: the node ``skip`` of the run, whose values its own preset has, overrides included.
-
-    Raises:
-        InputError: there is no such file.
-    """
+    """The values of presets by name. ``names``: files of ``conf/skip``. ``configured``: the node ``skip`` of
+    the run, whose values its own preset has, overrides included. InputError: there is no such file."""
     return {
         name: dict(configured) if name == configured["name"] else read_option("skip", name, "presets")
         for name in names
@@ -121,13 +114,10 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """The cases of a model; they share one copy of the weights. InputError: a preset or knob that the
-    model refuses, or to which the weights do not fit.
-
-    Args:
-        presets: of :func:`presets_of`; the yardstick comes first, without knobs, where it is among them.
-        knobs: values of each knob, by key; every preset is measured with every combination.
-    """
+    """The cases of a model; they share one copy of the weights. InputError: a preset or knob that the model
+    refuses, or to which the weights do not fit. ``presets``: of :func:`presets_of`; the yardstick comes
+    first, without knobs, where it is among them. ``knobs``: values of each knob, by key; every preset is
+    measured with every combination."""
     choices = [(name, change) for name in presets for change in combinations(knobs)]
     if YARDSTICK in presets:
         choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]

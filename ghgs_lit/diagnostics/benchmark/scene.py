@@ -31,15 +31,9 @@ def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
 def ellipsoid_batch(
     share: float, views: int, size: int | tuple[int, int], batch: int, seed: int = 0
 ) -> Batch:
-    """Photographs of noise on an ellipsoid of revolution, which looks the same in every view.
-
-    Args:
-        share: part of the frame that the subject covers.
-        size: side, or height and width, of the photographs in pixels.
-
-    Returns:
-        The batch; its target is the first input view.
-    """
+    """Photographs of noise on an ellipsoid of revolution, which looks the same in every view. Returns: The
+    batch; its target is the first input view. ``share``: part of the frame that the subject covers. ``size``:
+    side, or height and width, of the photographs in pixels."""
     size = (size, size) if isinstance(size, int) else size
     rig = Rig(look_at=(0.0, 0.0, 0.0), pitch=0.0, focal=1.0, shift_y=0.0)
     yaws = np.tile(np.arange(views) * 360.0 / views, (batch, 1))

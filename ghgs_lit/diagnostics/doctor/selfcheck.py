@@ -45,11 +45,8 @@ class Outcome:
 
 def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
     """All checks, each outcome as soon as it is known; an error ends its check alone, and is an outcome.
-
-    Args:
-        config: of a run of ``ghgs train``; its model gets random weights.
-        device: what is compared with the CPU.
-    """
+    ``config``: of a run of ``ghgs train``; its model gets random weights. ``device``: what is compared with
+    the CPU."""
     for check in CHECKS:
         try:
             yield from check(config, device)

@@ -22,13 +22,8 @@ def camera_sheet(
 
     The first picture of a row of lines has points of the mask, the others the lines on which each must be,
     where it is as far away as the subject: a line passes the same part of the body in every photograph.
-
-    Args:
-        images: photographs [h, w, 3] uint8.
-        views: masks of the photographs' sizes with their cameras.
-
-    Returns:
-        [H, W, 3] uint8.
+    Returns: [H, W, 3] uint8. ``images``: photographs [h, w, 3] uint8. ``views``: masks of the photographs'
+    sizes with their cameras.
     """
     focus, radius = subject_sphere(views)
     small = [_smaller(view) for view in views]

@@ -43,7 +43,8 @@ ENOUGH = 3
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """``folder.photographs(instant)`` for each of ``folder.instants``.
+    """``folder.photographs(instant)`` for each of ``folder.instants``. InputError: a folder or file is
+    missing or wrong.
 
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each instant; or of
@@ -57,9 +58,6 @@ class CaptureFolder:
             :class:`ghgs_lit.config.nodes.Calibration`.
         sequence: which instants count, and how videos fit together: the fields of
             :class:`ghgs_lit.config.nodes.Sequence`.
-
-    Raises:
-        InputError: a folder or file is missing or wrong.
     """
 
     images: str | Path | Mapping[str, Frame]
@@ -163,11 +161,9 @@ class CaptureFolder:
     def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied.
 
-        They are kept until :meth:`photographs` has them, or those of another instant are decoded.
-
-        Raises:
-            InputError: a photograph or mask is missing or wrong; of several instants one may lack photographs
-                (:attr:`missing`) where three or more remain.
+        They are kept until :meth:`photographs` has them, or those of another instant are decoded. InputError:
+        a photograph or mask is missing or wrong; of several instants one may lack photographs
+        (:attr:`missing`) where three or more remain.
         """
         self.begin(instant)
         return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})

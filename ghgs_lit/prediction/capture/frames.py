@@ -87,7 +87,9 @@ def find_frames(
     sync: Mapping[str, int] | str | None,
     step: int,
 ) -> tuple[dict[str, dict[str, VideoFrame]], str]:
-    """The frames of each instant that all videos show.
+    """The frames of each instant that all videos show. Returns: ``{instant: {camera: frame}}``, instants
+    named by the frame of the first camera; and a line about frames that are left over. InputError: videos and
+    cameras, or videos and one another, do not fit together.
 
     Args:
         masks: folder of masks: a video of the same name for each, or a folder of numbered images; None:
@@ -95,13 +97,6 @@ def find_frames(
         sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
             each frame of the first camera gets the nearest one of every other; None: all began together.
         step: of the instants that will be read.
-
-    Returns:
-        ``{instant: {camera: frame}}``, instants named by the frame of the first camera; and a line about
-        frames that are left over.
-
-    Raises:
-        InputError: videos and cameras, or videos and one another, do not fit together.
     """
     paths = by_camera(folder, images_in(folder, SUFFIXES), cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:

@@ -108,7 +108,8 @@ def live_frames(
 ) -> Iterator[Arrived]:
     """The newest capture whenever one is asked for.
 
-    Dropped is what comes while the one before is in use, and what cannot be read.
+    Dropped is what comes while the one before is in use, and what cannot be read. InputError: the
+    calibration, a video, a camera or the folder is missing or wrong.
 
     Args:
         images: a folder of videos, which are shown at their own rate; or of instants, each a folder that
@@ -119,9 +120,6 @@ def live_frames(
         idle: seconds without a new instant after which a folder of instants ends; None: never.
         clock, sleep: tells seconds, and lets some pass.
         options: as for :class:`CaptureFolder`.
-
-    Raises:
-        InputError: the calibration, a video, a camera or the folder is missing or wrong.
     """
     said, part = options.get("calibration", {}), options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):

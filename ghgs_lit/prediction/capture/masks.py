@@ -51,11 +51,8 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask: where a photograph differs from one without the subject, without specks and holes.
-
-    Raises:
-        InputError: the background's photograph has another size, or nothing differs.
-    """
+    """A mask: where a photograph differs from one without the subject, without specks and holes. InputError:
+    the background's photograph has another size, or nothing differs."""
     from scipy import ndimage  # here: masks of files do not need it
 
     background = read_pixels(path)

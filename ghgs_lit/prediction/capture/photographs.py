@@ -66,11 +66,8 @@ def read_pixels(path: Path) -> Pixels:
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
     """Whether a camera was calibrated with the photograph as it is stored, not as it is shown.
 
-    The size of the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns
-    photographs when it reads them.
-
-    Args:
-        exif: ``auto`` | ``stored`` | ``shown``: what the user says.
+    The size of the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns photographs
+    when it reads them. ``exif``: ``auto`` | ``stored`` | ``shown``: what the user says.
     """
     if exif != "auto" or not pixels.turns:
         return exif == "stored"
@@ -116,16 +113,10 @@ def find_instants(
     """The photographs of each instant: those of the folder itself, or of its folders.
 
     Folders are instants, each with a photograph of every camera; folders with the names of cameras hold one
-    photograph for each instant. Of several instants one may lack photographs.
-
-    Args:
-        names: the camera of a photograph (or of a camera's folder) whose name differs from the camera's.
-
-    Returns:
-        Paths by camera, by instant: ``{instant: {camera: path}}``.
-
-    Raises:
-        InputError: there are none, or photographs and cameras do not fit together.
+    photograph for each instant. Of several instants one may lack photographs. Returns: Paths by camera, by
+    instant: ``{instant: {camera: path}}``. ``names``: the camera of a photograph (or of a camera's folder)
+    whose name differs from the camera's. InputError: there are none, or photographs and cameras do not fit
+    together.
     """
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)

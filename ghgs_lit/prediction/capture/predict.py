@@ -63,7 +63,8 @@ def predict(
     renderer: Renderer | None = None,
     temporal: Temporal | None = None,
 ) -> TimedPrediction:
-    """The Gaussians of a capture.
+    """The Gaussians of a capture. InputError: the checkpoint cannot be used, or the size does not fit the
+    model.
 
     Args:
         model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
@@ -79,9 +80,6 @@ def predict(
         renderer: what refining draws with; None: that of the device.
         temporal: what predicted the instants before, in their order; None: this one has nothing to do with
             them.
-
-    Raises:
-        InputError: the checkpoint cannot be used, or the size does not fit the model.
     """
     if not isinstance(model, GHGS):
         path = file_of(model)

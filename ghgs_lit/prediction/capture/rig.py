@@ -69,10 +69,7 @@ class Rig:
         self, folder: CaptureFolder, captures: Sequence[Capture]
     ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
         """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
-
-        Args:
-            captures: of the folder, with the cameras as they were given.
-        """
+        ``captures``: of the folder, with the cameras as they were given."""
         found = {}
         for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
             stored = folder.file.cameras[name]

@@ -64,11 +64,8 @@ class Video:
 
 
 def read_video(path: Path) -> Video:
-    """What a video's file says of its frames; no frame but the first is decoded.
-
-    Raises:
-        InputError: it is missing, ffmpeg cannot read it or is not installed, or there is no frame.
-    """
+    """What a video's file says of its frames; no frame but the first is decoded. InputError: it is missing,
+    ffmpeg cannot read it or is not installed, or there is no frame."""
     require_file(path, "a video")
     return _read_video(path, path.stat().st_mtime_ns)
 

@@ -71,14 +71,9 @@ class Instants:
         self._seconds += time.perf_counter() - begin
 
     def write(self, directory: Path) -> list[Path]:
-        """Write the files after all instants are added and their own files are written.
-
-        Returns:
-            What was written, the report of these files last; nothing where ``formats`` has none of them.
-
-        Raises:
-            InputError: a file of another origin is in the way.
-        """
+        """Write the files after all instants are added and their own files are written. Returns: What was
+        written, the report of these files last; nothing where ``formats`` has none of them. InputError: a
+        file of another origin is in the way."""
         self.count, self.others = len(self.folders), {n: made for n, made in self.others.items() if made}
         names = self.files
         if not names:

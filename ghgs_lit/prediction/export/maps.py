@@ -91,12 +91,8 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
-    """A camera of this package's JSON.
-
-    Args:
-        intrinsics, extrinsics: arrays [3, 3] and [4, 4].
-        size: (height, width) of its photograph in pixels.
-    """
+    """A camera of this package's JSON. ``intrinsics``, ``extrinsics``: arrays [3, 3] and [4, 4]. ``size``:
+    (height, width) of its photograph in pixels."""
     return {
         "intrinsics": intrinsics.tolist(),
         "extrinsics": extrinsics.tolist(),

@@ -135,7 +135,8 @@ def write_prediction(
 ) -> list[Path]:
     """Write the prediction of one subject, ``sheet.png`` to look at and ``report.json`` about it.
 
-    Lengths in the files are in the unit of the batch's cameras.
+    Lengths in the files are in the unit of the batch's cameras. Returns: What was written, ``report.json``
+    last. InputError: several subjects, or a file of another origin is in the way.
 
     Args:
         directory: files that an earlier prediction wrote are replaced, others stay.
@@ -143,12 +144,6 @@ def write_prediction(
             or with the photographs where it has none.
         renderer: draws the turntable, and the input views for the report.
         facts: further plain data for the report, such as the seconds of each stage.
-
-    Returns:
-        What was written, ``report.json`` last.
-
-    Raises:
-        InputError: several subjects, or a file of another origin is in the way.
     """
     subject = exported_subject(batch, prediction, renderer, options)
     names, seconds = output_files(options, subject.views), {}

@@ -30,13 +30,7 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
     """Note files that are about to be written; those of a run that is cut off are known as ours, too.
-
-    Returns:
-        Files of earlier predictions beside these.
-
-    Raises:
-        InputError: a file of another origin is in the way.
-    """
+    Returns: Files of earlier predictions beside these. InputError: a file of another origin is in the way."""
     require_free(directory, names)
     earlier = _beside(directory, names)
     known = {"files": dict.fromkeys(names), "earlier_files": earlier}

@@ -79,11 +79,8 @@ class CameraRefinement:
         self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with corrected cameras; targets stay as they are.
-
-        Args:
-            batch: photographs, masks and cameras, of two views or more.
-        """
+        """The batch with corrected cameras; targets stay as they are. ``batch``: photographs, masks and
+        cameras, of two views or more."""
         frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
         inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):

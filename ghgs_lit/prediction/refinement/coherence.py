@@ -124,11 +124,9 @@ def coherent_cameras(
     Also returned is which cameras were free to move, and how far rays near outlines pass beside other
     silhouettes, in pixels on average, with the given cameras: 0 to 0.00014 with exact cameras and mattes,
     0.0001 to 0.0004 with four cameras that are off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by
-    three; infinite where no silhouette has an outline.
-
-    Args:
-        batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-        shared: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
+    three; infinite where no silhouette has an outline. ``batch``: in the subject's frame
+    (:class:`ghgs_lit.geometry.frame.Frame`). ``shared``: the elements are instants of one rig, in one frame;
+    its cameras move and zoom alike in all.
     """
     cameras = batch.cameras
     parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)

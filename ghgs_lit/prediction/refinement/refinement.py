@@ -63,15 +63,13 @@ class Report:
 
 
 class Descent:
-    """Gaussians with bounded changes, and the optimiser of these; at first nothing is changed.
+    """Gaussians with bounded changes, and the optimiser of these; at first nothing is changed. InputError:
+    means that belong to no pixel.
 
     Args:
         gaussians: predicted from ``batch``, each at a pixel of an input.
         batch: None where ``means`` are not changed.
         changes: what may change, as of :class:`Refinement`.
-
-    Raises:
-        InputError: means that belong to no pixel.
     """
 
     def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
@@ -142,15 +140,9 @@ class Refinement:
         self.steps, self.renderer, self.changes = steps, renderer, changes
 
     def __call__(self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None) -> Gaussians:
-        """The refined Gaussians.
-
-        Args:
-            gaussians: predicted from ``batch``, each at a pixel of an input.
-            views: numbers of the photographs that take part; None: all.
-
-        Raises:
-            InputError: Gaussians that belong to no pixel.
-        """
+        """The refined Gaussians. ``gaussians``: predicted from ``batch``, each at a pixel of an input.
+        ``views``: numbers of the photographs that take part; None: all. InputError: Gaussians that belong to
+        no pixel."""
         return deque(self.states(gaussians, batch, views), maxlen=1).pop()
 
     def states(
@@ -166,12 +158,9 @@ class Refinement:
 
     def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Predict) -> Report:
         """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
-
-        Args:
-            batch: one element, of which they were predicted.
-            predict: the Gaussians of a batch, here of the inputs without the last: of fewer than four none
-                is held out, since two show too little of a person.
-        """
+        ``batch``: one element, of which they were predicted. ``predict``: the Gaussians of a batch, here of
+        the inputs without the last: of fewer than four none is held out, since two show too little of a
+        person."""
         views = list(range(batch.images.shape[1]))
         inputs = tuple(self._psnr(splats, batch, views) for splats in (gaussians, refined))
         held_out = None

@@ -56,15 +56,12 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 class Viewer:
-    """A running page.
+    """A running page. InputError: viser is not installed, or this machine has no such address.
 
     Args:
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
         layers: cameras, photographs, point cloud and hull are there, too, of the first content alone.
-
-    Raises:
-        InputError: viser is not installed, or this machine has no such address.
     """
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
