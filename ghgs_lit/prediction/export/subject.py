@@ -136,7 +136,8 @@ def fitted(
         count = seen.extrinsics.shape[0]
         # Far apart, so that the two see different sides.
         views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
-        search.step(renderer, wanted.image[:, views], wanted.alpha[:, views], seen[views][None], _WEIGHTS)
+        part = (wanted.image[:, views], wanted.alpha[:, views], seen[views][None])
+        search.step(renderer, part, _WEIGHTS)
     return search.gaussians
 
 

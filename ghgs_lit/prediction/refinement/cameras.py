@@ -28,6 +28,8 @@ from ghgs_lit.prediction.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]
+#: Of the elements of a batch: numbers, and which of its cameras.
+Numbers, Which = Float[Tensor, " B"], Bool[Tensor, "B V"]
 
 #: Steps of the optimiser in each round, and its first step: radians, and half heights of the subject.
 _STEPS, _RATE = 15, 0.006
@@ -48,10 +50,7 @@ _TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
 
 @dataclass(frozen=True)
 class _Views:
-    """The ``n`` views of a batch, each with the Gaussians that are drawn in it and its photograph.
-
-    ``owner`` is the number of the view that each of the ``N`` Gaussians is drawn in.
-    """
+    """The ``n`` views of a batch, each with its photograph and the Gaussians whose ``owner`` it is."""
 
     gaussians: Gaussians
     owner: Int[Tensor, " N"]
@@ -96,13 +95,9 @@ class CameraRefinement:
         return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()
-    def _coherent(
-        self, batch: Batch
-    ) -> tuple[Batch, Bool[Tensor, " B"], Bool[Tensor, "B V"], Float[Tensor, " B"]]:
-        """Elements with coherent silhouettes, which agree better for it, and what a first round must gain.
-
-        The third is which cameras may be wrong: all, but where silhouettes and prediction agree on a few.
-        """
+    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
+        """Elements with coherent silhouettes; which agree better for it; which cameras may be wrong (all, but
+        where silhouettes and prediction agree on a few); and what a first round must gain."""
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
@@ -116,18 +111,25 @@ class CameraRefinement:
         cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
         return replace(batch, cameras=cameras), is_better, free, first
 
-    def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
+    def _disagreement(self, batch: Batch) -> Numbers:
         """The loss of the rounds with the cameras as they are."""
         views = _views(self.predict(batch), batch)
         return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
-    def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Float[Tensor, " B"]:
-        """:func:`_loss`, or its mean over the instants."""
-        loss = _loss(drawn, views, batch)
+    def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
+        """L1 of colours and silhouettes for each pixel of an element's subject, or its mean over instants."""
+        image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
+        # Where no other view shows the surface of the photograph, one sees through to what lies behind it.
+        same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
+        errors = same * (image - views.photographs).abs().mean(1)
+        errors = errors + _OUTLINE * (alpha - views.silhouettes).abs()
+        shape = batch.masks.shape[:2]
+        subject, errors = (each.reshape(*shape, -1).sum((1, 2)) for each in (views.silhouettes, errors))
+        loss = errors / torch.where(subject > 0, subject, 1)
         return loss.mean().expand(len(loss)) if self.shared else loss
 
     def _corrected(
-        self, prediction: Prediction, batch: Batch, free: Bool[Tensor, "B V"], worth: Float[Tensor, " B"]
+        self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
         """Cameras after one round, and which elements agree better by ``worth``; those of the others stay."""
         cameras, losses = batch.cameras, []
@@ -155,21 +157,18 @@ class CameraRefinement:
         return _chosen(is_better[:, None] & free, corrected, cameras), is_better
 
 
-def _of_free(
-    motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Bool[Tensor, "B V"]
-) -> Float[Tensor, "B V 6"]:
+def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
     """Motions of the free cameras: beside one another where all are, and beside the others where some are."""
     all_are = free.all(1)[:, None, None]
     return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
 
 
-def _chosen(which: Bool[Tensor, "B V"], first: Cameras, second: Cameras) -> Cameras:
+def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
     """The first cameras of some views, the second of the others."""
     which = which[..., None, None]
+    lenses = torch.where(which, first.intrinsics, second.intrinsics)
     return replace(
-        first,
-        intrinsics=torch.where(which, first.intrinsics, second.intrinsics),
-        extrinsics=torch.where(which, first.extrinsics, second.extrinsics),
+        first, intrinsics=lenses, extrinsics=torch.where(which, first.extrinsics, second.extrinsics)
     )
 
 
@@ -202,15 +201,8 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
     cameras = batch.cameras
     lenses, poses = (matrix.flatten(0, 1)[:, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
     apart = Cameras(lenses, poses, cameras.height, cameras.width)
-    photographs = at_least_float32(on_black(batch)).flatten(0, 1)
-    return _Views(
-        others,
-        owner,
-        apart,
-        photographs,
-        coverage(batch).flatten(0, 1),
-        prediction.depth.detach().flatten(0, 1),
-    )
+    maps = (at_least_float32(on_black(batch)), coverage(batch), prediction.depth.detach())
+    return _Views(others, owner, apart, *(each.flatten(0, 1) for each in maps))
 
 
 def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
@@ -218,14 +210,3 @@ def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
     rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
     return replace(views.gaussians, means=means)
-
-
-def _loss(drawn: Rendering, views: _Views, batch: Batch) -> Float[Tensor, " B"]:
-    """L1 of colours and silhouettes of each element, for each pixel of its subject."""
-    image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
-    # Where no other view shows the surface of the photograph, one sees through to what lies behind it.
-    same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
-    errors = same * (image - views.photographs).abs().mean(1) + _OUTLINE * (alpha - views.silhouettes).abs()
-    shape = batch.masks.shape[:2]
-    subject, errors = (each.reshape(*shape, -1).sum((1, 2)) for each in (views.silhouettes, errors))
-    return errors / torch.where(subject > 0, subject, 1)

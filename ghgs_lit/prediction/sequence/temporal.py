@@ -43,8 +43,7 @@ _WORSE = 1.5
 
 @dataclass(frozen=True)
 class _Last:
-    """The last instant: its batch, prediction, photographs for the flow, and depth [1, V, 1, H, W] of the
-    inputs' renders."""
+    """The last instant, its photographs for the flow, and depth [1, V, 1, H, W] of the inputs' renders."""
 
     batch: Batch
     prediction: Prediction
@@ -103,9 +102,9 @@ class Temporal:
     ) -> tuple[Prediction, Float[Tensor, " 2"]]:
         """The prediction after some steps, and by how much the inputs' renders before the last one do not
         fit: the error within masks, and the share of the subject beyond its mask in the worst view."""
-        photographs, silhouettes, cameras = seen_by(batch, range(batch.images.shape[1]))
+        photographs, silhouettes, _ = seen = seen_by(batch)
         for _ in range(_STEPS):
-            drawn = self._descent.step(self.renderer, photographs, silhouettes, cameras, _WEIGHTS)
+            drawn = self._descent.step(self.renderer, seen, _WEIGHTS)
         masks, depth = batch.masks[:, :, None], drawn.depth.detach()
         error = ((drawn.image - photographs).abs() * masks).sum() / (3 * masks.sum()).clamp(min=1)
         beyond = (drawn.alpha - silhouettes).clamp(min=0).sum((-2, -1))
@@ -117,10 +116,8 @@ class Temporal:
 
 def _are_equal(first: Batch, second: Batch) -> bool:
     """Whether two instants have the same photographs, mattes and cameras."""
-    pairs = [(first.images, second.images), (coverage(first), coverage(second))]
-    for name in ("intrinsics", "extrinsics"):
-        pairs.append((getattr(first.cameras, name), getattr(second.cameras, name)))
-    return all(torch.equal(one, other) for one, other in pairs)
+    known = ((b.images, coverage(b), b.cameras.intrinsics, b.cameras.extrinsics) for b in (first, second))
+    return all(map(torch.equal, *known))
 
 
 def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]) -> Gaussians:
@@ -173,13 +170,5 @@ def _as_drawn(
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
     points = replace(prediction.points, pixels=pixels, valid=valid)
     maps = replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
-    return replace(
-        prediction,
-        gaussians=gaussians,
-        depth=depth,
-        depth_valid=valid,
-        points=points,
-        depth_maps=maps,
-        rounds=(),
-        drafts=(),
-    )
+    found = {"gaussians": gaussians, "depth": depth, "depth_valid": valid, "points": points}
+    return replace(prediction, **found, depth_maps=maps, rounds=(), drafts=())
