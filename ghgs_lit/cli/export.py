@@ -1,7 +1,5 @@
 """``ghgs export``: a checkpoint to the published names, or to a small one for prediction."""
 
-from pathlib import Path
-
 import torch
 from omegaconf import DictConfig
 
@@ -13,6 +11,7 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_checkpoint
 from ghgs_lit.weights.exporting import export_weights, write_inference
+from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
 
 _PATCHES = 8  # along each side of the photographs that two models are compared on
@@ -48,7 +47,7 @@ def run(cfg: DictConfig) -> None:
     if inference is not None:
         write_inference(checkpoint, inference, config["dtype"])
         found = parity(checkpoint, inference)
-        sizes = (Path(path).stat().st_size / 1e6 for path in (checkpoint, inference))
+        sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
         print(
             f"against the checkpoint, on an ellipsoid: {found['psnr_to_none']:.1f} dB between renders;"

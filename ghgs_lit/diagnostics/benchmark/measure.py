@@ -1,10 +1,8 @@
 """The measurement: what a case computes and predicts, and how long each stage takes."""
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -15,7 +13,7 @@ from ghgs_lit.diagnostics.benchmark.presets import Case
 from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe, PeakProbe, SecondsProbe, forward
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
-from ghgs_lit.prediction.export.ply import write_ply
+from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Prediction, Rendering
@@ -111,16 +109,11 @@ def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Predi
 
 def _counts(prediction: Prediction) -> dict[str, float]:
     gaussians = prediction.gaussians
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{element}.ply" for element in range(len(gaussians.splits))]
-        for element, path in enumerate(paths):
-            write_ply(gaussians[element], path)
-        size = sum(path.stat().st_size for path in paths)
     return {
         "tokens": prediction.points.tokens.shape[0],
         "points": int(prediction.points.valid.sum()),
         "gaussians": len(gaussians),
-        "ply_bytes": size,
+        "ply_bytes": sum(len(ply_bytes(gaussians[element])) for element in range(len(gaussians.splits))),
     }
 
 
@@ -140,24 +133,12 @@ def record_cases(
             for name, value in differences(result, yardstick, batch.masks).items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
-            record.metrics += _metrics(record.case, batch, *result, metrics, device)
+            # The error against the truth, by the measurement of `ghgs evaluate`; its time does not count.
+            found, rendering = result
+            estimate = Estimate(rendering.image, found.depth, found.depth_valid, decisions=found.decisions)
+            measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
+            record.metrics += [{n: value for n, value in row.items() if n != "seconds"} for row in measured]
     times = time_cases(cases, batches, WARMUP, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work, record.times = Work.of(mine), seconds
     return records
-
-
-def _metrics(
-    case: Case,
-    batch: Batch,
-    prediction: Prediction,
-    rendering: Rendering,
-    metrics: ImageMetrics,
-    device: torch.device,
-) -> list[Row]:
-    """The error against the truth, by the measurement of ``ghgs evaluate``; its time does not count."""
-    estimate = Estimate(
-        rendering.image, prediction.depth, prediction.depth_valid, decisions=prediction.decisions
-    )
-    rows = measure(lambda _: estimate, case.label, [batch], metrics, device)
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]

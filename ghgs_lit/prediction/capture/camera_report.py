@@ -121,11 +121,11 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         line = f"{' and '.join(same)} have the same pose: one of them is a copy"
         return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
     if given.score >= AGREES:
-        size = given.size(folder)
-        line = (
-            f"cameras and masks agree ({given.score:.0%} of each mask or more lies in the hull of the others)"
+        size, agree = (
+            given.size(folder),
+            f"{given.score:.0%} of each mask or more lies in the hull of the others",
         )
-        return Diagnosis(True, (line, _size_line(size)), "", (given,), size)
+        return Diagnosis(True, (f"cameras and masks agree ({agree})", _size_line(size)), "", (given,), size)
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:
@@ -180,20 +180,16 @@ def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
             convention = replace(inner, extrinsics=extrinsics, axes=axes)
             if convention == given:
                 continue
-            changed = {
-                key: getattr(convention, key)
-                for key in ("extrinsics", "axes", "intrinsics", "resized")
-                if getattr(convention, key) != getattr(given, key)
-            }
+            changed = [
+                (key, value if isinstance(value, str) else f"{value:.4g}")
+                for key, value in vars(convention).items()
+                if value != getattr(given, key)
+            ]
             yield Hypothesis(
-                f"all cameras: {', '.join(f'{key} {_plain(value)}' for key, value in changed.items())}",
-                " ".join(f"calibration.{key}={_plain(value)}" for key, value in changed.items()),
+                f"all cameras: {', '.join(map(' '.join, changed))}",
+                " ".join(f"calibration.{key}={value}" for key, value in changed),
                 tuple(replace(view, convention=convention) for view in views),
             )
-
-
-def _plain(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def _likely_resize(views: Sequence[StoredView]) -> float:
@@ -207,7 +203,7 @@ def _plausible(view: StoredView) -> bool:
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]
-    return bool((share >= _MIDDLE[0]).all() and (share <= _MIDDLE[1]).all())
+    return bool(((share >= _MIDDLE[0]) & (share <= _MIDDLE[1])).all())
 
 
 def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
@@ -222,7 +218,11 @@ def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
         swapped[i] = replace(one, camera=other.camera)
         swapped[j] = replace(other, camera=one.camera)
         names, blames = f"{one.name} and {other.name}", (one.name, other.name)
-        if one.mask.shape == other.mask.shape and _masks_are_swapped(one, other):
+        # Outlines of the masks may follow edges of the other photograph rather than of their own.
+        if one.mask.shape == other.mask.shape and (
+            _contrast(one, other.mask) * _contrast(other, one.mask)
+            > _contrast(one, one.mask) * _contrast(other, other.mask)
+        ):
             swapped[i], swapped[j] = replace(one, mask=other.mask), replace(other, mask=one.mask)
             yield Hypothesis(f"the masks of {names} are exchanged", "", tuple(swapped), blames)
             continue
@@ -253,12 +253,6 @@ def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
         intrinsics = view.camera.intrinsics * [[factor], [factor], [1.0]]
         says = f"its intrinsics are for photographs {1 / factor:g} times as large"
         yield with_camera(says, intrinsics=intrinsics)
-
-
-def _masks_are_swapped(one: StoredView, other: StoredView) -> bool:
-    """Whether the outlines of the masks follow edges of the other photograph rather than of their own."""
-    as_given = _contrast(one, one.mask) * _contrast(other, other.mask)
-    return _contrast(one, other.mask) * _contrast(other, one.mask) > as_given
 
 
 def _contrast(view: StoredView, mask: np.ndarray) -> float:

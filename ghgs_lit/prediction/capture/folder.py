@@ -14,13 +14,7 @@ from ghgs_lit.config import nodes
 from ghgs_lit.data.silhouettes import implausible
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
-from ghgs_lit.prediction.capture.calibration import (
-    Calibration,
-    Convention,
-    StoredCamera,
-    calibrate,
-    quarter_turned,
-)
+from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera, calibrate, quarter_turned
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.frames import Frame, Source, VideoFrame, find_frames, has_videos
@@ -67,6 +61,8 @@ class CaptureFolder:
     segment: str | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
     sequence: Mapping[str, Any] = field(default_factory=dict)
+    #: The views of one instant that are decoded, or are being decoded.
+    _begun: dict[str, dict[str, Future]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("images", "cameras", "masks", "backgrounds"):
@@ -84,11 +80,6 @@ class CaptureFolder:
     @functools.cached_property
     def _part(self) -> nodes.Sequence:
         return nodes.Sequence.read(self.sequence, "sequence")
-
-    @functools.cached_property
-    def _begun(self) -> dict[str, dict[str, Future]]:
-        """The views of one instant that are decoded, or are being decoded."""
-        return {}
 
     @functools.cached_property
     def file(self) -> CameraFile:
@@ -218,13 +209,17 @@ class CaptureFolder:
         if calibration.distortion.any():
             from ghgs_lit.geometry.undistortion import undistort
 
-            image, matte = undistort(image, matte, _grid(_key(calibration), *size))
+            # Everything that undistortion depends on, as a key of a cache: many instants share it.
+            lens = (
+                *map(tuple, (calibration.intrinsics.ravel(), calibration.distortion)),
+                calibration.fisheye,
+            )
+            image, matte = undistort(image, matte, _grid(*lens, *size))
             expected, lens = "a lens distortion that leaves some of the subject", calibration.distortion
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
-        calibration = quarter_turned(calibration, turns, size)
+        found = quarter_turned(calibration, turns, size)
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
-        cameras = calibration.intrinsics, calibration.extrinsics, calibration.gains
-        return Photograph(name, image, matte, *cameras)
+        return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
@@ -255,14 +250,8 @@ class CaptureFolder:
 _segmenter = functools.cache(segmenter)
 
 
-def _key(calibration: Calibration) -> tuple:
-    """Everything that undistortion depends on, as a key of a cache: many instants share it."""
-    return tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
-
-
 @functools.lru_cache(maxsize=16)
-def _grid(key: tuple, height: int, width: int) -> "torch.Tensor":
+def _grid(intrinsics: tuple, distortion: tuple, fisheye: bool, height: int, width: int) -> "torch.Tensor":
     from ghgs_lit.geometry.undistortion import undistorting_grid
 
-    intrinsics, distortion, fisheye = key
     return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

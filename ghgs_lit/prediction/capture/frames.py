@@ -108,7 +108,10 @@ def find_frames(
         numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
     else:
         numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
-    frames = {name: _frames_of(video, folder, masks, step) for name, video in videos.items()}
+    frames = {}
+    for name, video in videos.items():
+        reader, drawn = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
+        frames[name] = {n: VideoFrame(reader, n, drawn.get(n)) for n in video.numbers.tolist()}
     instants = {
         f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
         for instant, shown in numbers.items()
@@ -164,12 +167,6 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
         shared = pd.merge_asof(shared, found, on="seconds", direction="nearest", tolerance=half)
     entries = shared.drop(columns="seconds").to_dict("records")
     return {entry[first]: {name: int(n) for name, n in entry.items() if n == n} for entry in entries}
-
-
-def _frames_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame]:
-    """The frames of a video by their numbers."""
-    reader, found = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
-    return {n: VideoFrame(reader, n, found.get(n)) for n in video.numbers.tolist()}
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:

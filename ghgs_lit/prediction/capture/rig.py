@@ -57,13 +57,12 @@ class Rig:
     def _corrected(self, photograph: Photograph) -> Photograph:
         """A camera that most instants lack stays as it is."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
-        lens = self._zoomed(photograph.name, photograph.intrinsics)
+        lens = photograph.intrinsics * self._zoom_of(photograph.name)
         gains = self.gains.get(photograph.name, photograph.gains)
         return replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
 
-    def _zoomed(self, name: str, intrinsics: np.ndarray) -> np.ndarray:
-        zoom = self.zoom.get(name, 1.0)
-        return intrinsics * [zoom, zoom, 1.0]
+    def _zoom_of(self, name: str) -> list[float]:
+        return [self.zoom.get(name, 1.0)] * 2 + [1.0]
 
     def calibrations(
         self, folder: CaptureFolder, captures: Sequence[Capture]
@@ -78,9 +77,9 @@ class Rig:
             # A photograph may be turned upright: what moved is the same before.
             corrected = self._corrected(photograph)
             moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
-            lens, pose = self._zoomed(name, given.intrinsics), given.extrinsics @ moved
-            changed = {"intrinsics": lens, "extrinsics": pose, "gains": corrected.gains}
-            found[name] = (replace(given, **changed), size)
+            lens, pose = given.intrinsics * self._zoom_of(name), given.extrinsics @ moved
+            changed = replace(given, intrinsics=lens, extrinsics=pose, gains=corrected.gains)
+            found[name] = changed, size
         return found
 
 
@@ -157,8 +156,7 @@ def _together(batches: Sequence[Batch]) -> Batch:
     names = ("images", "masks", "alpha", "log_gains")
     known = [name for name in names if getattr(batches[0], name) is not None]
     parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}
-    lenses = torch.cat([batch.cameras.intrinsics for batch in batches])
-    poses = torch.cat([batch.cameras.extrinsics for batch in batches])
+    both = ([getattr(batch.cameras, name) for batch in batches] for name in ("intrinsics", "extrinsics"))
+    cameras = Cameras(*map(torch.cat, both), *parts["masks"].shape[2:])
     subjects, views = zip(*((b.subjects[0], b.views[0]) for b in batches), strict=True)
-    cameras = Cameras(lenses, poses, *parts["masks"].shape[2:])
     return Batch(**parts, cameras=cameras, subjects=subjects, views=views)

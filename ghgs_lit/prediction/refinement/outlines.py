@@ -59,7 +59,7 @@ class Outlines:
     def along(
         self, view: int, lens: Tensor, pose: Tensor, start: Tensor, ahead: Tensor, depths: Float[Tensor, " D"]
     ) -> Float[Tensor, "R D"]:
-        """Distances in one silhouette (lens [3, 3], pose [4, 4]) at ``start`` [3] + depth * ``ahead`` [R, 3]."""
+        """Distances in a silhouette (lens [3, 3], pose [4, 4]) at ``start`` [3] + depth ``ahead`` [R, 3]."""
         # From -1 to 1 over the photograph; what is seen of a ray is a ratio of two lines.
         height, width = self.size
         onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens

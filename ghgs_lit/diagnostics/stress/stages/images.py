@@ -22,10 +22,6 @@ def _l1(v: Values) -> Tensor:
     return (v["image"] - v["target"]).abs().flatten(1).mean(1)
 
 
-def _l1_ssim(v: Values) -> Values:
-    return {"l1": _l1(v), "ssim": ssim(v["image"], v["target"])}
-
-
 def _ssim_slowly(v: Values) -> Values:
     """Moments about the mean of each window."""
     x = torch.arange(11, dtype=v["image"].dtype) - 5
@@ -61,11 +57,6 @@ def _metrics(v: Values) -> Values:
     return {"psnr": psnr(v["image"], v["target"]), "flip": flip}
 
 
-def _one_pixel(v: Values) -> Tensor:
-    """Colours that differ by a rounding have a distance of its power 0.1 or so: one pixel of 256 may."""
-    return torch.full((len(v["image"]),), 8.0, dtype=torch.float64)
-
-
 def _clouds(family: str, g: Generator) -> Values:
     middle = inputs.place(family, g)
     count = {"few": 3, "single": 1}.get(family, 20)
@@ -73,10 +64,6 @@ def _clouds(family: str, g: Generator) -> Values:
         "points": inputs.points(family, g, count, middle),
         "surface": middle + 0.3 * inputs.UNITS.get(family, 1.0) * inputs.normal(g, count, 3),
     }
-
-
-def _chamfer(v: Values) -> Values:
-    return {"chamfer": chamfer(v["points"], v["surface"])}
 
 
 def _chamfer_slowly(v: Values) -> Values:
@@ -87,12 +74,14 @@ def _chamfer_slowly(v: Values) -> Values:
 
 STAGES = (
     Stage(
-        "L1 and SSIM", ("images",), _pair, _l1_ssim, 20,
+        "L1 and SSIM", ("images",), _pair,
+        lambda v: {"l1": _l1(v), "ssim": ssim(v["image"], v["target"])}, 20,
         "five blurs of 121 products; the subtraction of moments is in kappa", _ssim_slowly,
         gradients=("image",), kappa=_moments, sizes=_terms, seeds=96,
     ),
     Stage(
-        "Chamfer", ("cameras", "points", "neighbors"), _clouds, case_by_case(_chamfer), 20,
+        "Chamfer", ("cameras", "points", "neighbors"), _clouds,
+        case_by_case(lambda v: {"chamfer": chamfer(v["points"], v["surface"])}), 20,
         "means of squares of differences", case_by_case(_chamfer_slowly), gradients=("points", "surface"),
         seeds=96, ties=("duplicates", "collapsed"),
         excluded=except_for({**inputs.NO_CAMERA, "masked": "takes no masks"}),
@@ -100,6 +89,8 @@ STAGES = (
     Stage(
         "PSNR and FLIP", ("images",), _pair, _metrics, 100,
         "powers 0.42 and 2.4 of colours, seven filters, a power 0.7 of a distance",
-        kappa=_one_pixel, silent="FLIP clamps colours to [0, 1]",
+        # Colours that differ by a rounding have a distance of its power 0.1 or so: one pixel of 256 may.
+        kappa=lambda v: torch.full((len(v["image"]),), 8.0, dtype=torch.float64),
+        silent="FLIP clamps colours to [0, 1]",
     ),
 )  # fmt: skip
