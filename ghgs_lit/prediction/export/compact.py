@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ghgs_lit.prediction.export.ply import stored_values
+from ghgs_lit.prediction.export.ply import ply_bytes, stored_values
 from ghgs_lit.types import Gaussians
 
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
@@ -20,12 +20,12 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 the rotation (w, x, y, z), of which 128 is zero."""
 
 
-def converted(ply: bytes, name: str) -> bytes:
+def converted(name: str, gaussians: Gaussians) -> bytes:
     """The content of a file of another format. ``name``: one of ``CONVERTED``. RuntimeError: gaussforge
     refuses."""
     from gaussforge import GaussForge
 
-    answer = GaussForge().convert(ply, "ply", CONVERTED[name])
+    answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
     if answer.get("error"):
         raise RuntimeError(f"{name}: gaussforge: {answer['error']}")
     return answer["data"]

@@ -6,7 +6,9 @@ import shutil
 import time
 from collections.abc import Iterable
 from functools import partial
+from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -15,7 +17,6 @@ from ghgs_lit.files import write_atomically
 from ghgs_lit.prediction.export.page import COARSE, pack, page, unpack
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
-from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
@@ -103,9 +104,8 @@ class Instants:
         return means - means[0]
 
     def _page(self) -> bytes:
-        first, name = self._first, self.folders[0].parent.name
-        facts = (first.gaussians, first.cameras, first.views, first.up, first.center, name)
-        return page(*facts, self._packed, self._path().tolist(), self.options.fps).encode()
+        name, path = self.folders[0].parent.name, self._path().tolist()
+        return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
         """From a camera that swings about the subject and shows all of it."""
@@ -134,3 +134,35 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
+
+
+# RGB is told apart from video levels by these: a player that guesses the matrix shows other colours.
+_COLORS = (
+    "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
+)
+
+
+def mp4_bytes(pictures: Iterable[np.ndarray], fps: int) -> bytes:
+    """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
+    ``pictures``: at least one; they are taken one after another, so that a long video fits in memory."""
+    import imageio_ffmpeg
+
+    pictures = iter(pictures)
+    first = next(pictures)
+    height, width = first.shape[:2]
+    pad = ((0, height % 2), (0, width % 2), (0, 0))
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "video.mp4")
+        writer = imageio_ffmpeg.write_frames(
+            str(path),
+            (width + width % 2, height + height % 2),
+            fps=fps,
+            quality=8,
+            macro_block_size=2,
+            output_params=[*_COLORS.split(), "-movflags", "+faststart"],
+        )
+        writer.send(None)
+        for picture in chain([first], pictures):
+            writer.send(np.ascontiguousarray(np.pad(picture, pad, mode="edge")))
+        writer.close()
+        return path.read_bytes()

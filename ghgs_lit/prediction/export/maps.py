@@ -50,19 +50,14 @@ def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
     text.add_text("Unit", f"{unit:g} (length of one grey level; 0: no depth)")
     for values in depth:
         yield partial(png, np.nan_to_num(np.round(values / unit)).astype(np.uint16), text)
-    yield partial(
-        _npz,
-        depth=depth,
-        intrinsics=subject.cameras.intrinsics.cpu().numpy(),
-        extrinsics=subject.cameras.extrinsics.cpu().numpy(),
-        views=np.array(subject.views),
-    )
+    cameras = {name: getattr(subject.cameras, name).cpu().numpy() for name in ("intrinsics", "extrinsics")}
 
+    def exact() -> bytes:
+        content = BytesIO()
+        np.savez_compressed(content, depth=depth, **cameras, views=np.array(subject.views))
+        return content.getvalue()
 
-def _npz(**arrays: np.ndarray) -> bytes:
-    content = BytesIO()
-    np.savez_compressed(content, **arrays)
-    return content.getvalue()
+    yield exact
 
 
 def points_ply(subject: ExportedSubject) -> bytes:
@@ -93,12 +88,8 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
     """A camera of this package's JSON. ``intrinsics``, ``extrinsics``: arrays [3, 3] and [4, 4]. ``size``:
     (height, width) of its photograph in pixels."""
-    return {
-        "intrinsics": intrinsics.tolist(),
-        "extrinsics": extrinsics.tolist(),
-        "width": size[1],
-        "height": size[0],
-    }
+    matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
+    return {**matrices, "width": size[1], "height": size[0]}
 
 
 def cameras_json(entries: Mapping[str, dict[str, Any]]) -> str:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ghgs_lit.prediction.export.ply import stored_values
-from ghgs_lit.types import Cameras, Gaussians
-from ghgs_lit.visualization.turntable import pixel_size
+from ghgs_lit.prediction.export.subject import ExportedSubject
+from ghgs_lit.types import Gaussians
 
 #: Steps of a centre in a photograph's pixel, of a standard deviation in a factor of e, of an opacity, and of
 #: each number of a rotation to each side of 0: of one instant, and of each of several that are played.
@@ -47,11 +47,9 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
     numbers[:, [6, 8]] -= numbers[:, [7]]  # red and blue go with green
     wide, narrow = np.split(np.diff(numbers, axis=0, prepend=0), [_WIDE], axis=1)
     wide = ((wide << 1) ^ (wide >> 63)).astype("<u4")  # the sign is the last bit: high bytes are mostly 0
+    planes = wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes()
     packer = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
-    return (
-        packer.compress(wide.view(np.uint8).T.tobytes() + narrow.astype(np.uint8).T.tobytes())
-        + packer.flush()
-    )
+    return packer.compress(planes) + packer.flush()
 
 
 def unpack(
@@ -83,11 +81,7 @@ def _signed(numbers: Tensor) -> Tensor:
 
 
 def page(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    views: Sequence[str],
-    up: Tensor,
-    center: Tensor,
+    subject: ExportedSubject,
     name: str,
     packed: Sequence[bytes] = (),
     path: Sequence[Sequence[float]] = ((0.0, 0.0, 0.0),),
@@ -96,30 +90,25 @@ def page(
     """The text of the page of an instant, or of several that it plays; it has a button for each camera.
 
     Args:
-        gaussians: of one subject, RGB colours; of several instants the first.
-        cameras: of the photographs [V]; the page begins at the first.
-        up: the unit vector [3] that points up.
-        center: the point [3] that it turns about.
-        packed: of each of several instants what :func:`pack` gives with ``COARSE`` and the size of pixels at
-            ``center``.
+        subject: of several instants the first; the page begins at its first camera.
+        packed: of each of several instants what :func:`pack` gives with ``COARSE``.
         path: how far from the first instant the page's camera moves along with the subject [instants, 3].
         fps: instants a second.
     """
-    steps, pixel = COARSE if packed else FINE, pixel_size(cameras, center)
+    gaussians, cameras, center, pixel = subject.gaussians, subject.cameras, subject.center, subject.pixel
+    steps = COARSE if packed else FINE
     packed = packed or [pack(gaussians, pixel, center, steps)]
     scene = {
         "size": [cameras.width, cameras.height],
-        "up": up.tolist(),
+        "up": subject.up.tolist(),
         "target": center.tolist(),
         "pixel": pixel,
         "steps": steps,
         "low_pass": gaussians.low_pass,
         "antialiased": gaussians.antialiased,
         "cameras": [
-            {"name": view, "intrinsics": k, "extrinsics": e}
-            for view, k, e in zip(
-                views, cameras.intrinsics.tolist(), cameras.extrinsics.tolist(), strict=True
-            )
+            {"name": view, "intrinsics": k.tolist(), "extrinsics": e.tolist()}
+            for view, k, e in zip(subject.views, cameras.intrinsics, cameras.extrinsics, strict=True)
         ],
         "path": path,
         "fps": fps,

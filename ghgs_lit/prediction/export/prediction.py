@@ -17,12 +17,12 @@ from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
 from ghgs_lit.prediction.export.gltf import glb_bytes
+from ghgs_lit.prediction.export.instants import mp4_bytes
 from ghgs_lit.prediction.export.maps import depth_files, depth_unit, input_files, png, points_ply
 from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
-from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Gaussians, Prediction
@@ -62,11 +62,6 @@ class Format:
         return names
 
 
-def _converted(name: str) -> Format:
-    contents = _of_viewers(lambda gaussians: converted(ply_bytes(gaussians), name))
-    return Format((f"gaussians.{CONVERTED[name]}",), contents, "gaussforge")
-
-
 def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubject], list]:
     """The contents of a format with one file."""
     return lambda subject: [partial(content, subject)]
@@ -79,15 +74,15 @@ def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubj
 
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
-    **{name: _converted(name) for name in CONVERTED},
+    **{
+        name: Format((f"gaussians.{suffix}",), _of_viewers(partial(converted, name)), "gaussforge")
+        for name, suffix in CONVERTED.items()
+    },
     "splat": Format(("gaussians.splat",), _of_viewers(lambda g: to_records(g).tobytes())),
     "glb": Format(
         ("gaussians.glb",), lambda s: [partial(glb_bytes, s.for_other_renderers, s.up)], "pygltflib"
     ),
-    "html": Format(
-        ("viewer.html",),
-        _one(lambda s: page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()),
-    ),
+    "html": Format(("viewer.html",), _one(lambda s: page(s, s.name).encode())),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
     "mp4": Format(
         ("turntable.mp4",),

@@ -46,14 +46,9 @@ def rotate_world(
     quaternions = multiply_quaternions(quaternion.to(means.device), gaussians.quaternions.double())
     extrinsics = cameras.extrinsics.double().clone()
     extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotation.to(extrinsics.device).mT
-    return (
-        replace(
-            gaussians,
-            means=means.to(gaussians.means.dtype),
-            quaternions=quaternions.to(gaussians.quaternions.dtype),
-        ),
-        replace(cameras, extrinsics=extrinsics.to(cameras.extrinsics.dtype)),
-    )
+    values = {"means": means.to(gaussians.means.dtype), "quaternions": quaternions.to(gaussians.quaternions)}
+    moved = replace(cameras, extrinsics=extrinsics.to(cameras.extrinsics.dtype))
+    return replace(gaussians, **values), moved
 
 
 #: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
@@ -173,15 +168,9 @@ class ExportedSubject:
 
     @cached_property
     def stored(self) -> Gaussians:
-        """The Gaussians as the PLY holds them, which says what image they were made for.
-
-        A renderer adds ``low_pass`` square pixels of its own screen to a Gaussian that was made for the
-        photographs' pixels; with ``smooth`` the file has these already (as the 3D smoothing of
-        Mip-Splatting, Yu et al. 2024), and a larger screen shows no gaps.
-        """
-        if not self.options.smooth:
-            return self.gaussians
-        return smoothed(self.gaussians, self.pixel)
+        """The Gaussians as the PLY holds them, which says what image they were made for; with ``smooth`` they
+        hold what a renderer adds (as of Mip-Splatting, Yu et al. 2024): a larger screen shows no gaps."""
+        return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
@@ -214,11 +203,8 @@ class ExportedSubject:
     def turntable(self) -> list[np.ndarray]:
         """Pictures [h, w, 3] uint8 from all around."""
         orbit = turntable(self.cameras, self.options.frames, self.body)
-        images = (
-            self.renderer(self.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
-            for frame in range(self.options.frames)
-        )
-        return [to_uint8(image) for image in images]
+        seen = (orbit[frame : frame + 1][None] for frame in range(self.options.frames))
+        return [to_uint8(self.renderer(self.gaussians, cameras).image[0, 0]) for cameras in seen]
 
 
 def exported_subject(

@@ -111,10 +111,8 @@ def _read_inputs(directory: Path) -> Batch:
     shapes = {picture.shape for picture in pictures}
     require(len(shapes) == 1, str(directory / "inputs"), "photographs of one size", sorted(shapes))
     values = torch.from_numpy(np.stack(pictures)).movedim(-1, 1).float()[None] / 255
-    stacked = [
-        torch.from_numpy(np.stack([getattr(camera, name) for camera in cameras])).float()[None]
-        for name in ("intrinsics", "extrinsics")
-    ]
+    matrices = ([getattr(c, name) for c in cameras] for name in ("intrinsics", "extrinsics"))
+    stacked = [torch.from_numpy(np.stack(each)).float()[None] for each in matrices]
     colors, alpha = values[:, :, :3], values[:, :, 3:]
     return Batch(
         images=torch.where(alpha > 0, colors * alpha, colors),
