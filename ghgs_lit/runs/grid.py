@@ -3,7 +3,7 @@
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import saved_text
 from ghgs_lit.config.verbs import VERBS
-from ghgs_lit.errors import InputError, require
+from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.runs.job import BUSY, check_config, trains_in_several_processes
 from ghgs_lit.runs.plan import PlannedRun, print_plan, print_results
@@ -132,9 +132,10 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
     todo = [item for item in planned if not item.run.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []
+    require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     while todo:
-        busy = []
-        for jobs in _batches(todo, batch):
+        busy, size = [], batch or len(todo)
+        for jobs in (todo[first : first + size] for first in range(0, len(todo), size)):
             results = launch([item.overrides for item in jobs], len(returns))
             for item, result in zip(jobs, results, strict=True):
                 if result.status == JobStatus.FAILED:
@@ -143,26 +144,11 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
                     busy.append(item)
                 else:
                     returns.append(result)
-        todo = busy
-        _wait_for_one(todo)
+        if todo := busy:
+            print(f"waiting for {', '.join(item.run.owner for item in todo)}", flush=True)
+        while todo and all(item.run.state == State.RUNNING for item in todo):
+            time.sleep(_POLL)
     return returns
-
-
-def _batches(items: list[PlannedRun], size: int | None) -> Iterator[list[PlannedRun]]:
-    if size is not None and size < 1:
-        raise InputError(f"hydra.sweeper.max_batch_size: expected a number of at least 1; found {size}")
-    size = size or len(items)
-    for first in range(0, len(items), size):
-        yield items[first : first + size]
-
-
-def _wait_for_one(items: Sequence[PlannedRun]) -> None:
-    """Return once no process works on one of the runs any more."""
-    if not items:
-        return
-    print(f"waiting for {', '.join(item.run.owner for item in items)}", flush=True)
-    while all(item.run.state == State.RUNNING for item in items):
-        time.sleep(_POLL)
 
 
 def _error(result: JobReturn) -> str:

@@ -47,32 +47,29 @@ def _waits() -> bool:
     return os.environ.get(_VARIABLE) == "wait"
 
 
-def _hash_of_run(*, _root_: DictConfig) -> str:
-    keys = [key for key in _root_ if key != "hydra"]
-    return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
-
-
-def _sqlite(path: str) -> str:
-    place = Path(path).resolve()
-    place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
-    return f"sqlite:///{place}"
-
-
-def _folder(first: str | None, second: str) -> str:
-    return second if first is None else str(Path(first).expanduser())
-
-
 def register_resolvers() -> None:
     """Register what configurations may ask for.
 
     ``${config_hash:}`` is a run's directory, ``${sqlite:path}`` a database's URL, ``${folder:first,second}``
     the first of two folders, or the second where that is null.
     """
+
+    def hash_of_run(*, _root_: DictConfig) -> str:
+        keys = [key for key in _root_ if key != "hydra"]
+        return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
+
+    def sqlite(path: str) -> str:
+        place = Path(path).resolve()
+        place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
+        return f"sqlite:///{place}"
+
+    def folder(first: str | None, second: str) -> str:
+        return second if first is None else str(Path(first).expanduser())
+
     is_old = omegaconf.__version__.startswith("2.3")
     register = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver
-    register("folder", _folder, replace=True)
-    register("config_hash", _hash_of_run, replace=True)
-    register("sqlite", _sqlite, replace=True)
+    for name, resolver in (("folder", folder), ("config_hash", hash_of_run), ("sqlite", sqlite)):
+        register(name, resolver, replace=True)
 
 
 def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:

@@ -40,7 +40,9 @@ def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
         if not isinstance(found, kind):
-            hint = " (`ghgs import` makes a checkpoint of published weights)" * _is_published(checkpoint)
+            names = map(str, checkpoint) if isinstance(checkpoint, Mapping) else ()
+            is_published = any(name == RELEASE_ENTRY or name.startswith(tuple(VGGT)) for name in names)
+            hint = " (`ghgs import` makes a checkpoint of published weights)" * is_published
             raise InputError(
                 f"{path}: expected a checkpoint with {key!r}; found {describe(checkpoint)}{hint}"
             )
@@ -85,12 +87,6 @@ def _check_sums(path: str | Path, whole: bool) -> None:
                             pass
     except (zipfile.BadZipFile, EOFError, RuntimeError) as error:
         raise InputError(f"{path}: expected the bytes that were written; found others ({error})") from error
-
-
-def _is_published(content: Any) -> bool:
-    return isinstance(content, Mapping) and any(
-        name == RELEASE_ENTRY or str(name).startswith(tuple(VGGT)) for name in content
-    )
 
 
 def describe(content: Any) -> str:

@@ -55,10 +55,6 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | Non
         write_atomically(path, lambda temporary: torch.save(content, temporary))
 
 
-_NOWHERE = {"resume": None, "init_from": None}  # paths of the machine that trained it
-_FACTS = ("imported",)  # what loading reads beside weights and configuration
-
-
 def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
     """Write the model of ``checkpoint`` without optimizer, losses and progress. InputError: a weight is too
     large for ``dtype``, or both are one file. ``dtype``: of all weights: ``float16``, ``bfloat16`` or
@@ -68,5 +64,7 @@ def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> Non
     content = read_checkpoint(checkpoint, whole=True)
     state = cast(lambda: model_state(read_checkpoint(checkpoint)), lambda *_: getattr(torch, dtype))
     require_finite(state, f"{checkpoint} as {dtype}")
-    facts = {name: content[name] for name in _FACTS if name in content}
-    write_checkpoint(path, state, {**content["config"], **_NOWHERE}, **facts)
+    # Without paths of the machine that trained it, with what loading reads beside weights and configuration.
+    config = {**content["config"], "resume": None, "init_from": None}
+    facts = {"imported": content["imported"]} if "imported" in content else {}
+    write_checkpoint(path, state, config, **facts)

@@ -42,19 +42,15 @@ class Outcome:
     gradient: float = 0.0
 
 
-def make_cases(stage: Stage, family: str, seeds: Sequence[int]) -> Values:
-    """Stacked inputs [n, ...] in float64; a case depends on stage, family and seed only."""
-    keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in seeds]
-    return stack([stage.make(family, torch.Generator().manual_seed(key)) for key in keys])
-
-
 def measure(
     stage: Stage, family: str, seeds: Sequence[int], dtypes: Sequence[str] | None = None
 ) -> list[Row]:
     """The cells of a family: one for each dtype of the stage (or for those of ``dtypes`` among them)."""
     started = time.perf_counter()
     chosen = [dtype for dtype in stage.dtypes if dtypes is None or dtype in dtypes]
-    cases = make_cases(stage, family, seeds)
+    # A case depends on stage, family and seed only.
+    keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in seeds]
+    cases = stack([stage.make(family, torch.Generator().manual_seed(key)) for key in keys])
     if family in PLANTED:
         check = partial(_planted, stage, PLANTED[family], cases, seeds)
     elif family in stage.refused:

@@ -1,7 +1,6 @@
 """All cases of a run: divided among processes, written as they end, and not computed twice."""
 
 import json
-import os
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -10,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -19,10 +17,9 @@ from ghgs_lit.diagnostics.stress.measure import Row, measure
 from ghgs_lit.diagnostics.stress.stage import FAMILIES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
+from ghgs_lit.files import append_line
 from ghgs_lit.readers import read_lines_of_json
 from ghgs_lit.runs.progress import track
-
-Rows = list[dict[str, Any]]
 
 
 @cache
@@ -34,45 +31,18 @@ def code_digest() -> str:
     return f"{digest:08x}"
 
 
-class Journal:
+class Journal(dict[str, list[Row]]):
     """Rows of finished pieces by key; those that an earlier run with the same code wrote are there."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._done = dict(self._read())
+        entries = read_lines_of_json(path) if path.exists() else ()
+        super().__init__((e["key"], e["rows"]) for e in entries if e.get("code") == code_digest())
 
-    def __contains__(self, key: str) -> bool:
-        return key in self._done
-
-    def __getitem__(self, key: str) -> Rows:
-        return self._done[key]
-
-    def add(self, key: str, rows: Rows) -> None:
+    def add(self, key: str, rows: list[Row]) -> None:
         """Note a finished piece; its line is on its way to the disk when this returns."""
-        line = json.dumps({"key": key, "code": code_digest(), "rows": rows})
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("ab") as file:
-            if file.tell() and not self._ends_whole():
-                line = "\n" + line
-            file.write(line.encode() + b"\n")
-        self._done[key] = rows
-
-    def say_done(self, keys: Sequence[str], what: str) -> None:
-        """Print how many of ``keys`` are there already, if any are."""
-        if count := sum(key in self for key in keys):
-            print(f"{self.path}: {count} of {len(keys)} {what} are done already", flush=True)
-
-    def _ends_whole(self) -> bool:
-        """False where a process was killed while it wrote the last line."""
-        with self.path.open("rb") as file:
-            file.seek(-1, os.SEEK_END)
-            return file.read() == b"\n"
-
-    def _read(self) -> Iterator[tuple[str, Rows]]:
-        """Lines of other code, and a last line that was cut off, are left out."""
-        for entry in read_lines_of_json(self.path) if self.path.exists() else ():
-            if entry.get("code") == code_digest():
-                yield entry["key"], entry["rows"]
+        append_line(self.path, json.dumps({"key": key, "code": code_digest(), "rows": rows}))
+        self[key] = rows
 
 
 @dataclass(frozen=True)
@@ -118,8 +88,9 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
     """The rows of all tasks; those that ``journal`` has already are read from it. ``journal``: a file of one
     line for each task, which is written as the tasks end. ``workers``: processes; 0: this one."""
     done = Journal(journal)
-    done.say_done([task.key for task in tasks], "families")
     left = [task for task in tasks if task.key not in done]
+    if count := len(tasks) - len(left):
+        print(f"{journal}: {count} of {len(tasks)} families are done already", flush=True)
     with _mapping(workers) as map_tasks:
         for task, rows in zip(track(left, "stages and families"), map_tasks(Task.run, left), strict=True):
             done.add(task.key, rows)
