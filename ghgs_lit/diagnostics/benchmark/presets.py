@@ -31,12 +31,8 @@ ROUNDS_AMPLIFY = 1000
 
 @dataclass(frozen=True)
 class Source:
-    """Weights and the configuration that fits them.
-
-    Args:
-        config: with :data:`MODEL_NODES`.
-        checkpoint: path of the weights; None: random ones.
-    """
+    """Weights and the configuration that fits them. ``config``: with :data:`MODEL_NODES`. ``checkpoint``:
+    path of the weights; None: random ones."""
 
     config: Mapping[str, Any]
     checkpoint: str | None

@@ -105,12 +105,8 @@ def _command(path: Path, pixels: str, *output: str, select: str = "1", **source:
 
 
 class Reader:
-    """Frames of one video, decoded in order as they are asked for; elsewhere it is sought.
-
-    Args:
-        pixels: ``rgb24`` | ``gray``.
-        step: frames between those that will be asked for: others never reach Python.
-    """
+    """Frames of one video, decoded in order as they are asked for; elsewhere it is sought. ``pixels``:
+    ``rgb24`` | ``gray``. ``step``: frames between those that will be asked for: others never reach Python."""
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
         self.video, self.pixels, self.step = video, pixels, step

@@ -32,11 +32,8 @@ class Instants:
     """Files beside the folders of several instants: for ``html`` ``viewer.html``; for ``ply``
     ``sequence/0000.ply`` and so on, which other programs import as a sequence; for ``mp4`` ``instants.mp4``.
 
-    The cameras of page and video follow the mean of the subject, smoothed over a second.
-
-    Args:
-        count: how many instants there may be.
-        others: names and, once they are known, contents of further files.
+    The cameras of page and video follow the mean of the subject, smoothed over a second. ``count``: how many
+    instants there may be. ``others``: names and, once they are known, contents of further files.
     """
 
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
