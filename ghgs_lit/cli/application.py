@@ -102,9 +102,7 @@ def read_yaml_quickly() -> None:
 @contextmanager
 def composed_once(arguments: Sequence[str]) -> Iterator[None]:
     """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
-
-    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name.
-    """
+    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name."""
     says = any(key in text for text in arguments for key in ("sweep", "hydra.mode", "hydra.searchpath"))
     if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
         yield
@@ -117,10 +115,8 @@ def composed_once(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced.
-
-    A file of ``sweep`` asks for a sweep, which Hydra 1.4 wants to know before it composes.
-    """
+    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced. A file of
+    ``sweep`` asks for a sweep, which Hydra 1.4 wants to know before it composes."""
     sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
         return [*arguments, "hydra.mode=MULTIRUN"]

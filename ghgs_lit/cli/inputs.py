@@ -102,11 +102,9 @@ def with_trained_data(cfg: DictConfig) -> DictConfig:
 
 
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
-    """The nodes that describe the model of a checkpoint, with what the command line changes in it.
-
-    Only what was said counts: the options that a verb composes by default describe another model. InputError:
-    the command line changes what the weights were trained for; names the key.
-    """
+    """The nodes that describe the model of a checkpoint, with what the command line changes in it. Only what
+    was said counts: the options that a verb composes by default describe another model. InputError: the
+    command line changes what the weights were trained for; names the key."""
     trained = read_checkpoint(checkpoint)["config"]
     for stage in STAGES:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
@@ -146,9 +144,7 @@ def _require_ablation(trained: Mapping[str, Any]) -> None:
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
     """``config`` that measures the protocol of ``targets=<option>`` alone, where that was said.
-
-    ``evaluation.targets`` says so for several protocols, and wins.
-    """
+    ``evaluation.targets`` says so for several protocols, and wins."""
     keys = said()
     if "targets" not in keys or is_below("evaluation.targets", keys):
         return config

@@ -99,9 +99,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     """Predict each instant of a folder of photographs; several get a folder each, and files of all.
-
-    InputError: none of them can be read.
-    """
+    InputError: none of them can be read."""
     folder, options = capture_folder(config), output_options(config)
     several, inputs = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
@@ -218,10 +216,8 @@ def moved_line(moved: dict[str, float]) -> str:
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
-    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile.
-
-    Of several instants those without enough photographs are left out; it prints what is missing.
-    """
+    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile. Of
+    several instants those without enough photographs are left out; it prints what is missing."""
     names = folder.instants
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])

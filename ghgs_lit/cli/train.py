@@ -154,10 +154,8 @@ def _run(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> f
 
 
 def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train, save the last weights, measure them; returns the mean PSNR of the first protocol.
-
-    ``stats`` gets the ``steps`` and ``seconds`` that are trained here.
-    """
+    """Train, save the last weights, measure them; returns the mean PSNR of the first protocol. ``stats`` gets
+    the ``steps`` and ``seconds`` that are trained here."""
     if rank_zero_only.rank == 0:
         write_config(config, directory)
         say_which_model()

@@ -72,10 +72,8 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
 def combinations(
     params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
 ) -> list[list[str]]:
-    """The overrides of each job; the command line's values of a key replace the sweep's own.
-
-    ``loader`` knows the options of groups, which ``glob(*)`` stands for.
-    """
+    """The overrides of each job; the command line's values of a key replace the sweep's own. ``loader`` knows
+    the options of groups, which ``glob(*)`` stands for."""
     parser = OverridesParser.create(config_loader=loader)
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
@@ -123,12 +121,9 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
-    """Launch runs until each one is done, here or elsewhere, or has failed.
-
-    A job whose run another process works on returns ``BUSY``: it is launched again once that process has
-    finished or died. ``launch`` starts jobs, given their overrides and the number of the first; ``batch`` of
-    them at once, None: all.
-    """
+    """Launch runs until each one is done, here or elsewhere, or has failed. A job whose run another process
+    works on returns ``BUSY``: it is launched again once that process has finished or died. ``launch`` starts
+    jobs, given their overrides and the number of the first; ``batch`` of them at once, None: all."""
     todo = [item for item in planned if not item.run.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []

@@ -48,10 +48,8 @@ def _waits() -> bool:
 
 
 def register_resolvers() -> None:
-    """Register what configurations may ask for.
-
-    ``${config_hash:}`` is a run's directory, ``${sqlite:path}`` a database's URL, ``${folder:first,second}``
-    the first of two folders, or the second where that is null.
+    """Register what configurations may ask for. ``${config_hash:}`` is a run's directory, ``${sqlite:path}``
+    a database's URL, ``${folder:first,second}`` the first of two folders, or the second where that is null.
     """
 
     def hash_of_run(*, _root_: DictConfig) -> str:
@@ -98,10 +96,8 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
 
 
 def train_in_own_process(run: RunDirectory) -> float | str | None:
-    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process.
-
-    The new process locks the run, so that the lock stays when this process dies.
-    """
+    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process. The new
+    process locks the run, so that the lock stays when this process dies."""
     hydra = HydraConfig.get()
     command = [sys.executable, "-m", "ghgs_lit", hydra.job.name, *hydra.overrides.task]
     command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]

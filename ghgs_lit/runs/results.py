@@ -48,10 +48,8 @@ def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
-    """Means over subjects for each method, number of views and kind of target.
-
-    A subject's targets are averaged first, so that each subject counts once.
-    """
+    """Means over subjects for each method, number of views and kind of target. A subject's targets are
+    averaged first, so that each subject counts once."""
     names = metric_names(rows)
     return [
         {

@@ -96,10 +96,8 @@ class RunDirectory:
 
     @contextlib.contextmanager
     def session(self, **facts: Any) -> Iterator[dict[str, Any]]:
-        """Log that this process works on the run, with ``facts``, and how it ends.
-
-        Gives a dict for numbers such as steps and seconds, which are logged at the end.
-        """
+        """Log that this process works on the run, with ``facts``, and how it ends. Gives a dict for numbers
+        such as steps and seconds, which are logged at the end."""
         self._log({"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), **facts})
         stats: dict[str, Any] = {}
         try:

@@ -17,10 +17,8 @@ _SHARE = 0.95
 
 
 def subject_points(gaussians: Gaussians) -> Tensor:
-    """Centres [n, 3] of the opaque Gaussians of one subject without the outermost; float64.
-
-    Of all Gaussians where none is opaque.
-    """
+    """Centres [n, 3] of the opaque Gaussians of one subject without the outermost; float64. Of all Gaussians
+    where none is opaque."""
     opaque = gaussians.opacities >= _OPAQUE
     points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
     if not len(points):
@@ -36,10 +34,8 @@ def center_of(points: Tensor, cameras: Cameras) -> Tensor:
 
 
 def pixel_size(cameras: Cameras, center: Tensor | None = None) -> float:
-    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V].
-
-    None: where the optical axes meet.
-    """
+    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V]. None: where the optical
+    axes meet."""
     away = (look_at_point(cameras) if center is None else center) - cameras.centers
     depths = (away * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())

@@ -188,10 +188,8 @@ def load_weights(
 
 def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
     """Compare the tokens that take part in a model with those that a checkpoint's training has shown.
-
     ``skip=auto`` leaves out presets that it did not show. The authors' training showed all tokens: fewer give
-    a warning.
-    """
+    a warning."""
     is_release = "release" in (checkpoint.get("imported") or {})
     if model.auto is not None:
         model.auto = model.auto.trained_by({} if is_release else checkpoint["config"])

@@ -71,10 +71,8 @@ def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
     """``checkpoint``, which was read at ``path``, with the tensors of the file that it refers to, if any.
-
     ``whole``: read every byte of these and refuse others than those that were written. InputError: there is
-    no such file beside the checkpoint, or it holds something else.
-    """
+    no such file beside the checkpoint, or it holds something else."""
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)
     place, reference = f"{path}: frozen_file", checkpoint["frozen_file"]

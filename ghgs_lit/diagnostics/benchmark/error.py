@@ -28,10 +28,8 @@ def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf)
 
 
 def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
-    """Indices of the Gaussians that belong to the same input pixel in both.
-
-    A preset may drop or merge Gaussians: those without a partner are left out.
-    """
+    """Indices of the Gaussians that belong to the same input pixel in both. A preset may drop or merge
+    Gaussians: those without a partner are left out."""
     if found.image is None or expected.image is None:
         n = min(len(found), len(expected))
         return torch.arange(n), torch.arange(n)

@@ -77,10 +77,8 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
-    """What presets promise and do not keep, in one line each.
-
-    A loss of PSNR says nothing about weights that nobody trained; a difference does.
-    """
+    """What presets promise and do not keep, in one line each. A loss of PSNR says nothing about weights that
+    nobody trained; a difference does."""
     return [f"{row['preset']}: {said}" for row in totals(rows) for said in _broken(row)]
 
 

@@ -46,10 +46,8 @@ def ellipsoid_batch(
 
 @torch.no_grad()
 def random_model(config: Mapping[str, Any], seed: int = 0) -> GHGS:
-    """A model with random weights, without the time of the usual initialisation.
-
-    No last layer is 0, as it is at the start of training: every output depends on the photographs.
-    """
+    """A model with random weights, without the time of the usual initialisation. No last layer is 0, as it is
+    at the start of training: every output depends on the photographs."""
     generator = torch.Generator().manual_seed(seed)
     with torch.device("meta"):
         model = GHGS.from_config(config)

@@ -58,11 +58,9 @@ def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tu
 
 
 class PeakProbe(Watcher):
-    """The peak memory of each stage, of the process on a CPU, of all tensors on CUDA.
-
-    ``peaks`` are bytes in addition to what was held when the first stage began: weights and photographs do
-    not count. On systems without Linux's counters there are no peaks.
-    """
+    """The peak memory of each stage, of the process on a CPU, of all tensors on CUDA. ``peaks`` are bytes in
+    addition to what was held when the first stage began: weights and photographs do not count. On systems
+    without Linux's counters there are no peaks."""
 
     def __init__(self, device: torch.device):
         self.device = device

@@ -126,10 +126,8 @@ def _inputs(cases: Values, dtype: str) -> Values:
 
 def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage: Stage) -> Values:
     """How far each output of the reference moves where the inputs are rounded at random, over the rounding.
-
     Two roundings are of one step. The other two are opposite and as large as the budget: a decision that
-    falls within it (a ray that grazes a box) jumps for one of them.
-    """
+    falls within it (a ray that grazes a box) jumps for one of them."""
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
     for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
         g, step, moved = torch.Generator().manual_seed(seed), size * _STEP, dict(exact)

@@ -64,11 +64,9 @@ def read_pixels(path: Path) -> Pixels:
 
 
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
-    """Whether a camera was calibrated with the photograph as it is stored, not as it is shown.
-
-    The size of the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns photographs
-    when it reads them. ``exif``: ``auto`` | ``stored`` | ``shown``: what the user says.
-    """
+    """Whether a camera was calibrated with the photograph as it is stored, not as it is shown. The size of
+    the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns photographs when it
+    reads them. ``exif``: ``auto`` | ``stored`` | ``shown``: what the user says."""
     if exif != "auto" or not pixels.turns:
         return exif == "stored"
     size = camera.size

@@ -163,19 +163,14 @@ def _crops(
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
-    """Side or (height, width) of the photographs that a checkpoint's model was trained with.
-
-    Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
-    """
+    """Side or (height, width) of the photographs that a checkpoint's model was trained with. Imported weights
+    were trained elsewhere: it is the size of the encoder's position embedding."""
     return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
 
 
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
-    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained.
-
-    Larger ones give a warning: they make results worse, not sharper. InputError: the model cannot take this
-    size.
-    """
+    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Larger ones give
+    a warning: they make results worse, not sharper. InputError: the model cannot take this size."""
     trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
     multiple = side_multiple(model.options, patch)

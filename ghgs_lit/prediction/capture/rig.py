@@ -131,10 +131,8 @@ def corrected_rig(
 @torch.no_grad()
 def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
     """By what the cameras [V, 3] of several instants multiply colours: the median, and 1 in the mean of all.
-
     None: exposures change from instant to instant, photographs are divided by gains already, or the model
-    does not ask for any. ``batch``: an element for each instant, in the world.
-    """
+    does not ask for any. ``batch``: an element for each instant, in the world."""
     if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
         return None
     batch = Frame.of(batch).enter(batch)

@@ -32,10 +32,8 @@ def converted(name: str, gaussians: Gaussians) -> bytes:
 
 
 def to_records(gaussians: Gaussians) -> np.ndarray:
-    """The records [N] of dtype ``RECORD`` of the Gaussians of one subject with RGB colours.
-
-    Large and opaque ones come first, so that a part of a ``.splat`` file is a picture, too.
-    """
+    """The records [N] of dtype ``RECORD`` of the Gaussians of one subject with RGB colours. Large and opaque
+    ones come first, so that a part of a ``.splat`` file is a picture, too."""
     values = {name: value[visible_first(gaussians).cpu()] for name, value in stored_values(gaussians).items()}
     records = np.empty(len(gaussians), RECORD)
     records["mean"], records["scale"] = values["means"].numpy(), values["scales"].numpy()

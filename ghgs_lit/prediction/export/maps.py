@@ -27,9 +27,7 @@ def png(picture: np.ndarray, text: PngInfo | None = None) -> bytes:
 
 def depth_unit(largest: float) -> float:
     """The length of one grey level of a depth picture: 0.001, and other powers of ten where these fit better.
-
-    So that ``largest`` fits into 16 bits and has at least 1000 levels.
-    """
+    So that ``largest`` fits into 16 bits and has at least 1000 levels."""
     exponent = -3
     while largest > _LEVELS * 10.0**exponent:
         exponent += 1
@@ -39,10 +37,8 @@ def depth_unit(largest: float) -> float:
 
 
 def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Makers of a PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ.
-
-    The NPZ has ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``.
-    """
+    """Makers of a PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ. The
+    NPZ has ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
     valid = subject.depth_valid.cpu().numpy()
     depth = np.where(valid, subject.depth.float().cpu().numpy(), np.float32(np.nan))
     unit = depth_unit(float(np.max(depth, where=valid, initial=0)))
@@ -69,10 +65,8 @@ def points_ply(subject: ExportedSubject) -> bytes:
 
 
 def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras.
-
-    Both are what ``ghgs predict images=inputs cameras=cameras.json`` reads.
-    """
+    """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras. Both
+    are what ``ghgs predict images=inputs cameras=cameras.json`` reads."""
     for image, matte in zip(subject.images, subject.mattes, strict=True):
         # Colours of a PNG are not premultiplied.
         colors = to_uint8(unmultiplied(image, matte))

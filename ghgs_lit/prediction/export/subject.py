@@ -36,10 +36,8 @@ def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4
 def rotate_world(
     quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
 ) -> tuple[Gaussians, Cameras]:
-    """The same scene in a world rotated by the unit ``quaternion``: every image stays as it is.
-
-    Colours must not depend on the direction.
-    """
+    """The same scene in a world rotated by the unit ``quaternion``: every image stays as it is. Colours must
+    not depend on the direction."""
     quaternion = quaternion.double()
     rotation = quaternion_to_matrix(quaternion)
     means = gaussians.means.double() @ rotation.to(gaussians.means.device).mT
@@ -87,11 +85,9 @@ class OutputOptions:
 
 
 def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
-    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide.
-
-    These are ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
-    Gaussians, for others the geometric mean of their axes.
-    """
+    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide. These are
+    ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
+    Gaussians, for others the geometric mean of their axes."""
     variances = gaussians.scales.square()
     wider = variances + gaussians.low_pass * pixel**2
     opacities = gaussians.opacities
@@ -120,9 +116,7 @@ def fitted(
     gaussians: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer
 ) -> Gaussians:
     """``gaussians`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
-
-    ``cameras``: sets of cameras [n], which take part in turn.
-    """
+    ``cameras``: sets of cameras [n], which take part in turn."""
     drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
     search = Descent(gaussians, None, _FIT)
     for step in range(_FIT_STEPS):

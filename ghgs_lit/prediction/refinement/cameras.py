@@ -1,14 +1,10 @@
 """Cameras of a capture, corrected until the photographs agree with one another.
 
-A calibration that is off by a pixel or two costs a model several dB: views contradict one another. First
-cameras move and zoom until silhouettes explain one another (:mod:`ghgs_lit.prediction.refinement.coherence`);
-where a prediction does not agree that this is better, as with wrong masks, they stay. Then predictions say
-more: what the other views say of a view is drawn with that view's camera and compared with its photograph,
-and the camera moves until they fit. A view's own Gaussians take no part, as they reproduce its photograph
-wherever its camera is. Bundle adjustment with a rendering loss is that of BARF (Lin et al., ICCV 2021).
-
-Photographs do not tell where the whole rig is, so cameras only move beside one another
-(:mod:`ghgs_lit.geometry.motion`); where a minority of them explains the silhouettes, beside the others.
+First cameras move and zoom until silhouettes explain one another
+(:mod:`ghgs_lit.prediction.refinement.coherence`); where a prediction does not agree that this is better, as
+with wrong masks, they stay. Then what the other views say of a view is drawn with that view's camera, which
+moves until it fits the photograph (bundle adjustment as of BARF, Lin et al., ICCV 2021). Photographs do not
+tell where the whole rig is, so cameras only move beside one another (:mod:`ghgs_lit.geometry.motion`).
 """
 
 from collections.abc import Callable

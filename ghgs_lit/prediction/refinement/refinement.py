@@ -2,8 +2,7 @@
 
 A prediction is near enough that a few steps suffice, and every change is bounded, so that what no photograph
 shows stays as predicted. Photographs that are reproduced say nothing of other views (with wrong geometry they
-are reproduced, too), so :meth:`Refinement.report` holds one out and predicts again from the others. To stop
-where that one is best was worse than a fixed number of steps: fewer inputs want fewer steps.
+are reproduced, too), so :meth:`Refinement.report` holds one out and predicts again from the others.
 """
 
 from collections import deque

@@ -1,10 +1,8 @@
 """Instants that start from the last: Gaussians move with the photographs and are predicted anew now and then.
 
-A body moves little from one instant to the next, and a rig not at all. So the Gaussians of the last instant
-follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few gradient steps on the inputs' renders,
-whose optimiser goes on over the instants, take back what flow leaves and what light changes (the streams of
-Luiten et al., 3DV 2024, begin with an optimised scene; these with a prediction). What appears is seen by the
-renders, and so is a mask that changes more than the body: where they no longer fit photographs or masks, and
+The Gaussians of the last instant follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few
+gradient steps on the inputs' renders, whose optimiser goes on over the instants, take back what flow leaves
+and what light changes (as in Luiten et al., 3DV 2024). Where renders no longer fit photographs or masks, and
 every few instants, all is predicted anew.
 """
 
