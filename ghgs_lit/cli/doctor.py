@@ -49,21 +49,18 @@ def cameras(cfg: DictConfig) -> None:
         listing.add_row(hypothesis.says, f"{hypothesis.score:.0%}", *shares)
     rich.print(listing)
     print("\n".join(diagnosis.lines), flush=True)
+    views = best.views
     if best.score > 0:
-        views = best.views
         images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
         save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)
         announce(picture)
     if diagnosis.option:  # a calibration that needs no option any more
-        sizes = {
-            v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in best.views
-        }
-        write_json(calibration, sizes)
+        found = {v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views}
+        write_json(calibration, found)
         announce(calibration)
     if not diagnosis.consistent:
-        raise InputError(
-            f"{cfg.cameras}: expected cameras that fit the masks; found {'; '.join(diagnosis.lines)}"
-        )
+        found = "; ".join(diagnosis.lines)
+        raise InputError(f"{cfg.cameras}: expected cameras that fit the masks; found {found}")
 
 
 def machine(cfg: DictConfig) -> None:

@@ -54,12 +54,8 @@ def baselines_of(
 ) -> dict[str, Method]:
     """The baselines called ``names``, or ``all``; other arguments as for :func:`trained_method`."""
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
-    renderer = build_renderer(config, device)
-
-    def untrained() -> GHGS:
-        return GHGS.from_config(config).to(device)
-
-    return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}
+    known = build_renderer(config, device), lambda: GHGS.from_config(config).to(device), config["per_scene"]
+    return {name: baseline(name, *known) for name in names}
 
 
 def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], dict[str, Any]]:

@@ -34,9 +34,7 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the written weights last."""
     config = save_config(cfg, output_dir())
-    checkpoint, vggt, release, inference = (
-        config[key] for key in ("checkpoint", "vggt", "release", "inference")
-    )
+    checkpoint, vggt, release, inference = map(config.get, ("checkpoint", "vggt", "release", "inference"))
     paths = [path for path in (vggt, release, inference) if path is not None]
     require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
     if vggt is not None or release is not None:

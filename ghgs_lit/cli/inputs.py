@@ -76,27 +76,20 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
 
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:
-    """``cfg`` with the data that its checkpoint was trained on, where no ``data=<option>`` was chosen.
-
-    Keys of it that were said, such as ``data.root=...`` for data that moved, act on it.
-
-    A checkpoint of somebody else does not say where this machine writes: ``data.cache_dir`` is the default.
-    InputError: there is no checkpoint, or it was not trained.
-    """
+    """``cfg`` with the data that its checkpoint was trained on, where no ``data=<option>`` was chosen. Keys
+    that were said, such as ``data.root=...``, act on it; where this machine writes (``data.cache_dir``) is
+    the default. InputError: there is no checkpoint, or it was not trained."""
     if "kind" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
         raise InputError("data: expected data=<option> where there is no checkpoint; found none")
     if cfg.checkpoint == SHIPPED:  # its training data would have to be rendered first
-        expected = (
-            "images=<folder> cameras=<file>, or data=<option>, with the weights that come with the package"
-        )
+        expected = "images=<folder> cameras=<file>, or data=<option>, with the weights of the package"
         raise InputError(f"data: expected {expected}; found neither")
     trained = read_checkpoint(cfg.checkpoint)["config"]
     if not trained.get("data"):
-        raise InputError(
-            f"data: expected data=<option> for weights that were imported ({cfg.checkpoint}); found none"
-        )
+        expected = f"data=<option> for weights that were imported ({cfg.checkpoint})"
+        raise InputError(f"data: expected {expected}; found none")
     data = {key: None if key == "cache_dir" else value for key, value in trained["data"].items()}
     return OmegaConf.merge({"data": data}, cfg)
 
@@ -136,10 +129,8 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
 def _require_ablation(trained: Mapping[str, Any]) -> None:
     """Refuse another row of the ablation: it is said by its switches where the weights are trained."""
     own, wanted = ablation_of(trained), HydraConfig.get().runtime.choices["ablation"]
-    expected = (
-        f"{own}, as the checkpoint was trained (recalibration.neighborhood=... and .similarity=... act)"
-    )
-    require(wanted == own, "ablation", expected, wanted)
+    switches = "recalibration.neighborhood=... and .similarity=... act"
+    require(wanted == own, "ablation", f"{own}, as the checkpoint was trained ({switches})", wanted)
 
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:

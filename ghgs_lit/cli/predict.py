@@ -74,10 +74,8 @@ def subject_batch(
     names = list(data.subjects(split))
     if isinstance(subject, int) and 0 <= subject < len(names):
         subject = names[subject]
-    if subject not in names:
-        raise InputError(
-            f"subject: expected 0 to {len(names) - 1} or a name such as {names[0]}; found {subject!r}"
-        )
+    expected = f"0 to {len(names) - 1} or a name such as {names[0]}"
+    require(subject in names, "subject", expected, subject)
     return data.evaluation_batch(subject, split, targets=targets)
 
 

@@ -56,9 +56,7 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []
-    require(
-        not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its own runs", True
-    )
+    require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
     for item in planned:
         check_config(item.config)
     write_plan(planned, config, directory)

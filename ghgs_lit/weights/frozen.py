@@ -75,12 +75,10 @@ def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False)
     no such file beside the checkpoint, or it holds something else."""
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)
-    place, reference = f"{path}: frozen_file", checkpoint["frozen_file"]
-    fits = isinstance(reference, Mapping) and all(
-        isinstance(reference.get(k), str) for k in ("name", "sha256")
-    )
-    require(fits, place, "a mapping of name and sha256", reference)
-    name, sha256 = reference["name"], reference["sha256"]
+    place, linked = f"{path}: frozen_file", checkpoint["frozen_file"]
+    fits = isinstance(linked, Mapping) and all(isinstance(linked.get(k), str) for k in ("name", "sha256"))
+    require(fits, place, "a mapping of name and sha256", linked)
+    name, sha256 = linked["name"], linked["sha256"]
     require(Path(name).name == name, place, "the name of a file beside the checkpoint", name)
     file = file_of(path).resolve().with_name(name)
     if not file.is_file():

@@ -51,9 +51,7 @@ def differences(
     (prediction, rendering), (yardstick, reference) = found, expected
     ours, theirs = prediction.gaussians, yardstick.gaussians
     a, b = partners(ours, theirs)
-    result = {
-        name: relative_difference(getattr(ours, name)[a], getattr(theirs, name)[b]) for name in ATTRIBUTES
-    }
+    result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b]) for n in ATTRIBUTES}
     # Not the largest: a Gaussian that covers 1/255 of a pixel up to rounding is drawn there or not.
     result["render"] = relative_difference(rendering.image, reference.image, norm=2)
     valid = prediction.depth_valid & yardstick.depth_valid & masks

@@ -52,11 +52,9 @@ def pack(gaussians: Gaussians, pixel: float, center: Tensor, steps: Mapping[str,
     return packer.compress(planes) + packer.flush()
 
 
-def unpack(
-    packed: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians
-) -> Gaussians:
+def unpack(data: bytes, pixel: float, center: Tensor, steps: Mapping[str, int], like: Gaussians) -> Gaussians:
     """The Gaussians of :func:`pack`, on the CPU. ``like``: has their constants."""
-    planes = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
+    planes = np.frombuffer(zlib.decompress(data), np.uint8).reshape(4 * _WIDE + _NARROW, -1)
     wide = np.ascontiguousarray(planes[: 4 * _WIDE].T).view("<u4").astype(np.int64)
     centers = torch.from_numpy((wide >> 1 ^ -(wide & 1)).cumsum(0))
     narrow = planes[4 * _WIDE :].T.astype(np.int64).cumsum(0)

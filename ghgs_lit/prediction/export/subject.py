@@ -112,13 +112,11 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     return replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
 
 
-def fitted(
-    gaussians: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer
-) -> Gaussians:
-    """``gaussians`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
+def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
+    """``theirs`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
     ``cameras``: sets of cameras [n], which take part in turn."""
     drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
-    search = Descent(gaussians, None, _FIT)
+    search = Descent(theirs, None, _FIT)
     for step in range(_FIT_STEPS):
         lap, among = divmod(step, len(cameras))
         seen, wanted = cameras[among], drawn[among]

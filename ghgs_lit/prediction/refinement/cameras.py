@@ -163,9 +163,8 @@ def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
     """The first cameras of some views, the second of the others."""
     which = which[..., None, None]
     lenses = torch.where(which, first.intrinsics, second.intrinsics)
-    return replace(
-        first, intrinsics=lenses, extrinsics=torch.where(which, first.extrinsics, second.extrinsics)
-    )
+    poses = torch.where(which, first.extrinsics, second.extrinsics)
+    return replace(first, intrinsics=lenses, extrinsics=poses)
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:

@@ -144,9 +144,8 @@ def coherent_cameras(
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count, device = len(pose) // len(rigs), batch.masks.device
     poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
-    moved = replace(
-        cameras, intrinsics=torch.cat(lenses).to(cameras.intrinsics), extrinsics=poses.to(cameras.extrinsics)
-    )
+    lenses, poses = torch.cat(lenses).to(cameras.intrinsics), poses.to(cameras.extrinsics)
+    moved = replace(cameras, intrinsics=lenses, extrinsics=poses)
     return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
 
 
@@ -255,12 +254,10 @@ def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
     return HEIGHT / 2 * (lens[..., 0, 0] / pose[:, 2, 3]).mean()
 
 
-def _stepped(
-    steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all_free: bool
-) -> tuple[Lenses, Pose]:
+def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
     """Intrinsics and extrinsics after a step; where all cameras are free they move beside one another."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
-    if are_all_free:
+    if are_all:
         motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
     zoomed = lens.clone()
     zoomed[..., [0, 1], [0, 1]] *= zooms.exp()

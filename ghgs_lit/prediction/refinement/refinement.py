@@ -74,9 +74,7 @@ class Descent:
         if "means" in changes:
             require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
             self._footprint = _footprints(self.start, batch)
-        self._raw = {
-            name: torch.zeros_like(getattr(self.start, name), requires_grad=True) for name in changes
-        }
+        self._raw = {n: torch.zeros_like(getattr(self.start, n), requires_grad=True) for n in changes}
         # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
         groups = [{"params": [self._raw[name]], "lr": change.rate} for name, change in changes.items()]
         self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95), eps=1e-15)

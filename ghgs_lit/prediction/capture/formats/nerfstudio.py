@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ghgs_lit.data.decoding import check_array
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats.camera_file import (
     CameraFile,
@@ -76,10 +76,8 @@ def _intrinsics(origin: str, numbers: Mapping[str, float], size: tuple[int, int]
             focal[axis] = numbers[f"fl_{axis}"]
         elif angle is not None and side is not None and 0 < angle < math.pi:
             focal[axis] = side / 2 / math.tan(angle / 2)
-    if not focal or (size is None and not {"cx", "cy"} <= set(numbers)):
-        raise InputError(
-            f"{origin}: expected fl_x, cx and cy, or w, h and camera_angle_x; found {sorted(numbers)}"
-        )
+    is_enough = bool(focal) and (size is not None or {"cx", "cy"} <= set(numbers))
+    require(is_enough, origin, "fl_x, cx and cy, or w, h and camera_angle_x", sorted(numbers))
     # Square pixels where one focal length is given.
     fx, fy = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
     cx = numbers["cx"] if "cx" in numbers else width / 2

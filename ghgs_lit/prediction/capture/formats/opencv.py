@@ -185,9 +185,7 @@ def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] 
     if width is None or height is None:
         return None
     try:
-        size = int(height), int(width)
+        return int(height), int(width)
     except (TypeError, ValueError):
-        raise InputError(
-            f"{origin}: expected width and height in pixels; found {width!r}, {height!r}"
-        ) from None
-    return size
+        found = f"{width!r}, {height!r}"
+        raise InputError(f"{origin}: expected width and height in pixels; found {found}") from None
