@@ -14,15 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import (
-    build_data,
-    build_renderer,
-    check_size,
-    load_model,
-    model_of,
-    pick_device,
-    with_trained_data,
-)
+from ghgs_lit.cli import inputs
 from ghgs_lit.cli.photographs import capture_folder, check_cameras
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
@@ -61,7 +53,8 @@ def run(cfg: DictConfig) -> None:
     """The verb; prints the files (not those in folders), and the directory last."""
     directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
     is_capture = cfg.images is not None or cfg.cameras is not None
-    config = resolve(cfg if is_capture else with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
+    config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
+    config |= inputs.model_of(cfg.checkpoint, cfg)
     (predict_photographs if is_capture else predict_subject)(config, directory)
     announce(directory)
 
@@ -83,10 +76,10 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     """Predict a subject of a data set."""
     expected = "0 without images=...: photographs of data sets are on black"
     require(config["refine_masks"] in (0, "auto"), "refine_masks", expected, config["refine_masks"])
-    options, device = output_options(config), pick_device(config["device"])
-    renderer, model = build_renderer(config, device), load_model(config, device)
-    data = build_data(config)
-    check_size(data, model)
+    options, device = output_options(config), inputs.pick_device(config["device"])
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    data = inputs.build_data(config)
+    inputs.check_size(data, model)
     write_config(config, directory)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
@@ -99,20 +92,20 @@ def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     """Predict each instant of a folder of photographs; several get a folder each, and files of all.
     InputError: none of them can be read."""
     folder, options = capture_folder(config), output_options(config)
-    several, inputs = len(folder.instants) > 1, folder.input_files
+    several, read = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
     others = ["rig.json"] if config["refine_cameras"] else []
     together = Instants(len(directories), options, others) if several else None
     for name, path in directories.items():
-        require_free(path, output_files(options, list(folder.paths[name])), inputs)
+        require_free(path, output_files(options, list(folder.paths[name])), read)
     if together:
-        require_free(directory, together.files, inputs)
+        require_free(directory, together.files, read)
     if folder.note:
         print(folder.note, flush=True)
     if config["check_cameras"]:
         check_cameras(folder)
-    device = pick_device(config["device"])
-    renderer, model = build_renderer(config, device), load_model(config, device)
+    device = inputs.pick_device(config["device"])
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
     size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
