@@ -28,17 +28,8 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
 #: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
-FREE = (
-    "bounds",
-    "model.pad",
-    "recalibration.k",
-    "recalibration.neighborhood",
-    "recalibration.similarity",
-    "recalibration.tokens",
-    "rounds.count",
-    "skip",
-    "unprojection",
-)
+FREE = ("bounds", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
+FREE += ("recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 
 def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":

@@ -144,16 +144,8 @@ def needs_own_process(config: Mapping[str, Any]) -> bool:
 
 
 #: What training writes below a run's directory, beside the logs of Hydra.
-WRITTEN = (
-    "checkpoints",
-    "csv",
-    "init_from.txt",
-    "metrics.csv",
-    "metrics.json",
-    "pictures",
-    "sessions.jsonl",
-    "tensorboard",
-)
+WRITTEN = ("checkpoints", "csv", "init_from.txt", "metrics.csv", "metrics.json", "pictures")
+WRITTEN += ("sessions.jsonl", "tensorboard")
 
 
 def check_config(config: Mapping[str, Any]) -> None:

@@ -138,13 +138,11 @@ class Backgrounds:
         photographs: dict[str, list[Photograph]] = {}
         for photograph in (photograph for capture in captures for photograph in capture.photographs):
             photographs.setdefault(photograph.name, []).append(photograph)
-        return cls(
-            {
-                name: _Background.of(found)
-                for name, found in photographs.items()
-                if len(found) >= _ENOUGH and len({photograph.mask.shape for photograph in found}) == 1
-            }
-        )
+        cameras = {}
+        for name, found in photographs.items():
+            if len(found) >= _ENOUGH and len({photograph.mask.shape for photograph in found}) == 1:
+                cameras[name] = _Background.of(found)
+        return cls(cameras)
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with masks that are mended where large parts contradict the background."""

@@ -19,7 +19,7 @@ from ghgs_lit.geometry.rotations import multiply_quaternions
 from ghgs_lit.geometry.sampling import sample
 from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow
 from ghgs_lit.geometry.vectors import unit
-from ghgs_lit.prediction.refinement.refinement import Change, Descent, Renderer, seen_by
+from ghgs_lit.prediction.refinement.refinement import NEAR, Change, Descent, Renderer, seen_by
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 
 #: Metres behind the rendered surface up to which a view shows a Gaussian.
@@ -27,12 +27,7 @@ _SHOWN = 0.03
 #: Steps at each instant. They may go farther than those of a single one: an error of the flow is larger than
 #: that of a prediction.
 _STEPS = 2
-_CHANGES = {
-    "means": Change(10.0, 0.1),
-    "scales": Change(1.0, 0.02),
-    "opacities": Change(2.0, 0.04),
-    "colors": Change(0.1, 0.004),
-}
+_CHANGES = NEAR | {"means": Change(10.0, 0.1), "colors": Change(0.1, 0.004)}
 #: Of L1 and of the silhouettes' L1; without SSIM, which takes as long as the renders.
 _WEIGHTS = (0.8, 0.0, 0.1)
 #: Times the misfit after a new prediction at which Gaussians no longer fit.

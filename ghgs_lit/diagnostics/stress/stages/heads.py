@@ -30,13 +30,9 @@ def _depth(v: Values) -> Values:
 
 
 def _attribute_inputs(family: str, g: Generator) -> Values:
-    return {
-        "offset": inputs.raw(family, g, 16, 3),
-        "scale": inputs.raw(family, g, 16, 3),
-        "rotation": inputs.raw(family, g, 16, 4),
-        "opacity": inputs.raw(family, g, 16),
-        "footprint": inputs.depths(family, g, 16) / 500,
-    }
+    sizes = {"offset": (3,), "scale": (3,), "rotation": (4,), "opacity": ()}
+    raw = {name: inputs.raw(family, g, 16, *size) for name, size in sizes.items()}
+    return {**raw, "footprint": inputs.depths(family, g, 16) / 500}
 
 
 _ATTRIBUTES = FootprintAttributes()
