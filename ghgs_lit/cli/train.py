@@ -24,7 +24,7 @@ from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
 from ghgs_lit.runs import job
-from ghgs_lit.runs.plan import print_single_plan
+from ghgs_lit.runs.grid import print_single_plan
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
