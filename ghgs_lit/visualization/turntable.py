@@ -33,11 +33,9 @@ def center_of(points: Tensor, cameras: Cameras) -> Tensor:
     return (points.amin(0) + points.amax(0)) / 2 if len(points) else look_at_point(cameras)
 
 
-def pixel_size(cameras: Cameras, center: Tensor | None = None) -> float:
-    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V]. None: where the optical
-    axes meet."""
-    away = (look_at_point(cameras) if center is None else center) - cameras.centers
-    depths = (away * cameras.extrinsics[:, 2, :3].double()).sum(-1)
+def pixel_size(cameras: Cameras, center: Tensor) -> float:
+    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V]."""
+    depths = ((center - cameras.centers) * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())
 
 

@@ -28,7 +28,7 @@ def is_repository(name: str) -> bool:
     )
 
 
-def fetch(repository: str, filename: str = FILE) -> tuple[Path, str]:
+def fetch(repository: str) -> tuple[Path, str]:
     """The path of a repository's file and its SHA-256, from the local cache or the hub.
 
     Shows progress, resumes an earlier download, and compares the checksum with the published one.
@@ -40,14 +40,14 @@ def fetch(repository: str, filename: str = FILE) -> tuple[Path, str]:
     except ImportError:
         raise InputError(
             f"{repository}: expected the package huggingface_hub (pip install 'ghgs-lit[hub]'); found none."
-            f" Or download https://huggingface.co/{repository}/resolve/main/{filename} by hand and set"
+            f" Or download https://huggingface.co/{repository}/resolve/main/{FILE} by hand and set"
             " vggt=<that file>"
         ) from None
-    address = huggingface_hub.hf_hub_url(repository, filename)
-    cached = huggingface_hub.try_to_load_from_cache(repository, filename)
+    address = huggingface_hub.hf_hub_url(repository, FILE)
+    cached = huggingface_hub.try_to_load_from_cache(repository, FILE)
     if not isinstance(cached, str):
         try:
-            cached = huggingface_hub.hf_hub_download(repository, filename)
+            cached = huggingface_hub.hf_hub_download(repository, FILE)
         except Exception as error:
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise InputError(

@@ -28,9 +28,7 @@ def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
     return (row / height)[:, None].square() + (column / width).square() < 0.25
 
 
-def ellipsoid_batch(
-    share: float, views: int, size: int | tuple[int, int], batch: int, seed: int = 0
-) -> Batch:
+def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch: int) -> Batch:
     """Photographs of noise on an ellipsoid of revolution, which looks the same in every view. Returns: The
     batch; its target is the first input view. ``share``: part of the frame that the subject covers. ``size``:
     side, or height and width, of the photographs in pixels."""
@@ -39,7 +37,7 @@ def ellipsoid_batch(
     yaws = np.tile(np.arange(views) * 360.0 / views, (batch, 1))
     cameras = rig.cameras(yaws, *size)
     masks = ellipse(share, size).expand(batch, views, -1, -1).contiguous()
-    noise = torch.rand(batch, views, 3, *size, generator=torch.Generator().manual_seed(seed))
+    noise = torch.rand(batch, views, 3, *size, generator=torch.Generator().manual_seed(0))
     images = noise * masks[:, :, None]
     return Batch(images, masks, cameras, Targets(images[:, :1], masks[:, :1], cameras[:, :1]))
 

@@ -94,16 +94,16 @@ def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcom
             yield compared(f"renderer {backend}, {name}: {part}", found[part], value, limit)
 
 
-def _random_splats(counts: tuple[int, int] = (150, 90)) -> Gaussians:
+def _random_splats() -> Gaussians:
     """Of two elements with different numbers of splats, about as large as a person."""
-    n, g = sum(counts), torch.Generator().manual_seed(0)
+    n, g = 240, torch.Generator().manual_seed(0)
     return Gaussians(
         means=torch.randn(n, 3, generator=g) * torch.tensor([0.2, 0.5, 0.2]),
         quaternions=torch.randn(n, 4, generator=g),
         scales=0.01 + 0.05 * torch.rand(n, 3, generator=g),
         opacities=0.1 + 0.8 * torch.rand(n, generator=g),
         colors=torch.rand(n, 3, generator=g),
-        splits=counts,
+        splits=(150, 90),
     )
 
 

@@ -16,9 +16,9 @@ _SIZE = 16
 _FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
 
 
-def _inputs(family: str, g: Generator, count: int = 24) -> Values:
+def _inputs(family: str, g: Generator) -> Values:
     """Splats of some pixels around the middle of a scene, before one camera."""
-    count = 1500 if family == "stacked" else count
+    count = 1500 if family == "stacked" else 24
     middle = inputs.place(family, g)
     lenses, poses = inputs.cameras(family, g, 1, _SIZE, middle)
     means = inputs.points(family, g, count, middle, poses)
