@@ -20,21 +20,14 @@ from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
+from ghgs_lit.prediction import export
 from ghgs_lit.prediction.capture.backgrounds import Backgrounds
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
 from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
-from ghgs_lit.prediction.export import (
-    REPORT,
-    Instants,
-    OutputOptions,
-    output_files,
-    output_options,
-    require_free,
-    write_prediction,
-)
+from ghgs_lit.prediction.export.reports import REPORT
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
@@ -76,7 +69,7 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     """Predict a subject of a data set."""
     expected = "0 without images=...: photographs of data sets are on black"
     require(config["refine_masks"] in (0, "auto"), "refine_masks", expected, config["refine_masks"])
-    options, device = output_options(config), inputs.pick_device(config["device"])
+    options, device = export.output_options(config), inputs.pick_device(config["device"])
     renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
     data = inputs.build_data(config)
     inputs.check_size(data, model)
@@ -91,15 +84,15 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     """Predict each instant of a folder of photographs; several get a folder each, and files of all.
     InputError: none of them can be read."""
-    folder, options = capture_folder(config), output_options(config)
+    folder, options = capture_folder(config), export.output_options(config)
     several, read = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
     others = ["rig.json"] if config["refine_cameras"] else []
-    together = Instants(len(directories), options, others) if several else None
+    together = export.Instants(len(directories), options, others) if several else None
     for name, path in directories.items():
-        require_free(path, output_files(options, list(folder.paths[name])), read)
+        export.require_free(path, export.output_files(options, list(folder.paths[name])), read)
     if together:
-        require_free(directory, together.files, read)
+        export.require_free(directory, together.files, read)
     if folder.note:
         print(folder.note, flush=True)
     if config["check_cameras"]:
@@ -237,7 +230,7 @@ def write_result(
     model: GHGS,
     renderer: Renderer,
     config: dict[str, Any],
-    options: OutputOptions,
+    options: export.OutputOptions,
 ) -> dict[str, float]:
     """Write the files of a result, and print what was done and written. Returns: the run time of each stage
     in seconds."""
@@ -261,6 +254,6 @@ def write_result(
         facts["refine"] = asdict(result.refined)
         print(result.refined, flush=True)
     begin = time.perf_counter()
-    paths = write_prediction(directory, result.batch, prediction, renderer, options, facts)
+    paths = export.write_prediction(directory, result.batch, prediction, renderer, options, facts)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
     return {**seconds, "write": time.perf_counter() - begin}
