@@ -103,6 +103,10 @@ def totals(rows: Sequence[Row]) -> list[Row]:
 
 def tables_of(rows: Sequence[Row]) -> Tables:
     """Cases with their cost and error, then the seconds of their stages."""
+
+    def promises(row: Row) -> bool:
+        return row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
+
     whole = pd.DataFrame(totals(rows))
     times = whole[["seconds", "seconds_low", "seconds_high"]].itertuples(index=False)
     cases = whole.assign(
@@ -111,15 +115,10 @@ def tables_of(rows: Sequence[Row]) -> Tables:
         peak_mb=whole.peak_bytes.astype(float) / 1e6,
         gflop=whole.flops.astype(float) / 1e9,
         ply_mb=whole.ply_bytes / 1e6,
-        budget=[_kept(row) for row in totals(rows)],
+        budget=["broken" if _broken(row) else "kept" if promises(row) else "-" for row in totals(rows)],
     )
     stages = pivoted(pd.DataFrame(rows), "stage", "preset", "seconds", "{:.4f}")
     return {"Presets": texts(cases, _COLUMNS), "Seconds by stage": stages}
-
-
-def _kept(row: Row) -> str:
-    promises = row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
-    return "broken" if _broken(row) else "kept" if promises else "-"
 
 
 def notes_of(content: Mapping[str, Any]) -> list[str]:
