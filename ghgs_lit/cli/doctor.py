@@ -20,8 +20,7 @@ from ghgs_lit.prediction.capture.drawing import camera_sheet
 from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
 from ghgs_lit.visualization.pictures import save_png
 
-#: How many meanings of a calibration are listed.
-_LISTED = 6
+_LISTED = 6  #: How many meanings of a calibration are listed
 
 
 def run(cfg: DictConfig) -> None:

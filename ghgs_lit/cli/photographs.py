@@ -9,12 +9,10 @@ from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.readers import require_data_folder
 from ghgs_lit.weights.reading import require_weights
 
-#: The folder that is being read, if any.
-_BEGUN: list[CaptureFolder] = []
+_BEGUN: list[CaptureFolder] = []  #: The folder that is being read, if any
 
 _SOURCES = ("images", "cameras", "masks", "backgrounds", "segment", "calibration", "sequence")
-#: How many instants of a sequence the check of cameras looks at.
-_CHECKED = 5
+_CHECKED = 5  #: How many instants of a sequence the check of cameras looks at
 
 
 def sources_of(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,8 +10,7 @@ from tabulate import tabulate
 
 from ghgs_lit.files import write_atomically
 
-#: Tables of texts by their titles.
-Tables = dict[str, pd.DataFrame]
+Tables = dict[str, pd.DataFrame]  #: Tables of texts by their titles
 
 
 def text(value: Any, form: str) -> str:

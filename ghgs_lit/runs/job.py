@@ -20,8 +20,7 @@ from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import STOP, Interrupted
 
-BUSY = "busy"
-"""The return value of a job whose run another process works on."""
+BUSY = "busy"  #: The return value of a job whose run another process works on
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 # Set in the environment of a job's own process: whether to "skip" a locked run or to "wait" for it.
 _VARIABLE = "GHGS_SWEEP_JOB"

@@ -16,10 +16,8 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.readers import read_json
 from ghgs_lit.runs.provenance import config_hash
 
-FORMAT_VERSION = 3
-"""The version that is written, and the only one that is read."""
-METHOD = "model"
-"""The method of the rows of a trained model; others are baselines."""
+FORMAT_VERSION = 3  #: The version that is written, and the only one that is read
+METHOD = "model"  #: The method of the rows of a trained model; others are baselines
 KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
 """What a row describes; all other entries of a row are metrics."""
 

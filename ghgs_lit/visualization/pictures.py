@@ -13,8 +13,7 @@ from ghgs_lit.types import Batch
 
 _CAPTION = 14  # height of a caption in pixels
 _GAP = 2
-ERROR_GAIN = 4.0
-"""Factor of the mean absolute error of the colours before it is shown."""
+ERROR_GAIN = 4.0  #: Factor of the mean absolute error of the colours before it is shown
 
 
 @cache

@@ -8,12 +8,9 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import look_at_point, project
 from ghgs_lit.types import Cameras, Gaussians
 
-#: Opacity of Gaussians that make up the subject.
-_OPAQUE = 0.5
-#: Part of them beyond each face of the subject's box: floaters.
-_OUTSIDE = 1e-3
-#: Part of a picture's height and width that the subject takes at most.
-_SHARE = 0.95
+_OPAQUE = 0.5  #: Opacity of Gaussians that make up the subject
+_OUTSIDE = 1e-3  #: Part of them beyond each face of the subject's box: floaters
+_SHARE = 0.95  #: Part of a picture's height and width that the subject takes at most
 
 
 def subject_points(gaussians: Gaussians) -> Tensor:

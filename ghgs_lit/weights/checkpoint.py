@@ -18,15 +18,12 @@ from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
 from ghgs_lit.weights.reading import cast, file_of, open_file
 
-#: Version of checkpoints that are whole by themselves; earlier ones are read too.
-FORMAT_VERSION = 2
+FORMAT_VERSION = 2  #: Version of checkpoints that are whole by themselves; earlier ones are read too
 
-#: Prefix of the model's tensors in the state of a LightningModule.
-STATE_PREFIX = "model."
+STATE_PREFIX = "model."  #: Prefix of the model's tensors in the state of a LightningModule
 
 
-#: Precisions of weights.
-_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)  #: Precisions of weights
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:

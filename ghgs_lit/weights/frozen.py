@@ -19,8 +19,7 @@ from ghgs_lit.weights.reading import file_of, open_file
 OWN = 1 << 26
 #: Version of checkpoints that share a file: what reads version 2 alone would miss their tensors.
 SHARING = 3
-#: Names of the files.
-PATTERN = "frozen-*.pt"
+PATTERN = "frozen-*.pt"  #: Names of the files
 
 
 def digest_of(tensors: Mapping[str, Tensor]) -> str:

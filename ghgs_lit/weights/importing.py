@@ -77,31 +77,22 @@ def _checked(path: Path) -> str:
     return found
 
 
-#: The files' names in messages.
-KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}
+KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}  #: The files' names in messages
 
 
 @dataclass(frozen=True)
 class Source:
     """A file of published weights."""
 
-    #: ``vggt`` or ``release``
-    key: str
-    #: the repository or the file's name, for reports
-    label: str
+    key: str  #: ``vggt`` or ``release``
+    label: str  #: the repository or the file's name, for reports
     path: Path
-    #: SHA-256
-    checksum: str
-    #: prefixes of published names: our prefixes
-    table: Mapping[str, str]
-    #: prefixes of tensors that are not used
-    ignored: Sequence[str] = ()
-    #: the key of the file under which its tensors are; None for none
-    entry: str | None = None
-    #: our name: published name, of the tensors that are used
-    used: dict[str, str] = field(default_factory=dict)
-    #: number of ignored tensors by the first part of their name
-    skipped: Counter = field(default_factory=Counter)
+    checksum: str  #: SHA-256
+    table: Mapping[str, str]  #: prefixes of published names: our prefixes
+    ignored: Sequence[str] = ()  #: prefixes of tensors that are not used
+    entry: str | None = None  #: the key of the file under which its tensors are; None for none
+    used: dict[str, str] = field(default_factory=dict)  #: our name: published name, of used tensors
+    skipped: Counter = field(default_factory=Counter)  #: ignored tensors by the first part of their name
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors of the file, mapped from the disk."""

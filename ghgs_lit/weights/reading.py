@@ -31,8 +31,7 @@ FAILED_DOWNLOADS = (
 SHIPPED, SHIPPED_FILE = "shipped", Path(__file__).with_name("shipped.ckpt")
 ZIP, PICKLE = b"PK", b"\x80"
 
-#: Bytes of tensors to convert before the file is mapped again.
-_CHUNK = 1 << 28
+_CHUNK = 1 << 28  #: Bytes of tensors to convert before the file is mapped again
 
 
 def file_of(path: str | Path) -> Path:

@@ -18,8 +18,7 @@ from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
 from ghgs_lit.types import Batch, Prediction, Rendering
 
-#: Rounds that do not count: the first compiles and fills caches.
-WARMUP = 1
+WARMUP = 1  #: Rounds that do not count: the first compiles and fills caches
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,10 @@ from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
-#: The preset that all others are compared with.
-YARDSTICK = "none"
+YARDSTICK = "none"  #: The preset that all others are compared with
 #: Nodes of a configuration that a model is built from, beside ``skip``.
 MODEL_NODES = (*STAGES, "rounds", "model")
-#: What knobs can change.
-KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
+KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: What knobs can change
 #: Rounds take normals from differences of depths and look photographs up where Gaussians are: one rounding of
 #: the photographs changes single attributes by 1e-3 of the largest one (trained weights, 1 to 3 rounds).
 ROUNDS_AMPLIFY = 1000

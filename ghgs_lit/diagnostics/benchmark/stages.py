@@ -19,8 +19,7 @@ from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 ROUNDS, RENDER, TOTAL = "rounds", "render", "total"
-#: What lies in no stage: checks, padding.
-OTHER = "other"
+OTHER = "other"  #: What lies in no stage: checks, padding
 #: Parts of stages: a name ``<stage>.<part>``, and where the part is in the model.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
 #: All that is timed, in the order of the data flow. The stages without a dot add up to ``total``.

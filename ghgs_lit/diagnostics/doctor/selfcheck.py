@@ -30,8 +30,7 @@ LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0*
 #: another neighbour: 2e-6 to 4e-2 on a CPU. Of three models one at least is spared; a wrong kernel spares
 #: none.
 GRADIENT_LIMIT, _MODELS = 1e-2, 3
-#: Side of the photographs of splats, and characters of an error that are shown.
-_SIZE, _LONGEST = 48, 300
+_SIZE, _LONGEST = 48, 300  #: Side of the photographs of splats, and characters of an error that are shown
 
 
 @dataclass(frozen=True)

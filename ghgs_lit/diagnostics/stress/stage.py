@@ -77,8 +77,7 @@ Values = dict[str, Tensor]
 
 #: Names of the dtypes: the last two are those of autocast, with inputs in float32.
 DTYPES = ("float64", "float32", "bfloat16", "float16")
-#: Those of kernels and of photographs, which are never in float64.
-FLOAT32_ONLY = DTYPES[1:]
+FLOAT32_ONLY = DTYPES[1:]  #: Those of kernels and of photographs, which are never in float64
 
 #: The largest factor of a budget: more than this many roundings of its inputs no stage may lose.
 LARGEST = 100.0

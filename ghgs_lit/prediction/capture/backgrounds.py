@@ -16,16 +16,13 @@ from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import Photograph
 
-#: Photographs of a camera that a background takes, at least.
-_ENOUGH = 6
+_ENOUGH = 6  #: Photographs of a camera that a background takes, at least
 #: Levels of 255 by which the photographs of a background differ at most, and by which the subject does.
 _STEADY, _DIFFERENT = 20.0, 12.0
-#: Deviations of the noise beyond which a pixel differs.
-_DEVIATIONS = 4.0
+_DEVIATIONS = 4.0  #: Deviations of the noise beyond which a pixel differs
 #: Parts of a mask's area: what is large, and what is a speck beside the largest part.
 _LARGE, _SPECK = 0.03, 0.05
-#: Share of the light that a shadow leaves, at least.
-_DARK = 0.3
+_DARK = 0.3  #: Share of the light that a shadow leaves, at least
 #: Correlation of brightness from which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
 

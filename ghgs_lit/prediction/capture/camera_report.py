@@ -20,12 +20,9 @@ from ghgs_lit.prediction.capture.photographs import Pixels
 
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
 AGREES, BETTER = 0.9, 0.05
-# Longer side of the photographs that are compared, in pixels.
-_SIDE = 320
-# Shares of a photograph between which a principal point is plausible.
-_MIDDLE = (0.3, 0.7)
-#: Largest extents that are taken for a person in metres.
-PERSON = (0.5, 2.5)
+_SIDE = 320  # Longer side of the photographs that are compared, in pixels
+_MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
+PERSON = (0.5, 2.5)  #: Largest extents that are taken for a person in metres
 # What photographs are resized by after a calibration.
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 # A part of a mask is another person where it has this share of the largest part's area, or more.
@@ -172,7 +169,10 @@ def in_parts(views: Sequence[StoredView]) -> list[str]:
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     given = views[0].convention
-    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, _likely_resize(views))):
+    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
+    scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
+    likely = min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
+    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, likely)):
         inner = replace(given, intrinsics=intrinsics, resized=resized)
         if not all(_plausible(replace(view, convention=inner)) for view in views):
             continue
@@ -190,13 +190,6 @@ def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
                 " ".join(f"calibration.{key}={value}" for key, value in changed),
                 tuple(replace(view, convention=convention) for view in views),
             )
-
-
-def _likely_resize(views: Sequence[StoredView]) -> float:
-    """The usual factor that brings the principal points nearest to the middle."""
-    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
-    scale = 0.5 / max(float(np.median(points)), 0.01)
-    return min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
 
 
 def _plausible(view: StoredView) -> bool:

@@ -9,8 +9,7 @@ from ghgs_lit.data.resampling import area_image
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
 SHARE = 0.8
-#: Mattes are searched in photographs of at most this times the size of their crops.
-_FINER = 2
+_FINER = 2  #: Mattes are searched in photographs of at most this times the size of their crops
 
 
 @dataclass(frozen=True)

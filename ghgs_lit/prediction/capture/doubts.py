@@ -12,10 +12,8 @@ from ghgs_lit.prediction.capture.crops import SHARE, Photograph
 from ghgs_lit.prediction.refinement.coherence import contradiction
 from ghgs_lit.types import Batch
 
-#: Pixels of masks, and rounds of cameras, that mend what is found.
-ENOUGH = 4
-#: Pixels beside an outline at which photographs are looked at.
-_REACH = 6
+ENOUGH = 4  #: Pixels of masks, and rounds of cameras, that mend what is found
+_REACH = 6  #: Pixels beside an outline at which photographs are looked at
 #: Pixels of crops by which outlines lie beside the masks', on average, above which masks are off.
 _OFF = 0.35
 #: Pixels that rays near outlines miss other silhouettes by, on average, above which cameras are off.

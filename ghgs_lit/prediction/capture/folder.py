@@ -31,8 +31,7 @@ from ghgs_lit.prediction.capture.photographs import (
 if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     import torch
 
-#: Photographs that an instant needs where others of its are missing.
-ENOUGH = 3
+ENOUGH = 3  #: Photographs that an instant needs where others of its are missing
 
 
 @dataclass(frozen=True)

@@ -65,8 +65,7 @@ class VideoFrame:
         return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
 
 
-#: Where a photograph comes from.
-Source = Path | Frame | VideoFrame
+Source = Path | Frame | VideoFrame  #: Where a photograph comes from
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:

@@ -13,14 +13,11 @@ from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.prediction.capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
 
-#: Choices of ``segment``.
-SEGMENTERS = ("rembg",)
-# Labels of body parts are numbers below this; alpha and probabilities reach 255.
-_LABELS = 32
+SEGMENTERS = ("rembg",)  #: Choices of ``segment``
+_LABELS = 32  # Labels of body parts are numbers below this; alpha and probabilities reach 255
 # By how many deviations of the noise a pixel differs from the background, and by how much at least.
 _DEVIATIONS, _LEAST_DIFFERENCE = 6.0, 12.0
-# Regions below this share of the largest one's area are not of the subject.
-_SPECK = 0.05
+_SPECK = 0.05  # Regions below this share of the largest one's area are not of the subject
 
 
 def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:

@@ -16,8 +16,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-#: A mask beside its photograph ends with this.
-MASK_ENDING = "_mask"
+MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
 #: How EXIF says to show a photograph: orientation to quarter turns as of ``numpy.rot90``.
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")

@@ -25,8 +25,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Cameras
 
-#: Instants, spread over a sequence, that its cameras are corrected with.
-INSTANTS = 8
+INSTANTS = 8  #: Instants, spread over a sequence, that its cameras are corrected with
 #: Median deviation of the logarithms of gains from which a camera changes its exposure between instants.
 _CHANGING = 0.05
 

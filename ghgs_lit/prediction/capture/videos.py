@@ -26,8 +26,7 @@ _TIME = re.compile(rb"pts_time:(\S+)")
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
 # How framecrc lists a packet that says no time, and one that is not shown.
 _UNTIMED, _HIDDEN = -(2**63), re.compile("F=0x[4-7]")
-#: Seconds of a video that are decoded for nothing before it is sought in.
-_PATIENCE = 10.0
+_PATIENCE = 10.0  #: Seconds of a video that are decoded for nothing before it is sought in
 
 
 @dataclass(frozen=True)

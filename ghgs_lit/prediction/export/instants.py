@@ -24,8 +24,7 @@ from ghgs_lit.visualization.turntable import orbit
 
 #: How far the video's camera swings to each side of the first photograph, in radians.
 _SWING = math.radians(20)
-#: The longer side of its pictures in pixels, at least.
-_VIDEO_SIDE = 720
+_VIDEO_SIDE = 720  #: The longer side of its pictures in pixels, at least
 
 
 class Instants:

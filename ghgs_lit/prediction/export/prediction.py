@@ -28,8 +28,7 @@ from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
 
-#: The picture to look at.
-SHEET = "sheet.png"
+SHEET = "sheet.png"  #: The picture to look at
 
 
 @dataclass(frozen=True)

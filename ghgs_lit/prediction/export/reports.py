@@ -11,8 +11,7 @@ from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.readers import read_json
 from ghgs_lit.runs.results import plain
 
-#: The file that lists the others.
-REPORT = "report.json"
+REPORT = "report.json"  #: The file that lists the others
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:

@@ -51,14 +51,12 @@ def rotate_world(
 
 #: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
 VIEWER_LOW_PASS = 0.3
-#: The least standard deviation of a Gaussian in pixels.
-_SMALLEST = 1e-3
+_SMALLEST = 1e-3  #: The least standard deviation of a Gaussian in pixels
 #: How Gaussians for other viewers are brought nearer to ours: what may change, steps, and cameras around the
 #: subject beside the inputs, of which two take part in a step.
 _FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
 _FIT_STEPS, _AROUND, _AT_ONCE = 32, 8, 2
-#: Of L1, 1 - SSIM, which would take half of the time, and the silhouette.
-_WEIGHTS = (1.0, 0.0, 0.1)
+_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM, which would take half of the time, and the silhouette
 
 
 @dataclass(frozen=True)

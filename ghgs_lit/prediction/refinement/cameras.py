@@ -29,12 +29,9 @@ Numbers, Which = Float[Tensor, " B"], Bool[Tensor, "B V"]
 
 #: Steps of the optimiser in each round, and its first step: radians, and half heights of the subject.
 _STEPS, _RATE = 15, 0.006
-#: Weight of the silhouettes beside that of colours.
-_OUTLINE = 0.5
-#: Metres between depths of one surface.
-_SAME = 0.05
-#: Weight of the squared motion.
-_STAY = 4.0
+_OUTLINE = 0.5  #: Weight of the silhouettes beside that of colours
+_SAME = 0.05  #: Metres between depths of one surface
+_STAY = 4.0  #: Weight of the squared motion
 #: Part of the disagreement that the first round and any later one must take away for its cameras to be kept.
 #: With exact cameras it is up to 0.01, 0.02 from above; with cameras that are off by a pixel 0.02 to 0.2.
 #: The first also holds for cameras that silhouettes propose.

@@ -32,8 +32,7 @@ Lenses, Middles = Float[Tensor, "K V 3 3"], Float[Tensor, "K 3"]
 #: One of each camera, and one of each ray.
 Which, Numbers, Points = Bool[Tensor, " V"], Int[Tensor, " R"], Float[Tensor, "R 3"]
 
-#: Depths along a ray.
-_DEPTHS = 48
+_DEPTHS = 48  #: Depths along a ray
 #: Mean distance in pixels of rays near outlines below which silhouettes explain one another.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those

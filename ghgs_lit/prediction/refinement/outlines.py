@@ -12,16 +12,12 @@ from ghgs_lit.geometry.outlines import signed_distance, soft_signed_distance
 from ghgs_lit.geometry.projection import pixel_centers
 from ghgs_lit.geometry.sampling import sample
 
-#: Size of the distance maps over that of the photographs.
-_FINER = 4
-#: Farther than this from an outline, in pixels, distances are all the same.
-_FAR = 20.0
-#: Pixels inside their outline whose rays are tried: from, and to.
-_FROM, TO = 0.25, 8.0
+_FINER = 4  #: Size of the distance maps over that of the photographs
+_FAR = 20.0  #: Farther than this from an outline, in pixels, distances are all the same
+_FROM, TO = 0.25, 8.0  #: Pixels inside their outline whose rays are tried: from, and to
 #: Of a look: size of the maps, pixels inside outlines to which rays are tried, and of how many one is.
 CAREFUL, QUICK = (_FINER, TO, 1), (1, 1.5, 2)
-#: Half the width in pixels over which a slope of a distance map is taken.
-_REACH = 0.75
+_REACH = 0.75  #: Half the width in pixels over which a slope of a distance map is taken
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
-#: Photographs on black, silhouettes and cameras.
-Seen = tuple[Tensor, Tensor, Cameras]
+Seen = tuple[Tensor, Tensor, Cameras]  #: Photographs on black, silhouettes and cameras
 
 
 @dataclass(frozen=True)

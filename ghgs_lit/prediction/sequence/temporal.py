@@ -22,16 +22,14 @@ from ghgs_lit.geometry.vectors import unit
 from ghgs_lit.prediction.refinement.refinement import NEAR, Change, Descent, Renderer, seen_by
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 
-#: Metres behind the rendered surface up to which a view shows a Gaussian.
-_SHOWN = 0.03
+_SHOWN = 0.03  #: Metres behind the rendered surface up to which a view shows a Gaussian
 #: Steps at each instant. They may go farther than those of a single one: an error of the flow is larger than
 #: that of a prediction.
 _STEPS = 2
 _CHANGES = NEAR | {"means": Change(10.0, 0.1), "colors": Change(0.1, 0.004)}
 #: Of L1 and of the silhouettes' L1; without SSIM, which takes as long as the renders.
 _WEIGHTS = (0.8, 0.0, 0.1)
-#: Times the misfit after a new prediction at which Gaussians no longer fit.
-_WORSE = 1.5
+_WORSE = 1.5  #: Times the misfit after a new prediction at which Gaussians no longer fit
 
 
 @dataclass(frozen=True)

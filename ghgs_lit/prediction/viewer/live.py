@@ -18,8 +18,7 @@ from ghgs_lit.prediction.viewer.content import Content
 from ghgs_lit.prediction.viewer.server import Viewer
 from ghgs_lit.types import Batch
 
-#: Instants over which times are means, the newest with the largest weight.
-_RECENT = 30
+_RECENT = 30  #: Instants over which times are means, the newest with the largest weight
 
 
 class Recording:

@@ -19,8 +19,7 @@ from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
 from ghgs_lit.prediction.capture.formats import camera_file
 from ghgs_lit.readers import check_yaml
 
-#: The files of EasyMocap: intrinsics and poses.
-EASYMOCAP = ("intri.yml", "extri.yml")
+EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
 # Spelled as `plain` does; a rotation matrix is preferred to a vector where there are both.
 _NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
@@ -32,8 +31,7 @@ _NAMES = {
     "height": ("height", "imageheight", "h"),
     "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
 }
-# Coefficients with an entry each.
-_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # Coefficients with an entry each
 #: Entries that are read, or of no matter for a camera.
 KNOWN = {
     *(name for names in _NAMES.values() for name in names),
