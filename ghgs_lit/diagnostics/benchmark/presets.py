@@ -38,22 +38,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Case:
-    """A model that is measured.
-
-    Args:
-        knobs: values that were changed, by key.
-        model: in evaluation mode, on its device.
-        budget_db: PSNR that the preset may lose against the yardstick; None: nothing is promised.
-        max_rel_diff: difference of every attribute from the yardstick's that the preset may make, times
-            :data:`ROUNDS_AMPLIFY` where there are rounds; None: nothing is promised.
-    """
+    """A model that is measured."""
 
     preset: str
-    knobs: Mapping[str, Any]
-    model: GHGS
+    knobs: Mapping[str, Any]  #: values that were changed, by key
+    model: GHGS  #: in evaluation mode, on its device
     renderer: Renderer
-    budget_db: float | None
-    max_rel_diff: float | None
+    budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: nothing is promised
+    max_rel_diff: float | None  #: the same of differences of attributes (:data:`ROUNDS_AMPLIFY`)
     is_trained: bool
 
     @property

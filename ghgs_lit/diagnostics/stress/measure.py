@@ -27,19 +27,12 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was found for n cases.
+    """What was found for n cases."""
 
-    Args:
-        errors: over eps times the condition number [n]; infinite where there is no bound.
-        lost: whether a value is not finite [n].
-        said: what has the error, of each case.
-        gradient: median of the largest gradient.
-    """
-
-    errors: Tensor
-    lost: Tensor
-    said: Sequence[str]
-    gradient: float = 0.0
+    errors: Tensor  #: over eps times the condition number [n]; infinite where there is no bound
+    lost: Tensor  #: whether a value is not finite [n]
+    said: Sequence[str]  #: what has the error, of each case
+    gradient: float = 0.0  #: median of the largest gradient
 
 
 def measure(

@@ -114,17 +114,11 @@ class StoredCamera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """One camera for photographs of one size, in the conventions of :mod:`ghgs_lit.types`.
+    """One camera for photographs of one size, in the conventions of :mod:`ghgs_lit.types`."""
 
-    Attributes:
-        intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
-        extrinsics: [4, 4] float64, world to camera, OpenCV axes.
-        distortion, fisheye, gains: as for :class:`StoredCamera`.
-    """
-
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
-    distortion: np.ndarray
+    intrinsics: np.ndarray  #: [3, 3] float64 in pixels, pixel centres at +0.5
+    extrinsics: np.ndarray  #: [4, 4] float64, world to camera, OpenCV axes
+    distortion: np.ndarray  #: this and what follows: as for :class:`StoredCamera`
     fisheye: bool
     gains: np.ndarray | None = None
 

@@ -43,19 +43,13 @@ class StoredView:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A meaning of a calibration, and how well masks and cameras agree with it.
-
-    Attributes:
-        option: of the command line, which makes it so; empty: as it is, or nothing does.
-        blames: the cameras that it says are wrong; empty: all, or none.
-        shares: by view, the share of the mask that lies in the hull of the others; empty before it is ranked.
-    """
+    """A meaning of a calibration, and how well masks and cameras agree with it."""
 
     says: str
-    option: str
+    option: str  #: of the command line, which makes it so; empty: as it is, or nothing does
     views: tuple[StoredView, ...]
-    blames: tuple[str, ...] = ()
-    shares: dict[str, float] = field(default_factory=dict)
+    blames: tuple[str, ...] = ()  #: the cameras that it says are wrong; empty: all, or none
+    shares: dict[str, float] = field(default_factory=dict)  #: of each mask in the hull of the others
 
     @property
     def score(self) -> float:
@@ -91,21 +85,14 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The report on a calibration.
-
-    Attributes:
-        option: of the command line, which mends it; empty where none does.
-        ranking: all meanings that were tried, the best first.
-        size: the subject's largest extent, in the user's unit, of the best meaning.
-        suspects: cameras that disagree with the others.
-    """
+    """The report on a calibration."""
 
     consistent: bool
     lines: tuple[str, ...]
-    option: str
-    ranking: tuple[Hypothesis, ...]
-    size: float
-    suspects: tuple[str, ...] = ()
+    option: str  #: of the command line, which mends it; empty where none does
+    ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
+    size: float  #: the subject's largest extent, in the user's unit, of the best meaning
+    suspects: tuple[str, ...] = ()  #: cameras that disagree with the others
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:

@@ -24,17 +24,11 @@ _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"
 
 @dataclass(frozen=True)
 class Pixels:
-    """One decoded photograph as it is shown.
+    """One decoded photograph as it is shown."""
 
-    Attributes:
-        image: [h, w, 3] uint8, RGB.
-        alpha: [h, w] uint8 where the file has it.
-        turns: quarter turns that showing it took, as of ``numpy.rot90``.
-    """
-
-    image: np.ndarray
-    alpha: np.ndarray | None
-    turns: int
+    image: np.ndarray  #: [h, w, 3] uint8, RGB
+    alpha: np.ndarray | None  #: [h, w] uint8 where the file has it
+    turns: int  #: quarter turns that showing it took, as of ``numpy.rot90``
 
     @property
     def size(self) -> tuple[int, int]:

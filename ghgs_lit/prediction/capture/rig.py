@@ -32,22 +32,13 @@ _CHANGING = 0.05
 
 @dataclass(frozen=True)
 class Rig:
-    """Corrected cameras, and what else photographs of all instants share, by name.
+    """Corrected cameras, and what else photographs of all instants share, by name; gains where found."""
 
-    Attributes:
-        extrinsics: [4, 4] float64, world to camera.
-        zoom: by how much their focal lengths grow.
-        moved: pixels of a crop that the correction moved the subject by.
-        why: what the given cameras contradicted, where ``auto`` decided.
-        gains: [3], by what they multiply red, green and blue, with a geometric mean of 1; of those alone of
-            which it is found here.
-    """
-
-    extrinsics: Mapping[str, np.ndarray]
-    zoom: Mapping[str, float]
-    moved: Mapping[str, float]
-    why: str = ""
-    gains: Mapping[str, np.ndarray] = field(default_factory=dict)
+    extrinsics: Mapping[str, np.ndarray]  #: [4, 4] float64, world to camera
+    zoom: Mapping[str, float]  #: by how much their focal lengths grow
+    moved: Mapping[str, float]  #: pixels of a crop that the correction moved the subject by
+    why: str = ""  #: what the given cameras contradicted, where ``auto`` decided
+    gains: Mapping[str, np.ndarray] = field(default_factory=dict)  #: [3], with a geometric mean of 1
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with the corrected cameras."""

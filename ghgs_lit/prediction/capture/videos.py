@@ -31,18 +31,12 @@ _PATIENCE = 10.0  #: Seconds of a video that are decoded for nothing before it i
 
 @dataclass(frozen=True)
 class Video:
-    """The frames of a video, as its file lists them.
-
-    Attributes:
-        size: (height, width) in pixels as shown.
-        seconds: [n] float64, when each frame is shown, ascending.
-        numbers: [n] int64, the number of each; one that the camera dropped has a number, too.
-    """
+    """The frames of a video, as its file lists them."""
 
     path: Path
-    size: tuple[int, int]
-    seconds: np.ndarray
-    numbers: np.ndarray
+    size: tuple[int, int]  #: (height, width) in pixels as shown
+    seconds: np.ndarray  #: [n] float64, when each frame is shown, ascending
+    numbers: np.ndarray  #: [n] int64, the number of each; one that the camera dropped has a number, too
 
     @property
     def count(self) -> int:

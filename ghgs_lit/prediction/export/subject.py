@@ -61,21 +61,13 @@ _WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM, which would take half of the tim
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Choices for the files of a prediction.
+    """Choices for the files of a prediction."""
 
-    Args:
-        formats: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`.
-        up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
-        smooth: the files of Gaussians hold what a renderer adds in pixels of the photographs.
-        frames: pictures of the turntable.
-        fps: of these, per second of the video.
-    """
-
-    formats: tuple[str, ...] = ("ply",)
-    up: str | None = None
-    smooth: bool = False
-    frames: int = 24
-    fps: int = 12
+    formats: tuple[str, ...] = ("ply",)  #: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`
+    up: str | None = None  #: axis (``y``, ``-y``, ``z``) that points up in files; None: as of the cameras
+    smooth: bool = False  #: the files of Gaussians hold what a renderer adds in pixels of the photographs
+    frames: int = 24  #: pictures of the turntable
+    fps: int = 12  #: of these, per second of the video
 
     def __post_init__(self):
         choice("up", self.up, (None, *AXES))
