@@ -28,24 +28,15 @@ from ghgs_lit.weights.reading import SHIPPED, file_of
 
 @dataclass(frozen=True)
 class TimedPrediction:
-    """A prediction with the batch that the model saw.
+    """A prediction with the batch that the model saw."""
 
-    Attributes:
-        batch: photographs (of a capture: crops around the subject), masks and cameras, corrected where asked.
-        prediction: of this batch, in the world and unit of its cameras.
-        moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
-        changed: which share of the subject refining changed in each crop; nothing where masks stay.
-        refined: what refining the Gaussians gained; None where they are as predicted. Depths stay.
-        why: what photographs or silhouettes contradict, by the name of the refinement that ``auto`` chose.
-    """
-
-    batch: Batch
-    prediction: Prediction
+    batch: Batch  #: photographs or crops around the subject, masks and cameras, corrected where asked
+    prediction: Prediction  #: of this batch, in the world and unit of its cameras
     seconds: dict[str, float] = field(default_factory=dict)
-    moved: tuple[float, ...] = ()
-    changed: tuple[float, ...] = ()
-    refined: Report | None = None
-    why: dict[str, str] = field(default_factory=dict)
+    moved: tuple[float, ...] = ()  #: pixels that correcting cameras moved the subject by in each photograph
+    changed: tuple[float, ...] = ()  #: share of the subject that refining masks changed in each crop
+    refined: Report | None = None  #: what refining the Gaussians gained, where asked; depths stay
+    why: dict[str, str] = field(default_factory=dict)  #: doubts, by the refinement that ``auto`` chose
 
     @property
     def gaussians(self) -> Gaussians:

@@ -33,20 +33,12 @@ SHEET = "sheet.png"  #: The picture to look at
 
 @dataclass(frozen=True)
 class Format:
-    """One format.
+    """One format. ``contents`` makes functions that make each of the files, in their order and in threads."""
 
-    Attributes:
-        files: their names below the directory of the prediction; one with ``{view}`` or ``{frame}`` stands
-            for a file of each view, or of each picture of the turntable.
-        contents: functions that make each of these files, in their order; they are called in threads.
-        package: that it needs.
-        extra: of this package, which installs it.
-    """
-
-    files: tuple[str, ...]
+    files: tuple[str, ...]  #: their names; ``{view}`` and ``{frame}``: one of each view, of the turntable
     contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
-    package: str | None = None
-    extra: str = "formats"
+    package: str | None = None  #: that it needs
+    extra: str = "formats"  #: of this package, which installs it
 
     def names(self, views: Sequence[str], frames: int) -> list[str]:
         """The names of all files."""
