@@ -64,8 +64,7 @@ class Verb:
         try:
             config = own_keys(cfg, self.name)
             require_paths(self.name, config)
-            # Before the verb's module is imported, which takes longer.
-            check(config)
+            check(config)  # before the verb's module is imported, which takes longer
             module = importlib.import_module(module_of(self.name))
             collect_garbage_again()
             children_sleep()

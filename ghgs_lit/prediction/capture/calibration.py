@@ -179,8 +179,7 @@ def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) 
     (without distortion) and ``size`` (height, width): of the image before."""
     for _ in range(turns % 4):
         k = calibration.intrinsics
-        # New x is the old y, new y is the width less the old x.
-        height, width = size
+        height, width = size  # new x is the old y, new y is the width less the old x
         turned = np.array([[k[1, 1], 0, k[1, 2]], [0, k[0, 0], width - k[0, 2]], [0, 0, 1.0]])
         rotation = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
         calibration = replace(calibration, intrinsics=turned, extrinsics=rotation @ calibration.extrinsics)

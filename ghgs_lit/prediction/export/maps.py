@@ -68,8 +68,7 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
     """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras. Both
     are what ``ghgs predict images=inputs cameras=cameras.json`` reads."""
     for image, matte in zip(subject.images, subject.mattes, strict=True):
-        # Colours of a PNG are not premultiplied.
-        colors = to_uint8(unmultiplied(image, matte))
+        colors = to_uint8(unmultiplied(image, matte))  # Colours of a PNG are not premultiplied
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
         yield partial(png, np.concatenate([colors, alpha], -1))
     cameras = subject.cameras

@@ -83,8 +83,7 @@ class CameraRefinement:
             if not bool(is_better.any()):
                 break
             inside, moved = replace(inside, cameras=cameras), moved | is_better
-        # To the frame and back is not exact.
-        left = frame.leave_cameras(inside.cameras, batch.cameras)
+        left = frame.leave_cameras(inside.cameras, batch.cameras)  # to the frame and back is not exact
         return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()

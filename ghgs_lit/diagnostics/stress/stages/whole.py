@@ -33,8 +33,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
                 parameter.data += 10.0 * torch.randn_like(parameter).sign()
             elif not parameter.any():
                 nn.init.normal_(parameter, std=0.1)
-    # Rounds draw their number in training.
-    model.train(name != "recurrent")
+    model.train(name != "recurrent")  # rounds draw their number in training
     exact = copy.deepcopy(model).double()
     exact.bounds = partial(_in_float32, model.bounds)
     return {torch.float32: model, torch.float64: exact}

@@ -112,8 +112,7 @@ def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]
         # The longest name: K_1 beside K_cam_1.
         name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
         field = key.removesuffix(f"_{name}")
-        # EasyVolcap's t is a time.
-        cameras.get(name, others)["time" if field == "t" else field] = value
+        cameras.get(name, others)["time" if field == "t" else field] = value  # EasyVolcap's t is a time
     camera_file.check_unread(origin, others, KNOWN)
     return cameras
 
