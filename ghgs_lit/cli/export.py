@@ -4,7 +4,7 @@ import torch
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.diagnostics.benchmark.error import differences as prediction_differences
+from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS

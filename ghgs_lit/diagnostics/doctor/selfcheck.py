@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES
+from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import has_bfloat16
