@@ -28,6 +28,7 @@ from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
 from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
 from ghgs_lit.prediction.export.reports import REPORT
+from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch
@@ -182,6 +183,11 @@ def advice_of(directory: Path) -> Iterator[str]:
     quality = report["psnr_box_of_inputs"].values()
     if len(quality) < 3:
         yield f"{len(quality)} photographs leave much unseen: 3 to 5 all around show a person"
+    for edge, names in report["cut"].items():
+        yield f"{', '.join(names)} end at the subject's {edge}: what no photograph shows is missing"
+    guessed = [part for part, share in report["seen_once"].items() if share > GUESSED]
+    if guessed:
+        yield f"at {', '.join(guessed)} of its height mostly one photograph shows the subject: a guess"
     low, high = min(quality), max(quality)
     if low < LOW_PSNR:
         left = [key for key in ("refine_cameras", "refine_masks") if key not in report]

@@ -23,6 +23,7 @@ from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
+from ghgs_lit.prediction.export.unseen import unseen
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Gaussians, Prediction
@@ -176,5 +177,6 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
         "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
         "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
         "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
+        **unseen(subject),
         "versions": versions(),
     }
