@@ -22,8 +22,10 @@ def test_what_is_done_is_there_after_a_kill(tmp_path):
 def test_rows_of_other_code_are_not_taken_over(tmp_path, monkeypatch, capsys):
     """A table must not mix numbers of two versions."""
     path = tmp_path / "pieces.jsonl"
-    Journal(path).add("a", [])
-    Journal(path).say_done(["a", "b"], "pieces")
-    assert capsys.readouterr().out == f"{path}: 1 of 2 pieces are done already\n"
+    done, left = (run.Task("cosine", family, 1) for family in ("ordinary", "zero_features"))
+    Journal(path).add(done.key, [])
+    rows = run.run_tasks([done, left], path, workers=0)
+    assert capsys.readouterr().out == f"{path}: 1 of 2 families are done already\n"
+    assert {row["family"] for row in rows} == {"zero_features"}
     monkeypatch.setattr(run, "code_digest", lambda: "other")
-    assert "a" not in Journal(path)
+    assert done.key not in Journal(path)
