@@ -25,7 +25,7 @@ from recorder import Recorder, Stage, forget_peak, memory_gb, merged
 
 from ghgs_lit import encoder
 from ghgs_lit.config import compose
-from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.encoder.packing import KeptPatches
 from ghgs_lit.kernels.linear import linear
 from ghgs_lit.model import GHGS, STAGES

@@ -16,10 +16,8 @@ import sys
 import torch
 
 from ghgs_lit.config import build, compose, resolve
-from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
-from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.stages import TOTAL
-from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
+from ghgs_lit.diagnostics.benchmark.stages import TOTAL, PeakProbe
 from ghgs_lit.model import GHGS
 from ghgs_lit.types import Batch
 

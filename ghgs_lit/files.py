@@ -88,6 +88,15 @@ def write_text_atomically(path: str | Path, text: str) -> None:
     write_atomically(path, lambda temporary: temporary.write_text(text))
 
 
+def append_line(path: Path, text: str) -> None:
+    """Append ``text`` as a line of its own, also after one whose end a killed process left out. Folders are
+    made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    is_torn = path.is_file() and path.stat().st_size > 0 and not path.read_bytes().endswith(b"\n")
+    with path.open("a") as file:
+        file.write(("\n" if is_torn else "") + text + "\n")
+
+
 def _remove_leftovers(path: Path) -> None:
     prefix = f".{path.name}.{socket.gethostname()}."
     for leftover in path.parent.glob(f"{prefix}*.tmp"):

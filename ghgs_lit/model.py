@@ -19,8 +19,7 @@ from ghgs_lit.skipping import SkipOptions
 from ghgs_lit.stages import HEADS, OPTIONS, STAGES
 from ghgs_lit.surroundings import ModelOptions, computing, surroundings
 from ghgs_lit.types import Batch, DepthBounds, Prediction, Tokens
-from ghgs_lit.weights.checkpoint import read_checkpoint
-from ghgs_lit.weights.loading import load_weights
+from ghgs_lit.weights.checkpoint import load_weights, read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED
 
 

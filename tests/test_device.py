@@ -197,7 +197,7 @@ def test_predict_runs_there(tmp_path, monkeypatch):
     render_boxes(tmp_path / "data", tmp_path / "scans", train=1, val=1)
     checkpoint = tmp_path / "a.ckpt"
     write_checkpoint(checkpoint, make_model("model=hull").state_dict(), config("model=hull"))
-    monkeypatch.setattr(predict, "pick_device", lambda _: DEVICE)
+    monkeypatch.setattr(predict.inputs, "pick_device", lambda _: DEVICE)
     with pretend_device():
         code = ghgs(
             "predict", f"checkpoint={checkpoint}", "data=scans", f"data.root={tmp_path / 'data'}",

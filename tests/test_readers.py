@@ -12,10 +12,10 @@ from ghgs_lit.data.decoding import read_array, read_image
 from ghgs_lit.data.layout import Completeness
 from ghgs_lit.data.pickles import load_npy
 from ghgs_lit.data.splits import read_split
+from ghgs_lit.diagnostics.stress.run import Journal
 from ghgs_lit.errors import InputError
 from ghgs_lit.evaluation.tables.records import read_others, read_sweep
 from ghgs_lit.readers import LARGEST, read_json, read_lines_of_json, read_npy, read_rows, read_text, read_yaml
-from ghgs_lit.runs.journal import Journal
 from ghgs_lit.runs.listing import list_runs
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory

@@ -5,12 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
+from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe
 from ghgs_lit.errors import InputError
 from ghgs_lit.model import GHGS
 from ghgs_lit.skipping import SkipOptions, encoder_products
-from ghgs_lit.weights.checkpoint import write_checkpoint
-from ghgs_lit.weights.loading import load_weights
+from ghgs_lit.weights.checkpoint import load_weights, write_checkpoint
 from tests.helpers.models import close, config, make_model
 from tests.helpers.scenes import hard_subjects, make_batch, stack
 

@@ -21,7 +21,7 @@ from ghgs_lit.prediction.capture.formats import read_cameras
 from ghgs_lit.prediction.export.maps import camera_entry
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
-from ghgs_lit.weights.inference import write_inference
+from ghgs_lit.weights.exporting import write_inference
 from ghgs_lit.weights.reading import file_of
 
 if TYPE_CHECKING:

@@ -22,15 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.messages import (
-    BAD_INPUT,
-    BadUsage,
-    check_deletions,
-    flags_first,
-    one_line,
-    raised_by_hydra,
-    takes_value,
-)
+from ghgs_lit.cli import messages
 from ghgs_lit.cli.usage import VERBS
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
 from ghgs_lit.config.registry import check
@@ -67,25 +59,24 @@ class Verb:
     def __call__(self, cfg: DictConfig) -> object:
         # Lightning starts the other processes of a DDP job by running sys.argv again, which needs the verb.
         sys.argv = list(self.argv)
-        from ghgs_lit.cli.paths import require_paths  # here: --help needs no NumPy
+        from ghgs_lit.cli.photographs import require_paths  # here: --help needs no NumPy
 
         try:
             config = own_keys(cfg, self.name)
             require_paths(self.name, config)
-            # Before the verb's module is imported, which takes longer.
-            check(config)
+            check(config)  # before the verb's module is imported, which takes longer
             module = importlib.import_module(module_of(self.name))
             collect_garbage_again()
             children_sleep()
             return module.run(cfg)
-        except BAD_INPUT as error:
+        except messages.BAD_INPUT as error:
             # In a sweep Hydra prints the error with the number of its job; elsewhere one line is enough.
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             discard_unused(Path(HydraConfig.get().runtime.output_dir), self.name, self.started)
             if self.wants_trace:
                 raise
-            print(f"ghgs {self.name}: {one_line(error, self.name)}", file=sys.stderr)
+            print(f"ghgs {self.name}: {messages.one_line(error, self.name)}", file=sys.stderr)
             raise SystemExit(1) from error
 
 
@@ -102,9 +93,7 @@ def read_yaml_quickly() -> None:
 @contextmanager
 def composed_once(arguments: Sequence[str]) -> Iterator[None]:
     """Spare Hydra the first of two compositions while the context lasts: it looks for ``hydra.mode`` alone.
-
-    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name.
-    """
+    Of ``conf`` sweeps alone set it. Arguments may, and so may files of the user's own, which flags name."""
     says = any(key in text for text in arguments for key in ("sweep", "hydra.mode", "hydra.searchpath"))
     if says or any(text.startswith("-") and text not in ("-m", "--multirun") for text in arguments):
         yield
@@ -117,10 +106,8 @@ def composed_once(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _for_hydra(verb: str, arguments: list[str]) -> list[str]:
-    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced.
-
-    A file of ``sweep`` asks for a sweep, which Hydra 1.4 wants to know before it composes.
-    """
+    """Arguments in Hydra's terms: where the data is that of a checkpoint, its keys are forced. A file of
+    ``sweep`` asks for a sweep, which Hydra 1.4 wants to know before it composes."""
     sweeps = any(re.match("sweep=(?!null)", argument) for argument in arguments)
     if sweeps and not any(argument.startswith("hydra.mode=") for argument in arguments):
         return [*arguments, "hydra.mode=MULTIRUN"]
@@ -134,9 +121,9 @@ def _help(verb: str, arguments: list[str]) -> int:
     """``ghgs <verb> --help [group]``; of other arguments only ``--config-dir`` has a say."""
     from ghgs_lit.cli.help import print_group, print_verb
 
-    words = flags_first(arguments)
+    words = messages.flags_first(arguments)
     folders = [Path(folder) for flag, folder in pairwise(words) if flag in ("-cd", "--config-dir")]
-    values = {word for flag, word in pairwise(words) if takes_value(flag)}
+    values = {word for flag, word in pairwise(words) if messages.takes_value(flag)}
     groups = [word for word in words if not word.startswith("-") and "=" not in word and word not in values]
     for group in groups:
         print_group(verb, group, folders)
@@ -153,8 +140,8 @@ def run(verb: str, argv: list[str]) -> int:
     try:
         if "--help" in argv or "-h" in argv:
             return _help(verb, argv[2:])
-        sys.argv = [argv[0], *flags_first(_for_hydra(verb, argv[2:]))]
-        check_deletions(sys.argv[1:])
+        sys.argv = [argv[0], *messages.flags_first(_for_hydra(verb, argv[2:]))]
+        messages.check_deletions(sys.argv[1:])
         read_yaml_quickly()
         with interruptible(), composed_once(sys.argv[1:]):
             hydra.main(**VERSION_BASE, config_path=str(conf_dir()), config_name=verb)(task)()
@@ -163,13 +150,13 @@ def run(verb: str, argv: list[str]) -> int:
         # The reader, such as `head`, has seen enough; Python must not write the rest when it exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
-    except BadUsage as error:
+    except messages.BadUsage as error:
         print(f"ghgs {verb}: {error}", file=sys.stderr)
         return 2
     except Exception as error:
-        if wants_trace or not (isinstance(error, BAD_INPUT) or raised_by_hydra(error)):
+        if wants_trace or not (isinstance(error, messages.BAD_INPUT) or messages.raised_by_hydra(error)):
             raise
-        print(f"ghgs {verb}: {one_line(error, verb)}", file=sys.stderr)
+        print(f"ghgs {verb}: {messages.one_line(error, verb)}", file=sys.stderr)
         return 1
     except Interrupted as stop:
         if not stop.explained:

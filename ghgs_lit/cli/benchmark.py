@@ -4,7 +4,6 @@ import itertools
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
@@ -37,8 +36,11 @@ def run(cfg: DictConfig) -> None:
     with threads(config["threads"]):
         content = _presets(configured_cases(config, device), config, device)
         content = {"machine": machine_facts(device), **content}
-    path = _write(directory, content, config)
-    announce(path)
+    tables = report.tables_of(content["rows"])
+    print_tables(tables)
+    print(*content["decisions"], sep="\n", flush=True)
+    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
+    announce(report.write_numbers(directory, {**content, "provenance": source}, tables))
     if content["broken"]:
         for said in content["broken"]:
             print(f"ghgs benchmark: {said}", file=sys.stderr)
@@ -83,9 +85,12 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
     rows = report.rows_of(records)
     _, views, _, height, width = batches[0].images.shape
     subjects = sum(len(batch.images) for batch in batches)
-    about = f"{_weights(config, cases)}; {subjects} subjects of {config['data']['name']}"
+    number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
+    weights = config["checkpoint"] or f"{choices().get('encoder', 'encoder')}, random weights"
+    weights = f"{weights} ({number:.1f} M parameters, precision {config['precision']})"
+    photographs = f"{subjects} subjects of {config['data']['name']}, {views} views of {height} x {width}"
     return {
-        "about": f"{about}, {views} views of {height} x {width}",
+        "about": f"{weights}; {photographs}",
         "random_weights": config["checkpoint"] is None,
         "rows": rows,
         "broken": report.broken_budgets(rows),
@@ -96,17 +101,3 @@ def _presets(cases: list[Case], config: dict[str, Any], device: torch.device) ->
         ],
         "subjects": [row for record in records for row in record.metrics],
     }
-
-
-def _weights(config: dict[str, Any], cases: list[Case]) -> str:
-    number = sum(p.numel() for p in cases[0].model.parameters()) / 1e6
-    own = config["checkpoint"] or f"{choices().get('encoder', 'encoder')}, random weights"
-    return f"{own} ({number:.1f} M parameters, precision {config['precision']})"
-
-
-def _write(directory: Path, content: dict[str, Any], config: dict[str, Any]) -> Path:
-    tables = report.tables_of(content["rows"])
-    print_tables(tables)
-    print(*content.get("decisions", []), sep="\n", flush=True)
-    source = provenance(config, seed=config["seed"], verb="benchmark", choices=choices())
-    return report.write_numbers(directory, {**content, "provenance": source}, tables)

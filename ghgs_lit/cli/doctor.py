@@ -1,18 +1,93 @@
-"""``ghgs doctor``: what is wrong, and what would mend it; one module for each task."""
+"""``ghgs doctor``: what is wrong, and what would mend it; one function for each task."""
 
-from collections.abc import Callable
-
+import rich
 from omegaconf import DictConfig
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
-from ghgs_lit.cli import doctor_cameras, doctor_machine, doctor_selfcheck
+from ghgs_lit.cli.inputs import pick_device
+from ghgs_lit.cli.photographs import capture_folder
+from ghgs_lit.cli.runtime import announce, output_dir, save_config
+from ghgs_lit.config import resolve
+from ghgs_lit.diagnostics.doctor.machine import machine_lines, missing_extras
+from ghgs_lit.diagnostics.doctor.selfcheck import FAILED, selfcheck, table
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import write_text_atomically
+from ghgs_lit.prediction.capture.calibration import calibrate
+from ghgs_lit.prediction.capture.camera_report import diagnose
+from ghgs_lit.prediction.capture.drawing import camera_sheet
+from ghgs_lit.prediction.capture.formats.json_and_toml import write_json
+from ghgs_lit.visualization.pictures import save_png
 
-TASKS: dict[str, Callable[[DictConfig], None]] = {
-    "cameras": doctor_cameras.run,
-    "machine": doctor_machine.run,
-    "selfcheck": doctor_selfcheck.run,
-}
+_LISTED = 6  #: How many meanings of a calibration are listed
 
 
 def run(cfg: DictConfig) -> None:
-    """The verb: one of :data:`TASKS`."""
-    TASKS[cfg.task](cfg)
+    """The verb: one of the tasks below."""
+    {"cameras": cameras, "machine": machine, "selfcheck": selfcheck_device}[cfg.task](cfg)
+
+
+def cameras(cfg: DictConfig) -> None:
+    """Whether photographs, masks and calibration fit together: print what was found; write ``cameras.png``,
+    and ``cameras.json`` of a meaning that fits. InputError: the cameras do not fit as they are."""
+    tasks = "images=<folder of photographs> cameras=<calibration>, task=machine or task=selfcheck"
+    require(cfg.images is not None, "images", tasks, None)
+    directory = output_dir()
+    folder = capture_folder(save_config(cfg, directory))
+    inputs = {path.resolve() for path in folder.input_files}
+    picture, calibration = directory / "cameras.png", directory / "cameras.json"
+    for path in (picture, calibration):
+        expected = "a folder (hydra.run.dir) without inputs"
+        require(path.resolve() not in inputs, str(path), expected, "an input")
+    diagnosis = diagnose(folder)
+    best = diagnosis.ranking[0]
+    listing = Table("meaning", "worst agreement", *best.shares)
+    for hypothesis in diagnosis.ranking[:_LISTED]:
+        shares = (f"{share:.0%}" for share in hypothesis.shares.values())
+        listing.add_row(hypothesis.says, f"{hypothesis.score:.0%}", *shares)
+    rich.print(listing)
+    print("\n".join(diagnosis.lines), flush=True)
+    views = best.views
+    if best.score > 0:
+        images = [folder.photograph(v.name, v.camera, v.pixels, v.mask, v.convention).image for v in views]
+        save_png(camera_sheet([v.name for v in views], images, best.silhouettes(folder)), picture)
+        announce(picture)
+    if diagnosis.option:  # a calibration that needs no option any more
+        found = {v.name: (calibrate(v.camera, v.convention, v.camera.size), v.camera.size) for v in views}
+        write_json(calibration, found)
+        announce(calibration)
+    if not diagnosis.consistent:
+        found = "; ".join(diagnosis.lines)
+        raise InputError(f"{cfg.cameras}: expected cameras that fit the masks; found {found}")
+
+
+def machine(cfg: DictConfig) -> None:
+    """Print what there is and what is missing; nothing is written."""
+    console = Console(soft_wrap=True)
+    for title, lines in (
+        ("This machine", machine_lines(pick_device(resolve(cfg)["device"]))),
+        ("Missing", list(missing_extras()) or [("nothing", "")]),
+    ):
+        listing = Table("", "", title=title, title_justify="left", show_header=False, box=None)
+        for line in lines:
+            listing.add_row(*map(escape, line))
+        console.print(listing)
+
+
+def selfcheck_device(cfg: DictConfig) -> None:
+    """Whether a device computes as the CPU does: print each outcome as soon as it is known; write all, and
+    the machine, to ``selfcheck.md``. InputError: a check failed; the exit status says so."""
+    config = resolve(cfg)
+    device = pick_device(config["device"])
+    outcomes = []
+    for outcome in selfcheck(config, device):
+        outcomes.append(outcome)
+        print(f"{outcome.status} {outcome.check}: {outcome.found}", flush=True)
+    facts = "\n".join(f"- {name}: {value}" for name, value in machine_lines(device))
+    path = output_dir() / "selfcheck.md"
+    write_text_atomically(path, f"{facts}\n\n{table(outcomes)}\n")
+    announce(path)
+    failed = [outcome.check for outcome in outcomes if outcome.status == FAILED]
+    if failed:
+        raise InputError(f"selfcheck: expected no failed check; found {len(failed)}: {', '.join(failed)}")

@@ -7,18 +7,7 @@ import lightning.pytorch as L
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import (
-    MODEL_NODES,
-    build_data,
-    build_renderer,
-    check_size,
-    choices,
-    load_model,
-    model_of,
-    pick_device,
-    with_chosen_targets,
-    with_trained_data,
-)
+from ghgs_lit.cli import inputs
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
@@ -34,11 +23,11 @@ from ghgs_lit.weights.checkpoint import read_checkpoint
 
 def trained_method(config: Mapping[str, Any], device: torch.device) -> tuple[ModelMethod, dict[str, Any]]:
     """The model of ``config["checkpoint"]`` on a device, refined as the verb says, and facts about it."""
-    renderer, model = build_renderer(config, device), load_model(config, device)
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
     checkpoint = read_checkpoint(config["checkpoint"])
     facts: dict[str, Any] = {
         "checkpoint_config": checkpoint["config"],
-        "model_config": {node: config[node] for node in MODEL_NODES if node in config},
+        "model_config": {node: config[node] for node in inputs.MODEL_NODES if node in config},
         "parameters": {"total": sum(p.numel() for p in model.parameters())},
     }
     if "global_step" in checkpoint:
@@ -54,11 +43,7 @@ def baselines_of(
 ) -> dict[str, Method]:
     """The baselines called ``names``, or ``all``; other arguments as for :func:`trained_method`."""
     names = BASELINES if names == "all" else [names] if isinstance(names, str) else names
-    renderer = build_renderer(config, device)
-
-    def untrained() -> GHGS:
-        return GHGS.from_config(config).to(device)
-
+    renderer, untrained = inputs.build_renderer(config, device), lambda: GHGS.from_config(config).to(device)
     return {name: baseline(name, renderer, untrained, config["per_scene"]) for name in names}
 
 
@@ -81,19 +66,19 @@ def _methods(config: dict[str, Any], device: Any) -> tuple[dict[str, Method], di
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the results last."""
     directory = output_dir()
-    config = with_chosen_targets(resolve(with_trained_data(cfg)))
+    config = inputs.with_chosen_targets(resolve(inputs.with_trained_data(cfg)))
     if config["checkpoint"] is not None:
-        config |= model_of(config["checkpoint"], cfg)
+        config |= inputs.model_of(config["checkpoint"], cfg)
     write_config(config, directory)
     L.seed_everything(config["seed"], workers=True, verbose=False)
-    device = pick_device(config["device"])
+    device = inputs.pick_device(config["device"])
     methods, facts = _methods(config, device)
-    data = build_data(config)
+    data = inputs.build_data(config)
     for method in methods.values():
         if isinstance(method, ModelMethod):
-            check_size(data, method.model)
+            inputs.check_size(data, method.model)
     check_evaluation(config, data)
-    facts |= {"verb": "evaluate", "choices": choices()}
+    facts |= {"verb": "evaluate", "choices": inputs.choices()}
     path = measure_and_write(methods, data, config, directory, device, **facts)
     if "model" in methods and (auto := methods["model"].model.auto) is not None:
         rows = (row for row in read_results(path)["rows"] if row["method"] == METHOD)

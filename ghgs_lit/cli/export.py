@@ -1,19 +1,17 @@
 """``ghgs export``: a checkpoint to the published names, or to a small one for prediction."""
 
-from pathlib import Path
-
 import torch
 from omegaconf import DictConfig
 
 from ghgs_lit.cli.runtime import announce, output_dir, save_config
-from ghgs_lit.diagnostics.benchmark.error import differences as prediction_differences
+from ghgs_lit.diagnostics.benchmark.measure import differences as prediction_differences
 from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
 from ghgs_lit.errors import require
 from ghgs_lit.model import GHGS
 from ghgs_lit.rendering import render
 from ghgs_lit.weights.checkpoint import read_checkpoint
-from ghgs_lit.weights.exporting import export_weights
-from ghgs_lit.weights.inference import write_inference
+from ghgs_lit.weights.exporting import export_weights, write_inference
+from ghgs_lit.weights.reading import file_of
 from ghgs_lit.weights.switches import differences
 
 _PATCHES = 8  # along each side of the photographs that two models are compared on
@@ -36,9 +34,7 @@ def parity(checkpoint: str, exported: str) -> dict[str, float]:
 def run(cfg: DictConfig) -> None:
     """The verb; prints the path of the written weights last."""
     config = save_config(cfg, output_dir())
-    checkpoint, vggt, release, inference = (
-        config[key] for key in ("checkpoint", "vggt", "release", "inference")
-    )
+    checkpoint, vggt, release, inference = map(config.get, ("checkpoint", "vggt", "release", "inference"))
     paths = [path for path in (vggt, release, inference) if path is not None]
     require(bool(paths), "vggt", "vggt=<file>, release=<file> or inference=<file>", None)
     if vggt is not None or release is not None:
@@ -49,7 +45,7 @@ def run(cfg: DictConfig) -> None:
     if inference is not None:
         write_inference(checkpoint, inference, config["dtype"])
         found = parity(checkpoint, inference)
-        sizes = (Path(path).stat().st_size / 1e6 for path in (checkpoint, inference))
+        sizes = (file_of(path).stat().st_size / 1e6 for path in (checkpoint, inference))
         print("{:.1f} MB to {:.1f} MB".format(*sizes), flush=True)
         print(
             f"against the checkpoint, on an ellipsoid: {found['psnr_to_none']:.1f} dB between renders;"

@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -15,7 +16,6 @@ from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError
 
 _WIDTH = 100
-
 
 #: Groups whose options a model chooses.
 _OF_MODELS = ("bounds", "depth_head", "unprojection", "recalibration", "gaussian_head")
@@ -72,12 +72,8 @@ def print_group(verb: str, group: str, folders: Sequence[Path] = ()) -> None:
 
 def _purpose(path: Path) -> str:
     """The comment at the top of a file of ``conf``."""
-    lines = []
-    for line in path.read_text().splitlines():
-        if not line.startswith("#"):
-            break
-        lines += [line.removeprefix("# ")] * ("@package" not in line)
-    return " ".join(lines)
+    lines = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
+    return " ".join(line.removeprefix("# ") for line in lines if "@package" not in line)
 
 
 def _fields(cls: type[BaseModel], indent: str = "") -> Iterator[str]:

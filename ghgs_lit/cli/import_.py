@@ -16,9 +16,8 @@ from ghgs_lit.weights.switches import differences
 
 
 def initial_state(config: Mapping[str, Any], release: str | None) -> dict[str, Tensor]:
-    """The tensors of a new model; stages that published weights fill are on the meta device. ``config``: the
-    configuration that builds the model. ``release``: the authors' checkpoint; with None the heads get initial
-    values."""
+    """The tensors of a new model; stages that published weights fill are on the meta device: the encoder, and
+    the others where there is the authors' ``release``."""
     filled = STAGES if release is not None else ("encoder",)
     return GHGS.from_config(config, empty=filled).state_dict()
 

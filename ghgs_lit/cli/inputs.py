@@ -17,8 +17,7 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rendering.api import resolve_backend
 from ghgs_lit.stages import OPTIONS, STAGES
 from ghgs_lit.surroundings import side_multiple
-from ghgs_lit.weights.checkpoint import read_checkpoint
-from ghgs_lit.weights.loading import load_weights
+from ghgs_lit.weights.checkpoint import load_weights, read_checkpoint
 from ghgs_lit.weights.reading import SHIPPED
 
 if TYPE_CHECKING:  # it would import Lightning, which takes seconds
@@ -28,17 +27,8 @@ if TYPE_CHECKING:  # it would import Lightning, which takes seconds
 MODEL_NODES = (*STAGES, *OPTIONS, "compat")
 
 #: What may be changed in a model whose weights are trained: no tensor has another shape or meaning for it.
-FREE = (
-    "bounds",
-    "model.pad",
-    "recalibration.k",
-    "recalibration.neighborhood",
-    "recalibration.similarity",
-    "recalibration.tokens",
-    "rounds.count",
-    "skip",
-    "unprojection",
-)
+FREE = ("bounds", "model.pad", "rounds.count", "skip", "unprojection", "recalibration.k")
+FREE += ("recalibration.neighborhood", "recalibration.similarity", "recalibration.tokens")
 
 
 def build_data(config: Mapping[str, Any]) -> "PhotographsDataModule":
@@ -76,37 +66,28 @@ def check_size(data: "PhotographsDataModule", model: GHGS) -> None:
 
 
 def with_trained_data(cfg: DictConfig) -> DictConfig:
-    """``cfg`` with the data that its checkpoint was trained on, where no ``data=<option>`` was chosen.
-
-    Keys of it that were said, such as ``data.root=...`` for data that moved, act on it.
-
-    A checkpoint of somebody else does not say where this machine writes: ``data.cache_dir`` is the default.
-    InputError: there is no checkpoint, or it was not trained.
-    """
+    """``cfg`` with the data that its checkpoint was trained on, where no ``data=<option>`` was chosen. Keys
+    that were said, such as ``data.root=...``, act on it; where this machine writes (``data.cache_dir``) is
+    the default. InputError: there is no checkpoint, or it was not trained."""
     if "kind" in (cfg.get("data") or {}):
         return cfg
     if cfg.checkpoint is None:
         raise InputError("data: expected data=<option> where there is no checkpoint; found none")
     if cfg.checkpoint == SHIPPED:  # its training data would have to be rendered first
-        expected = (
-            "images=<folder> cameras=<file>, or data=<option>, with the weights that come with the package"
-        )
+        expected = "images=<folder> cameras=<file>, or data=<option>, with the weights of the package"
         raise InputError(f"data: expected {expected}; found neither")
     trained = read_checkpoint(cfg.checkpoint)["config"]
     if not trained.get("data"):
-        raise InputError(
-            f"data: expected data=<option> for weights that were imported ({cfg.checkpoint}); found none"
-        )
+        expected = f"data=<option> for weights that were imported ({cfg.checkpoint})"
+        raise InputError(f"data: expected {expected}; found none")
     data = {key: None if key == "cache_dir" else value for key, value in trained["data"].items()}
     return OmegaConf.merge({"data": data}, cfg)
 
 
 def model_of(checkpoint: str, cfg: DictConfig) -> dict[str, Any]:
-    """The nodes that describe the model of a checkpoint, with what the command line changes in it.
-
-    Only what was said counts: the options that a verb composes by default describe another model. InputError:
-    the command line changes what the weights were trained for; names the key.
-    """
+    """The nodes that describe the model of a checkpoint, with what the command line changes in it. Only what
+    was said counts: the options that a verb composes by default describe another model. InputError: the
+    command line changes what the weights were trained for; names the key."""
     trained = read_checkpoint(checkpoint)["config"]
     for stage in STAGES:
         place, found = f"{checkpoint}: config.{stage}", trained.get(stage)
@@ -138,17 +119,13 @@ def _require_same(trained: Mapping[str, Any], key: str, value: Any) -> None:
 def _require_ablation(trained: Mapping[str, Any]) -> None:
     """Refuse another row of the ablation: it is said by its switches where the weights are trained."""
     own, wanted = ablation_of(trained), HydraConfig.get().runtime.choices["ablation"]
-    expected = (
-        f"{own}, as the checkpoint was trained (recalibration.neighborhood=... and .similarity=... act)"
-    )
-    require(wanted == own, "ablation", expected, wanted)
+    switches = "recalibration.neighborhood=... and .similarity=... act"
+    require(wanted == own, "ablation", f"{own}, as the checkpoint was trained ({switches})", wanted)
 
 
 def with_chosen_targets(config: dict[str, Any]) -> dict[str, Any]:
     """``config`` that measures the protocol of ``targets=<option>`` alone, where that was said.
-
-    ``evaluation.targets`` says so for several protocols, and wins.
-    """
+    ``evaluation.targets`` says so for several protocols, and wins."""
     keys = said()
     if "targets" not in keys or is_below("evaluation.targets", keys):
         return config

@@ -13,11 +13,9 @@ from ghgs_lit.kernels.cores import spin_if_alone
 
 
 def _completion_argv(argv: list[str]) -> list[str] | None:
-    """Arguments of a shell-completion call (``ghgs -sc ...``) for the verb on the shell's line.
-
-    Hydra completes that line without the verb. While the verb itself is being typed, the verbs are printed
-    and None is returned.
-    """
+    """Arguments of a shell-completion call (``ghgs -sc ...``) for the verb on the shell's line. Hydra
+    completes that line without the verb. While the verb itself is being typed, the verbs are printed and None
+    is returned."""
     if "query" not in argv[2]:
         return [argv[0], "train", *argv[1:]]
     line = os.environ.get("COMP_LINE", "")

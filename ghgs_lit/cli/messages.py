@@ -110,9 +110,8 @@ def _system(error: OSError) -> str:
     path = error.filename2 or error.filename
     if path is None:
         path = HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else Path.cwd()
-    return (
-        f"{os.fsdecode(path)}: expected a file that can be read or written; found {error.strerror or error}"
-    )
+    found = error.strerror or error
+    return f"{os.fsdecode(path)}: expected a file that can be read or written; found {found}"
 
 
 def raised_by_hydra(error: Exception) -> bool:

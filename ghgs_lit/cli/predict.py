@@ -1,11 +1,11 @@
 """``ghgs predict``: photographs to a splat, and to what else ``formats`` lists."""
 
 import contextlib
-import dataclasses
 import json
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from statistics import geometric_mean
@@ -14,35 +14,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 from omegaconf import DictConfig
 
-from ghgs_lit.cli.inputs import (
-    build_data,
-    build_renderer,
-    check_size,
-    load_model,
-    model_of,
-    pick_device,
-    with_trained_data,
-)
+from ghgs_lit.cli import inputs
 from ghgs_lit.cli.photographs import capture_folder, check_cameras
 from ghgs_lit.cli.runtime import announce, output_dir, write_config
 from ghgs_lit.config import resolve
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.model import GHGS
+from ghgs_lit.prediction import export
 from ghgs_lit.prediction.capture.backgrounds import Backgrounds
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.folder import CaptureFolder
 from ghgs_lit.prediction.capture.formats.json_and_toml import json_text
 from ghgs_lit.prediction.capture.predict import TimedPrediction, crop_size, in_frame, predict, predict_batch
 from ghgs_lit.prediction.capture.rig import INSTANTS, Rig, corrected_rig
-from ghgs_lit.prediction.export import (
-    REPORT,
-    Instants,
-    OutputOptions,
-    output_files,
-    output_options,
-    require_free,
-    write_prediction,
-)
+from ghgs_lit.prediction.export.reports import REPORT
 from ghgs_lit.prediction.export.unseen import GUESSED
 from ghgs_lit.prediction.sequence.temporal import Temporal
 from ghgs_lit.rendering import Renderer
@@ -62,7 +47,8 @@ def run(cfg: DictConfig) -> None:
     """The verb; prints the files (not those in folders), and the directory last."""
     directory = output_dir() if cfg.out is None else Path(cfg.out).expanduser().resolve()
     is_capture = cfg.images is not None or cfg.cameras is not None
-    config = resolve(cfg if is_capture else with_trained_data(cfg)) | model_of(cfg.checkpoint, cfg)
+    config = resolve(cfg if is_capture else inputs.with_trained_data(cfg))
+    config |= inputs.model_of(cfg.checkpoint, cfg)
     (predict_photographs if is_capture else predict_subject)(config, directory)
     announce(directory)
 
@@ -75,10 +61,8 @@ def subject_batch(
     names = list(data.subjects(split))
     if isinstance(subject, int) and 0 <= subject < len(names):
         subject = names[subject]
-    if subject not in names:
-        raise InputError(
-            f"subject: expected 0 to {len(names) - 1} or a name such as {names[0]}; found {subject!r}"
-        )
+    expected = f"0 to {len(names) - 1} or a name such as {names[0]}"
+    require(subject in names, "subject", expected, subject)
     return data.evaluation_batch(subject, split, targets=targets)
 
 
@@ -86,10 +70,10 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
     """Predict a subject of a data set."""
     expected = "0 without images=...: photographs of data sets are on black"
     require(config["refine_masks"] in (0, "auto"), "refine_masks", expected, config["refine_masks"])
-    options, device = output_options(config), pick_device(config["device"])
-    renderer, model = build_renderer(config, device), load_model(config, device)
-    data = build_data(config)
-    check_size(data, model)
+    options, device = export.output_options(config), inputs.pick_device(config["device"])
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
+    data = inputs.build_data(config)
+    inputs.check_size(data, model)
     write_config(config, directory)
     data.prepare_data([config["split"]])
     batch = subject_batch(data, config["subject"], config["split"], config.get("targets")).to(device)
@@ -100,24 +84,22 @@ def predict_subject(config: dict[str, Any], directory: Path) -> None:
 
 def predict_photographs(config: dict[str, Any], directory: Path) -> None:
     """Predict each instant of a folder of photographs; several get a folder each, and files of all.
-
-    InputError: none of them can be read.
-    """
-    folder, options = capture_folder(config), output_options(config)
-    several, inputs = len(folder.instants) > 1, folder.input_files
+    InputError: none of them can be read."""
+    folder, options = capture_folder(config), export.output_options(config)
+    several, read = len(folder.instants) > 1, folder.input_files
     directories = {name: directory / name if several else directory for name in folder.instants}
     others = ["rig.json"] if config["refine_cameras"] else []
-    together = Instants(len(directories), options, others) if several else None
+    together = export.Instants(len(directories), options, others) if several else None
     for name, path in directories.items():
-        require_free(path, output_files(options, list(folder.paths[name])), inputs)
+        export.require_free(path, export.output_files(options, list(folder.paths[name])), read)
     if together:
-        require_free(directory, together.files, inputs)
+        export.require_free(directory, together.files, read)
     if folder.note:
         print(folder.note, flush=True)
     if config["check_cameras"]:
         check_cameras(folder)
-    device = pick_device(config["device"])
-    renderer, model = build_renderer(config, device), load_model(config, device)
+    device = inputs.pick_device(config["device"])
+    renderer, model = inputs.build_renderer(config, device), inputs.load_model(config, device)
     size = crop_size(config["size"], read_checkpoint(config["checkpoint"])["config"], model)
     write_config(config, directory)
     refining = {name: config[name] for name in ("refine_cameras", "refine_masks", "refine")}
@@ -224,10 +206,8 @@ def moved_line(moved: dict[str, float]) -> str:
 
 
 def captures_of(folder: CaptureFolder) -> Iterator[tuple[Capture, float]]:
-    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile.
-
-    Of several instants those without enough photographs are left out; it prints what is missing.
-    """
+    """The capture of each instant and the seconds of waiting for it; the next one is decoded meanwhile. Of
+    several instants those without enough photographs are left out; it prints what is missing."""
     names = folder.instants
     with ThreadPoolExecutor(1) as pool:
         following = pool.submit(folder.photographs, names[0])
@@ -256,7 +236,7 @@ def write_result(
     model: GHGS,
     renderer: Renderer,
     config: dict[str, Any],
-    options: OutputOptions,
+    options: export.OutputOptions,
 ) -> dict[str, float]:
     """Write the files of a result, and print what was done and written. Returns: the run time of each stage
     in seconds."""
@@ -277,9 +257,9 @@ def write_result(
         facts["skip"] = model.auto.report(prediction.decisions)
         print(facts["skip"], flush=True)
     if result.refined is not None:
-        facts["refine"] = dataclasses.asdict(result.refined)
+        facts["refine"] = asdict(result.refined)
         print(result.refined, flush=True)
     begin = time.perf_counter()
-    paths = write_prediction(directory, result.batch, prediction, renderer, options, facts)
+    paths = export.write_prediction(directory, result.batch, prediction, renderer, options, facts)
     print("\n".join(str(path) for path in paths if path.parent == directory), flush=True)
     return {**seconds, "write": time.perf_counter() - begin}

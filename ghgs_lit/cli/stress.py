@@ -21,7 +21,12 @@ def run(cfg: DictConfig) -> None:
     directory = output_dir()
     config = save_config(cfg, directory)
     if config["dump"] is not None:
-        return _replay(config["dump"])
+        step, recorded, fault = replay(config["dump"])
+        print(f"step {step}, when it was saved: {recorded}")
+        print(f"step {step}, now: {fault or 'all values are finite'}")
+        if fault is not None:
+            raise SystemExit(1)
+        return
     tasks = tasks_of(config["stages"], config["families"], config["quick"])
     require(bool(tasks), "families", "a family that one of the stages has", config["families"])
     workers = allowed_cores() if config["workers"] is None else config["workers"]
@@ -38,14 +43,6 @@ def run(cfg: DictConfig) -> None:
             file=sys.stderr,
         )
     if failed:
-        raise SystemExit(1)
-
-
-def _replay(path: str) -> None:
-    step, recorded, fault = replay(path)
-    print(f"step {step}, when it was saved: {recorded}")
-    print(f"step {step}, now: {fault or 'all values are finite'}")
-    if fault is not None:
         raise SystemExit(1)
 
 

@@ -23,17 +23,8 @@ from ghgs_lit.evaluation.measure import ModelMethod
 from ghgs_lit.evaluation.protocols import check_evaluation
 from ghgs_lit.evaluation.report import measure_and_write
 from ghgs_lit.model import GHGS
-from ghgs_lit.runs.checks import check_config
-from ghgs_lit.runs.job import (
-    Train,
-    in_sweep,
-    is_multirun,
-    needs_own_process,
-    train_in_own_process,
-    train_once,
-    with_resume,
-)
-from ghgs_lit.runs.plan import print_single_plan
+from ghgs_lit.runs import job
+from ghgs_lit.runs.grid import print_single_plan
 from ghgs_lit.runs.results import read_results
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
@@ -116,11 +107,11 @@ def run(cfg: DictConfig) -> float | str | None:
     config, run_directory = resolve(cfg), RunDirectory(output_dir())
     if config["dry_run"]:
         return print_single_plan(config, run_directory)
-    check_config(config)
+    job.check_config(config)
     return run_job(config, run_directory, train)
 
 
-def run_job(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
+def run_job(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
     """What ``train`` returns; where it is interrupted, print how to go on. Interrupted: on Ctrl-C and
     SIGTERM."""
     with interruptible():
@@ -134,29 +125,27 @@ def run_job(config: dict[str, Any], run_directory: RunDirectory, train: Train) -
 
 def _changes_to_go_on(run_directory: RunDirectory) -> str:
     """What to add to the command of a run that was interrupted."""
-    if is_multirun():
+    if job.is_multirun():
         return f"hydra.sweep.dir={HydraConfig.get().sweep.dir}"
     if run_directory.checkpoint is None:
         return "another hydra.run.dir, or overwrite=true (there was no checkpoint yet)"
     return f"hydra.run.dir={run_directory.path} resume={run_directory.checkpoint}"
 
 
-def _run(config: dict[str, Any], run_directory: RunDirectory, train: Train) -> float | str | None:
-    if needs_own_process(config):
-        return train_in_own_process(run_directory)
+def _run(config: dict[str, Any], run_directory: RunDirectory, train: job.Train) -> float | str | None:
+    if job.needs_own_process(config):
+        return job.train_in_own_process(run_directory)
     if rank_zero_only.rank == 0:
-        return train_once(run_directory, config, train)
+        return job.train_once(run_directory, config, train)
     # The first process has locked the run for all of them.
-    if in_sweep() and run_directory.done:
+    if job.in_sweep() and run_directory.done:
         return None
-    return train(with_resume(config, run_directory), run_directory.path, {})
+    return train(job.with_resume(config, run_directory), run_directory.path, {})
 
 
 def train(config: dict[str, Any], directory: Path, stats: dict[str, Any]) -> float | None:
-    """Train, save the last weights, measure them; returns the mean PSNR of the first protocol.
-
-    ``stats`` gets the ``steps`` and ``seconds`` that are trained here.
-    """
+    """Train, save the last weights, measure them; returns the mean PSNR of the first protocol. ``stats`` gets
+    the ``steps`` and ``seconds`` that are trained here."""
     if rank_zero_only.rank == 0:
         write_config(config, directory)
         say_which_model()

@@ -10,8 +10,7 @@ from tabulate import tabulate
 
 from ghgs_lit.files import write_atomically
 
-#: Tables of texts by their titles.
-Tables = dict[str, pd.DataFrame]
+Tables = dict[str, pd.DataFrame]  #: Tables of texts by their titles
 
 
 def text(value: Any, form: str) -> str:
@@ -22,13 +21,8 @@ def text(value: Any, form: str) -> str:
 def texts(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> pd.DataFrame:
     """The columns of ``frame`` that a table shows. ``columns``: by heading, the name of a column and its
     format; those that ``frame`` has not are left out."""
-    return pd.DataFrame(
-        {
-            heading: [text(value, form) for value in frame[name]]
-            for heading, (name, form) in columns.items()
-            if name in frame
-        }
-    )
+    known = {heading: column for heading, column in columns.items() if column[0] in frame}
+    return pd.DataFrame({h: [text(v, form) for v in frame[name]] for h, (name, form) in known.items()})
 
 
 def pivoted(frame: pd.DataFrame, index: str, columns: str, values: str, form: str) -> pd.DataFrame:

@@ -1,9 +1,11 @@
 """The sweeper of ``conf/hydra/sweeper/grid.yaml``: launches the runs of a grid that are not done."""
 
+import datetime
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +15,134 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus, filter_overrides
 from omegaconf import DictConfig, OmegaConf, open_dict
+from tabulate import tabulate
 
 from ghgs_lit.config import resolve
 from ghgs_lit.config.compose import saved_text
 from ghgs_lit.config.verbs import VERBS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_text_atomically
-from ghgs_lit.runs.checks import check_config
-from ghgs_lit.runs.job import BUSY, trains_in_several_processes
-from ghgs_lit.runs.plan import PlannedRun, print_plan, print_results
+from ghgs_lit.runs.job import BUSY, check_config, is_multirun, trains_in_several_processes
+from ghgs_lit.runs.progress import clock
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory, State
 from ghgs_lit.runs.signals import Interrupted, interruptible, print_how_to_go_on
+
+OUTPUTS = "config.yaml, checkpoints/, metrics.json, metrics.csv, sessions.jsonl, pictures and logs"
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run of a sweep: the hash of its configuration, all of its overrides, and those to print."""
+
+    name: str
+    overrides: tuple[str, ...]
+    shown: tuple[str, ...]
+    config: Mapping[str, Any]
+    run: RunDirectory
+
+
+def time_budget(config: Mapping[str, Any]) -> float | None:
+    """Seconds of ``trainer.max_time`` (``days:hours:minutes:seconds`` or a mapping); None without one."""
+    value = config["trainer"].get("max_time")
+    if value is None:
+        return None
+    if isinstance(value, Mapping):
+        return datetime.timedelta(**value).total_seconds()
+    days, hours, minutes, seconds = map(int, value.split(":"))
+    return datetime.timedelta(days, seconds, hours=hours, minutes=minutes).total_seconds()
+
+
+def step_seconds(directory: Path) -> tuple[float, int] | None:
+    """Mean seconds of a training step in the runs below ``directory`` that are done, and their number."""
+    steps = seconds = count = 0
+    for path in sorted(directory.glob("*/metrics.json")):
+        sessions = [s for s in RunDirectory(path.parent).sessions() if s.get("steps")]
+        steps += sum(s["steps"] for s in sessions)
+        seconds += sum(s["seconds"] for s in sessions)
+        count += bool(sessions)
+    return (seconds / steps, count) if steps else None
+
+
+def expected_seconds(config: Mapping[str, Any], step: float | None) -> float | None:
+    """How long a run trains, from its budgets and the measured seconds of a ``step``; None if unknown."""
+    steps = config["trainer"].get("max_steps", -1)
+    known = [time_budget(config), steps * step if steps > 0 and step is not None else None]
+    return min((seconds for seconds in known if seconds is not None), default=None)
+
+
+def _budget(config: Mapping[str, Any], seconds: float | None) -> str:
+    return f"{config['trainer'].get('max_steps')} steps" if seconds is None else clock(seconds)
+
+
+def _print_table(planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]]) -> None:
+    """Print one line for each run; overrides that all runs share are left out."""
+    shared = set.intersection(*(set(item.shown) for item in planned)) if len(planned) > 1 else set()
+    overrides = [" ".join(o for o in item.shown if o not in shared) for item in planned]
+    table = {"run": [item.name for item in planned], **columns, "overrides": overrides}
+    print(tabulate(table, "keys", disable_numparse=True))
+
+
+def _print_states(
+    planned: Sequence[PlannedRun], columns: Mapping[str, Sequence[str]], end: str
+) -> list[State]:
+    """Print the runs with their states, and how many there are in each state."""
+    states = [item.run.state for item in planned]
+    _print_table(planned, {"state": [s.value for s in states], **columns})
+    counts = ", ".join(f"{states.count(state)} {state.value}" for state in State if state in states)
+    print(f"{len(planned)} runs: {counts}{end}")
+    return states
+
+
+def print_plan(planned: Sequence[PlannedRun], directory: Path) -> None:
+    """Print the runs with their states, how long the remaining ones train, and where results go."""
+    measured = step_seconds(directory)
+    times = [expected_seconds(item.config, measured and measured[0]) for item in planned]
+    budgets = [_budget(item.config, seconds) for item, seconds in zip(planned, times, strict=True)]
+    states = _print_states(planned, {"trains for": budgets}, "; nothing was run")
+    left = [t for t, state in zip(times, states, strict=True) if state != State.DONE]
+    basis = ["trainer.max_time"] if any(time_budget(item.config) is not None for item in planned) else []
+    if measured:
+        basis.append(f"{measured[0]:.3g} s a step, measured in {measured[1]} finished runs")
+    known = "unknown" if None in left else clock(sum(left))
+    reason = "; ".join(basis) or "no trainer.max_time, and no finished run to measure a step in"
+    print(f"expected training time of the remaining runs, one after another: {known} ({reason})")
+    print(f"outputs: {directory}/<run>/ with {OUTPUTS}", flush=True)
+    print_refusals([item.config for item in planned])
+
+
+def print_refusals(configs: Sequence[Mapping[str, Any]]) -> None:
+    """Print why runs would be refused as they are configured, each reason once."""
+    reasons = {}
+    for config in configs:
+        try:
+            check_config(config)
+        except InputError as error:
+            reasons[str(error)] = None
+    for reason in reasons:
+        print(f"would be refused: {reason}", flush=True)
+
+
+def print_results(planned: Sequence[PlannedRun], directory: Path) -> None:
+    """Print the runs with their states and results, and last the path of the sweep."""
+    shown = ["" if (m := item.run.metric) is None else f"{m:.2f}" for item in planned]
+    sessions = [str(len(item.run.sessions())) for item in planned]
+    _print_states(planned, {"PSNR": shown, "sessions": sessions}, "")
+    print(f"wrote {directory}", flush=True)
+
+
+def print_single_plan(config: Mapping[str, Any], run: RunDirectory) -> None:
+    """Print the plan of one training run; refused in a sweep whose runs are not known in advance."""
+    if is_multirun():
+        # Any other error would count as one failed job, and the sweep would continue.
+        raise SystemExit(
+            "dry_run: expected hydra/sweeper=grid, which knows its runs in advance; found another"
+        )
+    budget = _budget(config, expected_seconds(config, None))
+    _print_table([PlannedRun(config_hash(config), (), (), config, run)], {"trains for": [budget]})
+    print(f"nothing was run; outputs: {run.path}/ with {OUTPUTS}", flush=True)
+    print_refusals([config])
+
 
 log = logging.getLogger(__name__)
 _POLL = 2.0  # seconds between two looks at runs that other processes work on
@@ -57,9 +175,7 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
     if config.get("dry_run"):
         print_plan(planned, directory)
         return []
-    require(
-        not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its own runs", True
-    )
+    require(not config.get("overwrite"), "overwrite", "false in a sweep, which goes on with its runs", True)
     for item in planned:
         check_config(item.config)
     write_plan(planned, config, directory)
@@ -73,10 +189,8 @@ def _sweep(sweeper: BasicSweeper, arguments: Sequence[str], directory: Path) -> 
 def combinations(
     params: Mapping[str, Any] | None, arguments: Sequence[str], loader: ConfigLoader | None = None
 ) -> list[list[str]]:
-    """The overrides of each job; the command line's values of a key replace the sweep's own.
-
-    ``loader`` knows the options of groups, which ``glob(*)`` stands for.
-    """
+    """The overrides of each job; the command line's values of a key replace the sweep's own. ``loader`` knows
+    the options of groups, which ``glob(*)`` stands for."""
     parser = OverridesParser.create(config_loader=loader)
     given = parser.parse_overrides(list(arguments))
     keys = {override.get_key_element() for override in given}
@@ -124,18 +238,16 @@ def write_plan(planned: Sequence[PlannedRun], config: DictConfig, directory: Pat
 
 
 def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = None) -> list[JobReturn]:
-    """Launch runs until each one is done, here or elsewhere, or has failed.
-
-    A job whose run another process works on returns ``BUSY``: it is launched again once that process has
-    finished or died. ``launch`` starts jobs, given their overrides and the number of the first; ``batch`` of
-    them at once, None: all.
-    """
+    """Launch runs until each one is done, here or elsewhere, or has failed. A job whose run another process
+    works on returns ``BUSY``: it is launched again once that process has finished or died. ``launch`` starts
+    jobs, given their overrides and the number of the first; ``batch`` of them at once, None: all."""
     todo = [item for item in planned if not item.run.done]
     print(f"{len(planned)} runs: {len(planned) - len(todo)} done before, {len(todo)} to do", flush=True)
     returns: list[JobReturn] = []
+    require(batch is None or batch >= 1, "hydra.sweeper.max_batch_size", "a number of at least 1", batch)
     while todo:
-        busy = []
-        for jobs in _batches(todo, batch):
+        busy, size = [], batch or len(todo)
+        for jobs in (todo[first : first + size] for first in range(0, len(todo), size)):
             results = launch([item.overrides for item in jobs], len(returns))
             for item, result in zip(jobs, results, strict=True):
                 if result.status == JobStatus.FAILED:
@@ -144,26 +256,11 @@ def run_all(planned: Sequence[PlannedRun], launch: Launch, batch: int | None = N
                     busy.append(item)
                 else:
                     returns.append(result)
-        todo = busy
-        _wait_for_one(todo)
+        if todo := busy:
+            print(f"waiting for {', '.join(item.run.owner for item in todo)}", flush=True)
+        while todo and all(item.run.state == State.RUNNING for item in todo):
+            time.sleep(_POLL)
     return returns
-
-
-def _batches(items: list[PlannedRun], size: int | None) -> Iterator[list[PlannedRun]]:
-    if size is not None and size < 1:
-        raise InputError(f"hydra.sweeper.max_batch_size: expected a number of at least 1; found {size}")
-    size = size or len(items)
-    for first in range(0, len(items), size):
-        yield items[first : first + size]
-
-
-def _wait_for_one(items: Sequence[PlannedRun]) -> None:
-    """Return once no process works on one of the runs any more."""
-    if not items:
-        return
-    print(f"waiting for {', '.join(item.run.owner for item in items)}", flush=True)
-    while all(item.run.state == State.RUNNING for item in items):
-        time.sleep(_POLL)
 
 
 def _error(result: JobReturn) -> str:

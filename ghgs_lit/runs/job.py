@@ -1,6 +1,7 @@
 """What a job of a sweep does: lock its run if that is free and not done, and train or resume it."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -12,14 +13,14 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ghgs_lit.errors import InputError
-from ghgs_lit.runs.checks import check_directory
+from ghgs_lit.config.keys import lookup
+from ghgs_lit.errors import InputError, require
+from ghgs_lit.files import resolved
 from ghgs_lit.runs.provenance import config_hash
 from ghgs_lit.runs.run import RunDirectory
 from ghgs_lit.runs.signals import STOP, Interrupted
 
-BUSY = "busy"
-"""The return value of a job whose run another process works on."""
+BUSY = "busy"  #: The return value of a job whose run another process works on
 SWEEPER = "hydra_plugins.ghgs_lit_sweeper.GridSweeper"
 # Set in the environment of a job's own process: whether to "skip" a locked run or to "wait" for it.
 _VARIABLE = "GHGS_SWEEP_JOB"
@@ -45,32 +46,27 @@ def _waits() -> bool:
     return os.environ.get(_VARIABLE) == "wait"
 
 
-def _hash_of_run(*, _root_: DictConfig) -> str:
-    keys = [key for key in _root_ if key != "hydra"]
-    return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
-
-
-def _sqlite(path: str) -> str:
-    place = Path(path).resolve()
-    place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
-    return f"sqlite:///{place}"
-
-
-def _folder(first: str | None, second: str) -> str:
-    return second if first is None else str(Path(first).expanduser())
-
-
 def register_resolvers() -> None:
-    """Register what configurations may ask for.
-
-    ``${config_hash:}`` is a run's directory, ``${sqlite:path}`` a database's URL, ``${folder:first,second}``
-    the first of two folders, or the second where that is null.
+    """Register what configurations may ask for. ``${config_hash:}`` is a run's directory, ``${sqlite:path}``
+    a database's URL, ``${folder:first,second}`` the first of two folders, or the second where that is null.
     """
+
+    def hash_of_run(*, _root_: DictConfig) -> str:
+        keys = [key for key in _root_ if key != "hydra"]
+        return config_hash(OmegaConf.to_container(OmegaConf.masked_copy(_root_, keys), resolve=True))
+
+    def sqlite(path: str) -> str:
+        place = Path(path).resolve()
+        place.parent.mkdir(parents=True, exist_ok=True)  # SQLite does not
+        return f"sqlite:///{place}"
+
+    def folder(first: str | None, second: str) -> str:
+        return second if first is None else str(Path(first).expanduser())
+
     is_old = omegaconf.__version__.startswith("2.3")
     register = OmegaConf.register_new_resolver if is_old else OmegaConf.register_resolver
-    register("folder", _folder, replace=True)
-    register("config_hash", _hash_of_run, replace=True)
-    register("sqlite", _sqlite, replace=True)
+    for name, resolver in (("folder", folder), ("config_hash", hash_of_run), ("sqlite", sqlite)):
+        register(name, resolver, replace=True)
 
 
 def with_resume(config: dict[str, Any], run: RunDirectory) -> dict[str, Any]:
@@ -99,10 +95,8 @@ def train_once(run: RunDirectory, config: dict[str, Any], train: Train) -> float
 
 
 def train_in_own_process(run: RunDirectory) -> float | str | None:
-    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process.
-
-    The new process locks the run, so that the lock stays when this process dies.
-    """
+    """Run this job as a ``ghgs`` of its own: training in several processes cannot share its process. The new
+    process locks the run, so that the lock stays when this process dies."""
     hydra = HydraConfig.get()
     command = [sys.executable, "-m", "ghgs_lit", hydra.job.name, *hydra.overrides.task]
     command += [f"hydra.run.dir='{run.path}'", "hydra.mode=RUN"]
@@ -146,3 +140,58 @@ def needs_own_process(config: Mapping[str, Any]) -> bool:
     launcher = HydraConfig.get().runtime.choices.get("hydra/launcher", "basic")
     # SLURM starts the processes of a job itself.
     return trains_in_several_processes(config, launcher) and "slurm" not in launcher
+
+
+#: What training writes below a run's directory, beside the logs of Hydra.
+WRITTEN = ("checkpoints", "csv", "init_from.txt", "metrics.csv", "metrics.json", "pictures")
+WRITTEN += ("sessions.jsonl", "tensorboard")
+
+
+def check_config(config: Mapping[str, Any]) -> None:
+    """Refuse a run that cannot give what it is started for. InputError: ``skip=auto``, or a frozen
+    encoder without weights."""
+    one_preset = not lookup(config, "skip.choices")
+    require(one_preset, "skip", "the preset to train with, or one and token_budgets=[...]", "auto")
+    _require_weights(config)
+
+
+def _require_weights(config: Mapping[str, Any]) -> None:
+    """A part of an encoder that does not learn must have learned before."""
+    trainable = lookup(config, "encoder.trainable")
+    starts = config.get("init_from") is not None or config.get("resume") is not None
+    if starts or config.get("allow_random_encoder"):
+        return
+    if lookup(config, "encoder.semantic") is not None:
+        raise InputError(
+            "init_from: expected a checkpoint of `ghgs pretext` for encoder.semantic, which does not learn in"
+            " training; found none: it would stay random (allow_random_encoder=true to try things out)"
+        )
+    if trainable in (None, "all"):
+        return
+    raise InputError(
+        f"init_from: expected a checkpoint with the encoder's weights for encoder.trainable={trainable},"
+        " such as that of `ghgs import vggt=facebook/VGGT-1B compat=none out=vggt.ckpt`; found none:"
+        " the encoder would stay random (allow_random_encoder=true to try things out)"
+    )
+
+
+def check_directory(directory: Path, config: Mapping[str, Any]) -> None:
+    """Refuse to train where an earlier run would be lost; with ``overwrite`` remove it. InputError: there is
+    a run, and this one does not go on from it."""
+    kept = [*(directory / "checkpoints").glob("*.ckpt"), directory / "csv" / "metrics.csv"]
+    earlier = next((path for path in [*kept, directory / "metrics.json"] if path.exists()), None)
+    resume = config.get("resume")
+    if resume is not None and resolved(resume).is_relative_to(directory.resolve()):
+        return
+    if config.get("overwrite"):
+        source = config.get("init_from")
+        safe = source is None or not resolved(source).is_relative_to(directory.resolve())
+        require(safe, "init_from", "a file outside the run that overwrite=true deletes", source)
+        for path in (directory / name for name in WRITTEN):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    elif earlier is not None:
+        last = directory / "checkpoints" / "last.ckpt"
+        raise InputError(
+            f"{directory}: expected a directory without a run; found {earlier.relative_to(directory)}"
+            f" (resume={last} goes on with it, overwrite=true deletes it, hydra.run.dir=... is another)"
+        )

@@ -29,9 +29,11 @@ def list_runs(folders: Sequence[Path]) -> pd.DataFrame:
     """
     runs = []
     for path in files_below(folders, "config.yaml"):
-        run = RunDirectory(path.parent)
+        run, file = RunDirectory(path.parent), path.parent / ".hydra" / "overrides.yaml"
         if run.state != State.MISSING or _trains(path):
-            runs.append((str(path.parent), str(run.state), _best(run), _overrides(path.parent)))
+            said = read_yaml(file) if file.is_file() else []
+            overrides = " ".join(map(str, said)) if isinstance(said, list) else ""
+            runs.append((str(path.parent), str(run.state), _best(run), overrides))
     if not runs:
         raise InputError(f"{', '.join(map(str, folders))}: expected runs below it; found none")
     return pd.DataFrame(runs, columns=["run", "state", "best", "overrides"])
@@ -54,9 +56,3 @@ def _best(run: RunDirectory) -> str:
     rows = read_rows(log) if log.is_file() else []
     scores = pd.to_numeric(pd.Series([row.get("val/psnr") for row in rows], dtype=object), errors="coerce")
     return "" if scores.isna().all() else f"{scores.max():.2f} dB (validation)"
-
-
-def _overrides(path: Path) -> str:
-    file = path / ".hydra" / "overrides.yaml"
-    said = read_yaml(file) if file.is_file() else []
-    return " ".join(map(str, said)) if isinstance(said, list) else ""

@@ -11,8 +11,7 @@ from rich.progress import track as bar
 
 T = TypeVar("T")
 
-#: Seconds between two lines.
-EVERY = 60.0
+EVERY = 60.0  #: Seconds between two lines
 
 
 def on_terminal() -> bool:

@@ -16,10 +16,8 @@ PACKAGES = ("ghgs-lit", "torch", "lightning", "torchmetrics", "kornia", "numpy",
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits that identify a resolved configuration.
-
-    The order of keys does not matter, nor do keys without influence on a number (``WITHOUT_INFLUENCE``).
-    """
+    """Twelve hexadecimal digits that identify a resolved configuration. The order of keys does not matter,
+    nor do keys without influence on a number (``WITHOUT_INFLUENCE``)."""
     hashed = {key: value for key, value in flatten(config).items() if not is_below(key, WITHOUT_INFLUENCE)}
     text = json.dumps(hashed, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

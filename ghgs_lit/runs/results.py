@@ -16,10 +16,8 @@ from ghgs_lit.files import write_text_atomically
 from ghgs_lit.readers import read_json
 from ghgs_lit.runs.provenance import config_hash
 
-FORMAT_VERSION = 3
-"""The version that is written, and the only one that is read."""
-METHOD = "model"
-"""The method of the rows of a trained model; others are baselines."""
+FORMAT_VERSION = 3  #: The version that is written, and the only one that is read
+METHOD = "model"  #: The method of the rows of a trained model; others are baselines
 KEYS = ("method", "subject", "views", "targets", "target", "inputs", "skip")
 """What a row describes; all other entries of a row are metrics."""
 
@@ -48,10 +46,8 @@ def by_protocol(rows: Sequence[Row]) -> dict[tuple, dict[str, list[Row]]]:
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
-    """Means over subjects for each method, number of views and kind of target.
-
-    A subject's targets are averaged first, so that each subject counts once.
-    """
+    """Means over subjects for each method, number of views and kind of target. A subject's targets are
+    averaged first, so that each subject counts once."""
     names = metric_names(rows)
     return [
         {

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.files import is_locked, lock, lock_owner
+from ghgs_lit.files import append_line, is_locked, lock, lock_owner
 from ghgs_lit.readers import read_lines_of_json
 from ghgs_lit.runs.results import read_results
 
@@ -96,10 +96,8 @@ class RunDirectory:
 
     @contextlib.contextmanager
     def session(self, **facts: Any) -> Iterator[dict[str, Any]]:
-        """Log that this process works on the run, with ``facts``, and how it ends.
-
-        Gives a dict for numbers such as steps and seconds, which are logged at the end.
-        """
+        """Log that this process works on the run, with ``facts``, and how it ends. Gives a dict for numbers
+        such as steps and seconds, which are logged at the end."""
         self._log({"started": _now(), "host": socket.gethostname(), "pid": os.getpid(), **facts})
         stats: dict[str, Any] = {}
         try:
@@ -111,11 +109,7 @@ class RunDirectory:
         self._log({"ended": _now(), "outcome": "done", **stats})
 
     def _log(self, entry: dict[str, Any]) -> None:
-        path = self.path / "sessions.jsonl"
-        # A process that was killed while it wrote may have left a line without its end.
-        torn = path.is_file() and path.stat().st_size > 0 and not path.read_bytes().endswith(b"\n")
-        with open(path, "a") as file:
-            file.write(("\n" if torn else "") + json.dumps(entry) + "\n")
+        append_line(self.path / "sessions.jsonl", json.dumps(entry))
 
 
 def _now() -> str:

@@ -13,11 +13,9 @@ STOP = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(SystemExit):
-    """This process was asked to stop; the exit code is 128 and the signal's number.
-
-    A ``SystemExit``, because Hydra takes any ``Exception`` for one failed job and starts the next one.
-    ``number``: of the signal. ``explained``: whether a line that says how to go on is printed already.
-    """
+    """This process was asked to stop; the exit code is 128 and the signal's number. A ``SystemExit``, because
+    Hydra takes any ``Exception`` for one failed job and starts the next one. ``number``: of the signal.
+    ``explained``: whether a line that says how to go on is printed already."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
@@ -51,12 +49,9 @@ def handlers() -> dict[int, Any]:
 
 
 def handle(act: Callable[[int], Any], before: Mapping[int, Any]) -> None:
-    """Let ``act(number)`` handle the signals that nobody else handles.
-
-    submitit and ``nohup`` have handlers of their own, which stay: under submitit SIGTERM does not end a job.
-    ``act``: called with the signal's number. ``before``: the handlers to judge by, and to return to where
-    they are somebody else's.
-    """
+    """Let ``act(number)`` handle the signals that nobody else handles. submitit and ``nohup`` have handlers
+    of their own, which stay: under submitit SIGTERM does not end a job. ``act``: called with the signal's
+    number. ``before``: the handlers to judge by, and to return to where they are somebody else's."""
     if threading.current_thread() is not threading.main_thread():
         return  # signals belong to the main thread
     for number, handler in before.items():

@@ -17,9 +17,8 @@ def clouds(batch: Batch, prediction: Prediction, element: int, limit: int = 6000
     of the body where the data has them; ``points_and_body``, both, whose distance the Chamfer term measures.
     Clouds without points are left out."""
     valid = prediction.points.valid[element] & batch.masks[element]
-    found = {
-        "points": (prediction.points.pixels[element][valid], batch.images[element].movedim(1, -1)[valid])
-    }
+    colors = batch.images[element].movedim(1, -1)
+    found = {"points": (prediction.points.pixels[element][valid], colors[valid])}
     if batch.body_vertices is not None:
         body = batch.body_vertices[element]
         found["body"] = (body, body.new_tensor(BODY_COLOR).expand(len(body), 3))

@@ -13,8 +13,7 @@ from ghgs_lit.types import Batch
 
 _CAPTION = 14  # height of a caption in pixels
 _GAP = 2
-ERROR_GAIN = 4.0
-"""Factor of the mean absolute error of the colours before it is shown."""
+ERROR_GAIN = 4.0  #: Factor of the mean absolute error of the colours before it is shown
 
 
 @cache
@@ -52,18 +51,6 @@ def error_map(image: Tensor, target: Tensor) -> np.ndarray:
     return colorize((image - target).abs().mean(0) * ERROR_GAIN, 0, 1, "inferno")
 
 
-def depth_range(depth: Tensor, valid: Tensor) -> tuple[float, float]:
-    """1st and 99th percentile of the valid depths in metres; (0, 1) where none is valid."""
-    known = depth[valid].detach().float().cpu().numpy()
-    low, high = np.quantile(known, [0.01, 0.99]) if known.size else (0.0, 1.0)
-    return float(low), float(high)
-
-
-def depth_map(depth: Tensor, valid: Tensor, limits: tuple[float, float]) -> np.ndarray:
-    """Depths [h, w] in colours between ``limits`` in metres: near is red, not ``valid`` is black."""
-    return colorize(-depth, -limits[1], -limits[0], "turbo", valid)
-
-
 def row(tiles: Sequence[np.ndarray], captions: Sequence[str]) -> np.ndarray:
     """Tiles side by side, each below its caption."""
     height = max(tile.shape[0] for tile in tiles) + _CAPTION
@@ -86,7 +73,7 @@ def stack(rows: Sequence[np.ndarray]) -> np.ndarray:
 def _depth_rows(
     batch: Batch, element: int, depth: Tensor | None, depth_valid: Tensor | None
 ) -> list[np.ndarray]:
-    """A row of predicted and a row of true depths of one subject, in the same colours."""
+    """A row of predicted and a row of true depths of one subject, in the same colours: near is red."""
     masks, maps = batch.masks[element], {}
     if depth is not None:
         maps["depth"] = (depth[element], masks if depth_valid is None else masks & depth_valid[element])
@@ -94,12 +81,16 @@ def _depth_rows(
         maps["true depth"] = (batch.depths[element], masks & (batch.depths[element] > 0))
     if not maps:
         return []
-    # The true depths set the range where they are known.
-    limits = [depth_range(d, v) for d, v in zip(*list(maps.values())[-1], strict=True)]
-    return [
-        row([depth_map(*tile) for tile in zip(*values, limits, strict=True)], [name] * len(limits))
-        for name, values in maps.items()
-    ]
+    ends = []  # 1st and 99th percentile of each view's depths, of the true ones where they are known
+    for depths, valid in zip(*list(maps.values())[-1], strict=True):
+        known = depths[valid].detach().float().cpu().numpy()
+        ends.append(np.quantile(known, [0.01, 0.99]).tolist() if known.size else (0.0, 1.0))
+    rows = []
+    for name, values in maps.items():
+        tiles = zip(*values, ends, strict=True)
+        tiles = [colorize(-d, -high, -low, "turbo", valid) for d, valid, (low, high) in tiles]
+        rows.append(row(tiles, [name] * len(tiles)))
+    return rows
 
 
 def sheet(

@@ -8,19 +8,14 @@ from torch import Tensor
 from ghgs_lit.geometry.projection import look_at_point, project
 from ghgs_lit.types import Cameras, Gaussians
 
-#: Opacity of Gaussians that make up the subject.
-_OPAQUE = 0.5
-#: Part of them beyond each face of the subject's box: floaters.
-_OUTSIDE = 1e-3
-#: Part of a picture's height and width that the subject takes at most.
-_SHARE = 0.95
+_OPAQUE = 0.5  #: Opacity of Gaussians that make up the subject
+_OUTSIDE = 1e-3  #: Part of them beyond each face of the subject's box: floaters
+_SHARE = 0.95  #: Part of a picture's height and width that the subject takes at most
 
 
 def subject_points(gaussians: Gaussians) -> Tensor:
-    """Centres [n, 3] of the opaque Gaussians of one subject without the outermost; float64.
-
-    Of all Gaussians where none is opaque.
-    """
+    """Centres [n, 3] of the opaque Gaussians of one subject without the outermost; float64. Of all Gaussians
+    where none is opaque."""
     opaque = gaussians.opacities >= _OPAQUE
     points = (gaussians.means[opaque] if bool(opaque.any()) else gaussians.means).detach().double()
     if not len(points):
@@ -35,13 +30,9 @@ def center_of(points: Tensor, cameras: Cameras) -> Tensor:
     return (points.amin(0) + points.amax(0)) / 2 if len(points) else look_at_point(cameras)
 
 
-def pixel_size(cameras: Cameras, center: Tensor | None = None) -> float:
-    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V].
-
-    None: where the optical axes meet.
-    """
-    away = (look_at_point(cameras) if center is None else center) - cameras.centers
-    depths = (away * cameras.extrinsics[:, 2, :3].double()).sum(-1)
+def pixel_size(cameras: Cameras, center: Tensor) -> float:
+    """The side of a photograph's pixel at ``center`` [3], mean of ``cameras`` [V]."""
+    depths = ((center - cameras.centers) * cameras.extrinsics[:, 2, :3].double()).sum(-1)
     return float((depths / cameras.intrinsics[:, 0, 0]).mean())
 
 

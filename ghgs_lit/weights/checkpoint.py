@@ -1,5 +1,6 @@
 """Checkpoints of this package: plain data with the whole configuration, enough to rebuild the model."""
 
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,39 +13,33 @@ from ghgs_lit.config.keys import flatten
 from ghgs_lit.config.registry import KINDS
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
+from ghgs_lit.kernels.precision import fast_precision
 from ghgs_lit.weights.frozen import SHARING, joined
 from ghgs_lit.weights.names import RELEASE_ENTRY, VGGT
-from ghgs_lit.weights.reading import file_of, open_file
+from ghgs_lit.weights.reading import cast, file_of, open_file
 
-#: Version of checkpoints that are whole by themselves; earlier ones are read too.
-FORMAT_VERSION = 2
+FORMAT_VERSION = 2  #: Version of checkpoints that are whole by themselves; earlier ones are read too
 
-#: Prefix of the model's tensors in the state of a LightningModule.
-STATE_PREFIX = "model."
+STATE_PREFIX = "model."  #: Prefix of the model's tensors in the state of a LightningModule
 
 
-#: Precisions of weights.
-_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)  #: Precisions of weights
 
 
 def read_checkpoint(path: str | Path, whole: bool = False) -> dict[str, Any]:
     """Read a checkpoint of this package, with frozen weights that it shares with others (:mod:`.frozen`).
-
-    Args:
-        path: the file; its tensors are mapped from the disk, not read.
-        whole: read every byte once and refuse a file that was damaged since it was written (2 s for 1 GB).
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: the file is not a checkpoint of this package, or its frozen weights are missing; names
-            what was expected and found.
-    """
+    ``path``: the file; its tensors are mapped from the disk, not read. ``whole``: read every byte once and
+    refuse a file that was damaged since it was written (2 s for 1 GB). FileNotFoundError: there is no such
+    file. InputError: the file is not a checkpoint of this package, or its frozen weights are missing; names
+    what was expected and found."""
     _check_sums(path, whole)
     checkpoint = open_file(path)
     for key, kind in (("state_dict", Mapping), ("config", Mapping), ("format_version", int)):
         found = checkpoint.get(key) if isinstance(checkpoint, Mapping) else None
         if not isinstance(found, kind):
-            hint = " (`ghgs import` makes a checkpoint of published weights)" * _is_published(checkpoint)
+            names = map(str, checkpoint) if isinstance(checkpoint, Mapping) else ()
+            is_published = any(name == RELEASE_ENTRY or name.startswith(tuple(VGGT)) for name in names)
+            hint = " (`ghgs import` makes a checkpoint of published weights)" * is_published
             raise InputError(
                 f"{path}: expected a checkpoint with {key!r}; found {describe(checkpoint)}{hint}"
             )
@@ -89,12 +84,6 @@ def _check_sums(path: str | Path, whole: bool) -> None:
                             pass
     except (zipfile.BadZipFile, EOFError, RuntimeError) as error:
         raise InputError(f"{path}: expected the bytes that were written; found others ({error})") from error
-
-
-def _is_published(content: Any) -> bool:
-    return isinstance(content, Mapping) and any(
-        name == RELEASE_ENTRY or str(name).startswith(tuple(VGGT)) for name in content
-    )
 
 
 def describe(content: Any) -> str:
@@ -165,3 +154,43 @@ def write_checkpoint(
         **facts,
     }
     write_atomically(path, lambda temporary: torch.save(content, temporary))
+
+
+def load_weights(
+    model: nn.Module, path: str | Path, dtype: torch.dtype | None = None, device: Any = "cpu"
+) -> None:
+    """Give a model the weights of a checkpoint, mapped from the file, not copied. FileNotFoundError: there is
+    no such file. InputError: the file is not a checkpoint of this package, or its weights are not finite or
+    do not fit the model.
+
+    Args:
+        model: a :class:`ghgs_lit.model.GHGS`; its own weights may be on the meta device.
+        dtype: of the encoder (None: as in the file, on a CPU float32 in place of a half precision that it
+            lacks); the heads are float32 or wider.
+        device: where the weights will be moved to.
+    """
+    checkpoint = read_checkpoint(path, whole=True)
+    require_fit(model, model_state(checkpoint), path)
+    check_preset(model, checkpoint, path)
+
+    def precision(name: str, stored: torch.dtype) -> torch.dtype:
+        if name.startswith("encoder."):
+            return dtype or fast_precision(stored, torch.device(device))
+        return torch.promote_types(stored, torch.float32)
+
+    state = cast(lambda: model_state(read_checkpoint(path)), precision)
+    require_finite(state, path)
+    model.load_state_dict(state, assign=True)
+
+
+def check_preset(model: nn.Module, checkpoint: Mapping[str, Any], path: str | Path) -> None:
+    """Compare the tokens that take part in a model with those that a checkpoint's training has shown.
+    ``skip=auto`` leaves out presets that it did not show. The authors' training showed all tokens: fewer give
+    a warning."""
+    is_release = "release" in (checkpoint.get("imported") or {})
+    if model.auto is not None:
+        model.auto = model.auto.trained_by({} if is_release else checkpoint["config"])
+    elif is_release and model.skip.tokens != "all":
+        expected = "all, as in the training of the authors' weights"
+        found = f"{model.skip.tokens}, whose error is not known for them"
+        warnings.warn(f"{path}: skip.tokens: expected {expected}; found {found}", stacklevel=3)

@@ -1,4 +1,4 @@
-"""Writes a checkpoint's tensors under their published names, for the authors' code or VGGT's."""
+"""Writes a checkpoint for others: its tensors under their published names, or a small one for prediction."""
 
 from pathlib import Path
 
@@ -9,7 +9,8 @@ from torch import Tensor
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.files import write_atomically
 from ghgs_lit.weights import names
-from ghgs_lit.weights.checkpoint import model_state, read_checkpoint
+from ghgs_lit.weights.checkpoint import model_state, read_checkpoint, require_finite, write_checkpoint
+from ghgs_lit.weights.reading import cast
 from ghgs_lit.weights.switches import differences
 
 
@@ -52,3 +53,18 @@ def write_tensors(path: str | Path, tensors: dict[str, Tensor], entry: str | Non
     else:
         content = tensors if entry is None else {entry: tensors}
         write_atomically(path, lambda temporary: torch.save(content, temporary))
+
+
+def write_inference(checkpoint: str | Path, path: str | Path, dtype: str) -> None:
+    """Write the model of ``checkpoint`` without optimizer, losses and progress. InputError: a weight is too
+    large for ``dtype``, or both are one file. ``dtype``: of all weights: ``float16``, ``bfloat16`` or
+    ``float32``."""
+    if Path(checkpoint).resolve() == Path(path).resolve():
+        raise InputError(f"inference={path}: expected another file than the checkpoint; found the same")
+    content = read_checkpoint(checkpoint, whole=True)
+    state = cast(lambda: model_state(read_checkpoint(checkpoint)), lambda *_: getattr(torch, dtype))
+    require_finite(state, f"{checkpoint} as {dtype}")
+    # Without paths of the machine that trained it, with what loading reads beside weights and configuration.
+    config = {**content["config"], "resume": None, "init_from": None}
+    facts = {"imported": content["imported"]} if "imported" in content else {}
+    write_checkpoint(path, state, config, **facts)

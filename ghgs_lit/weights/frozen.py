@@ -19,8 +19,7 @@ from ghgs_lit.weights.reading import file_of, open_file
 OWN = 1 << 26
 #: Version of checkpoints that share a file: what reads version 2 alone would miss their tensors.
 SHARING = 3
-#: Names of the files.
-PATTERN = "frozen-*.pt"
+PATTERN = "frozen-*.pt"  #: Names of the files
 
 
 def digest_of(tensors: Mapping[str, Tensor]) -> str:
@@ -71,18 +70,14 @@ def _write(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 def joined(path: str | Path, checkpoint: Mapping[str, Any], whole: bool = False) -> dict[str, Any]:
     """``checkpoint``, which was read at ``path``, with the tensors of the file that it refers to, if any.
-
     ``whole``: read every byte of these and refuse others than those that were written. InputError: there is
-    no such file beside the checkpoint, or it holds something else.
-    """
+    no such file beside the checkpoint, or it holds something else."""
     if "frozen_file" not in checkpoint:
         return dict(checkpoint)
-    place, reference = f"{path}: frozen_file", checkpoint["frozen_file"]
-    fits = isinstance(reference, Mapping) and all(
-        isinstance(reference.get(k), str) for k in ("name", "sha256")
-    )
-    require(fits, place, "a mapping of name and sha256", reference)
-    name, sha256 = reference["name"], reference["sha256"]
+    place, linked = f"{path}: frozen_file", checkpoint["frozen_file"]
+    fits = isinstance(linked, Mapping) and all(isinstance(linked.get(k), str) for k in ("name", "sha256"))
+    require(fits, place, "a mapping of name and sha256", linked)
+    name, sha256 = linked["name"], linked["sha256"]
     require(Path(name).name == name, place, "the name of a file beside the checkpoint", name)
     file = file_of(path).resolve().with_name(name)
     if not file.is_file():

@@ -1,5 +1,7 @@
 """Published weights to a checkpoint of this package: every tensor is used, or is listed as ignored."""
 
+import hashlib
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,34 +14,85 @@ from torch import Tensor
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.weights import names
 from ghgs_lit.weights.checkpoint import describe, require_shape, shape_of, write_checkpoint
-from ghgs_lit.weights.hub import fetch, is_repository, sha256
 from ghgs_lit.weights.reading import cast, open_file
 
-#: The files' names in messages.
-KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}
+FILE = "model.safetensors"
+
+
+def is_repository(name: str) -> bool:
+    """Whether ``name`` looks like ``owner/repository`` rather than like a file."""
+    return (
+        re.fullmatch(r"[\w.-]+/[\w.-]+", name) is not None
+        and Path(name).suffix not in (".pt", ".pth", ".bin", ".ckpt", ".safetensors")
+        and not Path(name).exists()
+    )
+
+
+def fetch(repository: str) -> tuple[Path, str]:
+    """The path of a repository's file and its SHA-256, from the local cache or the hub.
+
+    Shows progress, resumes an earlier download, and compares the checksum with the published one.
+    ``repository``: ``owner/repository``. InputError: the package, the network or the repository is missing,
+    or the checksum differs.
+    """
+    try:
+        import huggingface_hub
+    except ImportError:
+        raise InputError(
+            f"{repository}: expected the package huggingface_hub (pip install 'ghgs-lit[hub]'); found none."
+            f" Or download https://huggingface.co/{repository}/resolve/main/{FILE} by hand and set"
+            " vggt=<that file>"
+        ) from None
+    address = huggingface_hub.hf_hub_url(repository, FILE)
+    cached = huggingface_hub.try_to_load_from_cache(repository, FILE)
+    if not isinstance(cached, str):
+        try:
+            cached = huggingface_hub.hf_hub_download(repository, FILE)
+        except Exception as error:
+            reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            raise InputError(
+                f"{repository}: expected the hub or a cached copy; found: {reason}. Download {address} by"
+                " hand and set vggt=<that file>"
+            ) from error
+    path = Path(cached)
+    return path, _checked(path)
+
+
+def sha256(path: Path) -> str:
+    """The checksum of a file in hexadecimal digits."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _checked(path: Path) -> str:
+    """The checksum of a cached file, which the cache names by the published one."""
+    found, published = sha256(path), path.resolve().name
+    if re.fullmatch(r"[0-9a-f]{64}", published) and found != published:
+        raise InputError(
+            f"{path.resolve()}: expected SHA-256 {published}; found {found}: a broken download: delete it"
+        )
+    return found
+
+
+KINDS = {"vggt": "VGGT-1B", "release": "the authors' release"}  #: The files' names in messages
 
 
 @dataclass(frozen=True)
 class Source:
     """A file of published weights."""
 
-    #: ``vggt`` or ``release``
-    key: str
-    #: the repository or the file's name, for reports
-    label: str
+    key: str  #: ``vggt`` or ``release``
+    label: str  #: the repository or the file's name, for reports
     path: Path
-    #: SHA-256
-    checksum: str
-    #: prefixes of published names: our prefixes
-    table: Mapping[str, str]
-    #: prefixes of tensors that are not used
-    ignored: Sequence[str] = ()
-    #: the key of the file under which its tensors are; None for none
-    entry: str | None = None
-    #: our name: published name, of the tensors that are used
-    used: dict[str, str] = field(default_factory=dict)
-    #: number of ignored tensors by the first part of their name
-    skipped: Counter = field(default_factory=Counter)
+    checksum: str  #: SHA-256
+    table: Mapping[str, str]  #: prefixes of published names: our prefixes
+    ignored: Sequence[str] = ()  #: prefixes of tensors that are not used
+    entry: str | None = None  #: the key of the file under which its tensors are; None for none
+    used: dict[str, str] = field(default_factory=dict)  #: our name: published name, of used tensors
+    skipped: Counter = field(default_factory=Counter)  #: ignored tensors by the first part of their name
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors of the file, mapped from the disk."""
@@ -106,17 +159,14 @@ def import_weights(
 ) -> list[str]:
     """Write a checkpoint with published weights; returns a report.
 
-    The published tensors are mapped from their files and written from there.
+    The published tensors are mapped from their files and written from there. FileNotFoundError: a file is
+    missing. InputError: a tensor does not fit; names the file, the tensor and both shapes.
 
     Args:
         state: the model's tensors. Those on the meta device must come from the files, others may keep
             their values.
         vggt: a file of VGGT-1B's weights, or a repository of the Hugging Face hub.
         dtype: precision of the encoder in the checkpoint, such as ``bfloat16``; the heads are always float32.
-
-    Raises:
-        FileNotFoundError: a file is missing.
-        InputError: a tensor does not fit; names the file, the tensor and both shapes.
     """
     files = list(sources(vggt, release))
     for source in files:

@@ -27,8 +27,7 @@ RELEASE = {
 }
 RELEASE_ENTRY = "network"
 
-#: Part of the names of tensors that only our own variants have.
-UNPUBLISHED = ".guide."
+UNPUBLISHED = ".guide."  #: Part of the names of tensors that only our own variants have
 
 
 def to_ours(name: str, table: Mapping[str, str]) -> str | None:

@@ -31,8 +31,7 @@ FAILED_DOWNLOADS = (
 SHIPPED, SHIPPED_FILE = "shipped", Path(__file__).with_name("shipped.ckpt")
 ZIP, PICKLE = b"PK", b"\x80"
 
-#: Bytes of tensors to convert before the file is mapped again.
-_CHUNK = 1 << 28
+_CHUNK = 1 << 28  #: Bytes of tensors to convert before the file is mapped again
 
 
 def file_of(path: str | Path) -> Path:
@@ -41,11 +40,9 @@ def file_of(path: str | Path) -> Path:
 
 
 def open_file(path: str | Path) -> Any:
-    """The content of a safetensors or PyTorch file; its format is read from its first bytes.
-
-    Nothing in the file is ever executed (``weights_only=True``). ``path``: the file, or :data:`SHIPPED`.
-    FileNotFoundError: there is no such file. InputError: it has another format, is truncated, or holds code.
-    """
+    """The content of a safetensors or PyTorch file; its format is read from its first bytes. Nothing in the
+    file is ever executed (``weights_only=True``). ``path``: the file, or :data:`SHIPPED`. FileNotFoundError:
+    there is no such file. InputError: it has another format, is truncated, or holds code."""
     path = file_of(path)
     start = require_weights(path)
     if start.startswith(ZIP):

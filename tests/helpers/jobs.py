@@ -9,9 +9,8 @@ import hydra
 
 from ghgs_lit.cli.runtime import output_dir
 from ghgs_lit.config import VERSION_BASE, conf_dir, own_keys
-from ghgs_lit.runs.grid import run_all
+from ghgs_lit.runs.grid import PlannedRun, run_all
 from ghgs_lit.runs.job import register_resolvers, train_once
-from ghgs_lit.runs.plan import PlannedRun
 from ghgs_lit.runs.provenance import config_hash, provenance
 from ghgs_lit.runs.results import write_results
 from ghgs_lit.runs.run import RunDirectory

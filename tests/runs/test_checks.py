@@ -5,7 +5,7 @@ import pytest
 from ghgs_lit.cli import train as train_verb
 from ghgs_lit.config import compose, resolve
 from ghgs_lit.errors import InputError
-from ghgs_lit.runs.checks import check_config, check_directory
+from ghgs_lit.runs.job import check_config, check_directory
 from tests.cli.test_main import call
 from tests.helpers.jobs import executed, record_execution
 

@@ -11,8 +11,7 @@ from ghgs_lit.model import GHGS
 from ghgs_lit.training.checkpoints import AtomicCheckpointIO
 from ghgs_lit.training.start import check_resume, initialize
 from ghgs_lit.weights.checkpoint import FORMAT_VERSION, read_checkpoint
-from ghgs_lit.weights.exporting import export_weights
-from ghgs_lit.weights.inference import write_inference
+from ghgs_lit.weights.exporting import export_weights, write_inference
 from ghgs_lit.weights.reading import SHIPPED_FILE
 from tests.helpers.models import config, make_model
 

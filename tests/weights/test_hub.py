@@ -7,7 +7,7 @@ import types
 import pytest
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.weights import hub
+from ghgs_lit.weights import importing
 
 ADDRESS = "https://hub.test/facebook/VGGT-1B/resolve/main/model.safetensors"
 
@@ -44,7 +44,7 @@ def cached_file(folder, content, name=None):
 )
 def test_repositories_and_files_are_distinguished(name, expected):
     """A file name must not be looked up on the hub, nor a repository on the disk."""
-    assert hub.is_repository(name) is expected
+    assert importing.is_repository(name) is expected
 
 
 def test_a_file_that_exists_is_a_file(tmp_path, monkeypatch):
@@ -52,14 +52,14 @@ def test_a_file_that_exists_is_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "facebook").mkdir()
     (tmp_path / "facebook" / "VGGT-1B").write_bytes(b"x")
-    assert not hub.is_repository("facebook/VGGT-1B")
+    assert not importing.is_repository("facebook/VGGT-1B")
 
 
 def test_a_cached_file_needs_no_network(monkeypatch, tmp_path):
     """Weights that were downloaded once must work offline."""
     path = cached_file(tmp_path, b"weights")
     fake_client(monkeypatch, cached=path, offline=True)
-    found, checksum = hub.fetch("facebook/VGGT-1B")
+    found, checksum = importing.fetch("facebook/VGGT-1B")
     assert str(found) == path
     assert checksum == hashlib.sha256(b"weights").hexdigest()
 
@@ -69,7 +69,7 @@ def test_a_download_is_checked(monkeypatch, tmp_path):
     broken = cached_file(tmp_path, b"half of the wei", name="0" * 64)
     fake_client(monkeypatch, download=lambda *_: broken)
     with pytest.raises(InputError, match=r"0{64}: expected SHA-256 0{64}; found \w{64}: a broken download"):
-        hub.fetch("facebook/VGGT-1B")
+        importing.fetch("facebook/VGGT-1B")
 
 
 def test_what_the_hub_refuses_is_one_line(monkeypatch):
@@ -80,7 +80,7 @@ def test_what_the_hub_refuses_is_one_line(monkeypatch):
 
     fake_client(monkeypatch, download=refuse)
     with pytest.raises(InputError, match=r"found: Repository Not Found\.") as caught:
-        hub.fetch("facebook/VGGT-1B")
+        importing.fetch("facebook/VGGT-1B")
     text = str(caught.value)
     assert f"Download {ADDRESS} by hand and set vggt=<that file>" in text
     assert "\n" not in text
@@ -90,4 +90,4 @@ def test_without_the_package_it_names_the_extra_and_the_file(monkeypatch):
     """Without the optional package the user needs its name, or the address of the file."""
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(InputError, match=r"ghgs-lit\[hub\].*resolve/main/model\.safetensors by hand"):
-        hub.fetch("facebook/VGGT-1B")
+        importing.fetch("facebook/VGGT-1B")

@@ -1,29 +1,83 @@
-"""The measurement: what a case computes and predicts, and how long each stage takes."""
+"""The measurement: what a case computes, how far it is from the yardstick, how long each stage takes."""
 
-import tempfile
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
 
-from ghgs_lit.diagnostics.benchmark.error import differences
-from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
-from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
 from ghgs_lit.diagnostics.benchmark.presets import Case
-from ghgs_lit.diagnostics.benchmark.stages import SecondsProbe, forward
+from ghgs_lit.diagnostics.benchmark.stages import FlopsProbe, PeakProbe, SecondsProbe, forward
 from ghgs_lit.evaluation.measure import Estimate, measure
 from ghgs_lit.metrics import ImageMetrics
-from ghgs_lit.prediction.export.ply import write_ply
+from ghgs_lit.metrics.functional import decibels, squared_error
+from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.runs.progress import track
 from ghgs_lit.runs.results import Row
-from ghgs_lit.types import Batch, Prediction, Rendering
+from ghgs_lit.types import Batch, Gaussians, Prediction, Rendering
 
-#: Rounds that do not count: the first compiles and fills caches.
-WARMUP = 1
+ATTRIBUTES = ("means", "quaternions", "scales", "opacities", "colors")
+
+
+def relative_difference(found: Tensor, expected: Tensor, norm: float = math.inf) -> float:
+    """``|found - expected| / max|expected|``; infinite where a value is not finite or all of ``expected`` is
+    0 and ``found`` is not; 0 where there are no values. ``norm``: of the difference: the largest of all
+    values, or 2 for their root mean square."""
+    if found.numel() == 0:
+        return 0.0
+    difference = (found - expected).double().abs()
+    difference = (difference.max() if norm == math.inf else difference.square().mean().sqrt()).item()
+    if not math.isfinite(difference):
+        return math.inf
+    largest = expected.abs().max().item()
+    return difference / largest if largest > 0 else (0.0 if difference == 0 else math.inf)
+
+
+def partners(found: Gaussians, expected: Gaussians) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """Indices of the Gaussians that belong to the same input pixel in both. A preset may drop or merge
+    Gaussians: those without a partner are left out."""
+    if found.image is None or expected.image is None:
+        n = min(len(found), len(expected))
+        return torch.arange(n), torch.arange(n)
+    frames = [pd.DataFrame({"image": g.image.cpu(), "pixel": g.pixel.cpu()}) for g in (found, expected)]
+    frames = [frame.rename_axis(name).reset_index() for frame, name in zip(frames, ("a", "b"), strict=True)]
+    both = frames[0].merge(frames[1], on=["image", "pixel"])
+    device = found.means.device
+    return tuple(torch.tensor(both[name].to_numpy().copy(), device=device) for name in ("a", "b"))
+
+
+def differences(
+    found: tuple[Prediction, Rendering], expected: tuple[Prediction, Rendering], masks: Bool[Tensor, "..."]
+) -> dict[str, float]:
+    """What a preset changes. ``masks``: of the inputs [B, V, H, W]. Returns: :func:`relative_difference` of
+    each attribute of the Gaussians, of the ``render`` (root mean square) and of the ``depth`` of the
+    subject's pixels; their largest, ``max_rel_diff``; ``psnr_to_none`` in dB of the renders; and
+    ``unmatched``, the part of the yardstick's Gaussians that have no partner, or more than the preset's own
+    that have none."""
+    (prediction, rendering), (yardstick, reference) = found, expected
+    ours, theirs = prediction.gaussians, yardstick.gaussians
+    a, b = partners(ours, theirs)
+    result = {n: relative_difference(getattr(ours, n)[a], getattr(theirs, n)[b]) for n in ATTRIBUTES}
+    # Not the largest: a Gaussian that covers 1/255 of a pixel up to rounding is drawn there or not.
+    result["render"] = relative_difference(rendering.image, reference.image, norm=2)
+    valid = prediction.depth_valid & yardstick.depth_valid & masks
+    result["depth"] = relative_difference(prediction.depth[valid], yardstick.depth[valid])
+    error = squared_error(rendering.image.flatten(0, 1), reference.image.flatten(0, 1)).mean()
+    missing = max(len(theirs), len(ours)) - len(a)
+    return {
+        **result,
+        "max_rel_diff": max(result.values()),
+        "psnr_to_none": decibels(error[None]).item(),
+        "unmatched": missing / max(len(theirs), 1),
+    }
+
+
+WARMUP = 1  #: Rounds that do not count: the first compiles and fills caches
 
 
 @dataclass(frozen=True)
@@ -113,16 +167,11 @@ def inspect(case: Case, batch: Batch, device: torch.device) -> tuple[Work, Predi
 
 def _counts(prediction: Prediction) -> dict[str, float]:
     gaussians = prediction.gaussians
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{element}.ply" for element in range(len(gaussians.splits))]
-        for element, path in enumerate(paths):
-            write_ply(gaussians[element], path)
-        size = sum(path.stat().st_size for path in paths)
     return {
         "tokens": prediction.points.tokens.shape[0],
         "points": int(prediction.points.valid.sum()),
         "gaussians": len(gaussians),
-        "ply_bytes": size,
+        "ply_bytes": sum(len(ply_bytes(gaussians[element])) for element in range(len(gaussians.splits))),
     }
 
 
@@ -142,24 +191,12 @@ def record_cases(
             for name, value in differences(result, yardstick, batch.masks).items():
                 worst = min if name == "psnr_to_none" else max
                 record.differences[name] = worst(record.differences.get(name, value), value)
-            record.metrics += _metrics(record.case, batch, *result, metrics, device)
+            # The error against the truth, by the measurement of `ghgs evaluate`; its time does not count.
+            found, rendering = result
+            estimate = Estimate(rendering.image, found.depth, found.depth_valid, decisions=found.decisions)
+            measured = measure(lambda _, known=estimate: known, record.case.label, [batch], metrics, device)
+            record.metrics += [{n: value for n, value in row.items() if n != "seconds"} for row in measured]
     times = time_cases(cases, batches, WARMUP, repeats, device)
     for record, mine, seconds in zip(records, works, times, strict=True):
         record.work, record.times = Work.of(mine), seconds
     return records
-
-
-def _metrics(
-    case: Case,
-    batch: Batch,
-    prediction: Prediction,
-    rendering: Rendering,
-    metrics: ImageMetrics,
-    device: torch.device,
-) -> list[Row]:
-    """The error against the truth, by the measurement of ``ghgs evaluate``; its time does not count."""
-    estimate = Estimate(
-        rendering.image, prediction.depth, prediction.depth_valid, decisions=prediction.decisions
-    )
-    rows = measure(lambda _: estimate, case.label, [batch], metrics, device)
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]

@@ -12,19 +12,16 @@ from torch import Tensor
 from ghgs_lit.config import build
 from ghgs_lit.config.compose import read_option
 from ghgs_lit.config.keys import flatten, is_below
-from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.benchmark.scene import random_model
 from ghgs_lit.errors import require
 from ghgs_lit.evaluation.measure import Renderer
 from ghgs_lit.model import GHGS, STAGES
-from ghgs_lit.weights.checkpoint import read_checkpoint, require_fit
-from ghgs_lit.weights.loading import check_preset, load_weights
+from ghgs_lit.weights.checkpoint import check_preset, load_weights, read_checkpoint, require_fit
 
-#: The preset that all others are compared with.
-YARDSTICK = "none"
+YARDSTICK = "none"  #: The preset that all others are compared with
 #: Nodes of a configuration that a model is built from, beside ``skip``.
 MODEL_NODES = (*STAGES, "rounds", "model")
-#: What knobs can change.
-KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")
+KNOBS = (*STAGES, "rounds", "skip", "model", "renderer", "precision")  #: What knobs can change
 #: Rounds take normals from differences of depths and look photographs up where Gaussians are: one rounding of
 #: the photographs changes single attributes by 1e-3 of the largest one (trained weights, 1 to 3 rounds).
 ROUNDS_AMPLIFY = 1000
@@ -32,12 +29,8 @@ ROUNDS_AMPLIFY = 1000
 
 @dataclass(frozen=True)
 class Source:
-    """Weights and the configuration that fits them.
-
-    Args:
-        config: with :data:`MODEL_NODES`.
-        checkpoint: path of the weights; None: random ones.
-    """
+    """Weights and the configuration that fits them. ``config``: with :data:`MODEL_NODES`. ``checkpoint``:
+    path of the weights; None: random ones."""
 
     config: Mapping[str, Any]
     checkpoint: str | None
@@ -45,22 +38,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Case:
-    """A model that is measured.
-
-    Args:
-        knobs: values that were changed, by key.
-        model: in evaluation mode, on its device.
-        budget_db: PSNR that the preset may lose against the yardstick; None: nothing is promised.
-        max_rel_diff: difference of every attribute from the yardstick's that the preset may make, times
-            :data:`ROUNDS_AMPLIFY` where there are rounds; None: nothing is promised.
-    """
+    """A model that is measured."""
 
     preset: str
-    knobs: Mapping[str, Any]
-    model: GHGS
+    knobs: Mapping[str, Any]  #: values that were changed, by key
+    model: GHGS  #: in evaluation mode, on its device
     renderer: Renderer
-    budget_db: float | None
-    max_rel_diff: float | None
+    budget_db: float | None  #: PSNR that the preset may lose against the yardstick; None: nothing is promised
+    max_rel_diff: float | None  #: the same of differences of attributes (:data:`ROUNDS_AMPLIFY`)
     is_trained: bool
 
     @property
@@ -75,15 +60,8 @@ class Case:
 
 
 def presets_of(names: Sequence[str], configured: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The values of presets by name.
-
-    Args:
-        names: files of ``conf/skip``.
-        configured: the node ``skip`` of the run, whose values its own preset has, overrides included.
-
-    Raises:
-        InputError: there is no such file.
-    """
+    """The values of presets by name. ``names``: files of ``conf/skip``. ``configured``: the node ``skip`` of
+    the run, whose values its own preset has, overrides included. InputError: there is no such file."""
     return {
         name: dict(configured) if name == configured["name"] else read_option("skip", name, "presets")
         for name in names
@@ -122,13 +100,10 @@ def cases_of(
     device: torch.device,
     seed: int = 0,
 ) -> list[Case]:
-    """The cases of a model; they share one copy of the weights. InputError: a preset or knob that the
-    model refuses, or to which the weights do not fit.
-
-    Args:
-        presets: of :func:`presets_of`; the yardstick comes first, without knobs, where it is among them.
-        knobs: values of each knob, by key; every preset is measured with every combination.
-    """
+    """The cases of a model; they share one copy of the weights. InputError: a preset or knob that the model
+    refuses, or to which the weights do not fit. ``presets``: of :func:`presets_of`; the yardstick comes
+    first, without knobs, where it is among them. ``knobs``: values of each knob, by key; every preset is
+    measured with every combination."""
     choices = [(name, change) for name in presets for change in combinations(knobs)]
     if YARDSTICK in presets:
         choices = [(YARDSTICK, {}), *(choice for choice in choices if choice != (YARDSTICK, {}))]

@@ -77,10 +77,8 @@ def rows_of(records: Sequence[Record]) -> list[Row]:
 
 
 def broken_budgets(rows: Sequence[Row]) -> list[str]:
-    """What presets promise and do not keep, in one line each.
-
-    A loss of PSNR says nothing about weights that nobody trained; a difference does.
-    """
+    """What presets promise and do not keep, in one line each. A loss of PSNR says nothing about weights that
+    nobody trained; a difference does."""
     return [f"{row['preset']}: {said}" for row in totals(rows) for said in _broken(row)]
 
 
@@ -105,6 +103,10 @@ def totals(rows: Sequence[Row]) -> list[Row]:
 
 def tables_of(rows: Sequence[Row]) -> Tables:
     """Cases with their cost and error, then the seconds of their stages."""
+
+    def promises(row: Row) -> bool:
+        return row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
+
     whole = pd.DataFrame(totals(rows))
     times = whole[["seconds", "seconds_low", "seconds_high"]].itertuples(index=False)
     cases = whole.assign(
@@ -113,15 +115,10 @@ def tables_of(rows: Sequence[Row]) -> Tables:
         peak_mb=whole.peak_bytes.astype(float) / 1e6,
         gflop=whole.flops.astype(float) / 1e9,
         ply_mb=whole.ply_bytes / 1e6,
-        budget=[_kept(row) for row in totals(rows)],
+        budget=["broken" if _broken(row) else "kept" if promises(row) else "-" for row in totals(rows)],
     )
     stages = pivoted(pd.DataFrame(rows), "stage", "preset", "seconds", "{:.4f}")
     return {"Presets": texts(cases, _COLUMNS), "Seconds by stage": stages}
-
-
-def _kept(row: Row) -> str:
-    promises = row["max_rel_diff_budget"] is not None or (row["trained"] and row["budget_db"] is not None)
-    return "broken" if _broken(row) else "kept" if promises else "-"
 
 
 def notes_of(content: Mapping[str, Any]) -> list[str]:

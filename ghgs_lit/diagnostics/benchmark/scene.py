@@ -1,11 +1,15 @@
-"""A subject of a given size in the frame: an ellipsoid before a ring of cameras."""
+"""What is measured without training or data: random weights, and a subject of a given size in the frame."""
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from ghgs_lit.errors import require
+from ghgs_lit.model import GHGS
 from ghgs_lit.synthesis.rig import Rig
 from ghgs_lit.types import Batch, Targets
 
@@ -24,23 +28,34 @@ def ellipse(share: float, size: tuple[int, int]) -> torch.Tensor:
     return (row / height)[:, None].square() + (column / width).square() < 0.25
 
 
-def ellipsoid_batch(
-    share: float, views: int, size: int | tuple[int, int], batch: int, seed: int = 0
-) -> Batch:
-    """Photographs of noise on an ellipsoid of revolution, which looks the same in every view.
-
-    Args:
-        share: part of the frame that the subject covers.
-        size: side, or height and width, of the photographs in pixels.
-
-    Returns:
-        The batch; its target is the first input view.
-    """
+def ellipsoid_batch(share: float, views: int, size: int | tuple[int, int], batch: int) -> Batch:
+    """Photographs of noise on an ellipsoid of revolution, which looks the same in every view. Returns: The
+    batch; its target is the first input view. ``share``: part of the frame that the subject covers. ``size``:
+    side, or height and width, of the photographs in pixels."""
     size = (size, size) if isinstance(size, int) else size
     rig = Rig(look_at=(0.0, 0.0, 0.0), pitch=0.0, focal=1.0, shift_y=0.0)
     yaws = np.tile(np.arange(views) * 360.0 / views, (batch, 1))
     cameras = rig.cameras(yaws, *size)
     masks = ellipse(share, size).expand(batch, views, -1, -1).contiguous()
-    noise = torch.rand(batch, views, 3, *size, generator=torch.Generator().manual_seed(seed))
+    noise = torch.rand(batch, views, 3, *size, generator=torch.Generator().manual_seed(0))
     images = noise * masks[:, :, None]
     return Batch(images, masks, cameras, Targets(images[:, :1], masks[:, :1], cameras[:, :1]))
+
+
+@torch.no_grad()
+def random_model(config: Mapping[str, Any], seed: int = 0) -> GHGS:
+    """A model with random weights, without the time of the usual initialisation. No last layer is 0, as it is
+    at the start of training: every output depends on the photographs."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.device("meta"):
+        model = GHGS.from_config(config)
+    for module in model.modules():
+        for name, parameter in module._parameters.items():
+            if parameter is None:
+                continue
+            if parameter.dim() == 1:
+                value = torch.full(parameter.shape, float(name in ("weight", "gamma")))
+            else:
+                value = torch.randn(parameter.shape, generator=generator) * parameter[0].numel() ** -0.5
+            module._parameters[name] = nn.Parameter(value, requires_grad=False)
+    return model.eval()

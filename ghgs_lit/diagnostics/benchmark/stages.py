@@ -1,20 +1,25 @@
 """The stages of a forward pass as they are measured: their names, and a pass that is watched."""
 
-import dataclasses
 from collections.abc import Iterable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import replace
+from typing import Any
+from unittest import mock
 
 import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
+from ghgs_lit.encoder import cpu
 from ghgs_lit.evaluation.measure import Renderer
-from ghgs_lit.kernels.watching import Stopwatch, Watcher, inside
+from ghgs_lit.kernels.allocation import can_forget_peak, forget_peak, resident_bytes, return_free_memory
+from ghgs_lit.kernels.watching import Inputs, Stopwatch, Watcher, inside
 from ghgs_lit.kernels.watching import watched as stages_watched
 from ghgs_lit.model import GHGS, STAGES
 from ghgs_lit.types import Batch, Prediction, Rendering
 
 ROUNDS, RENDER, TOTAL = "rounds", "render", "total"
-#: What lies in no stage: checks, padding.
-OTHER = "other"
+OTHER = "other"  #: What lies in no stage: checks, padding
 #: Parts of stages: a name ``<stage>.<part>``, and where the part is in the model.
 PARTS = {"encoder.patch_tokens": "encoder.aggregator.patch_embed"}
 #: All that is timed, in the order of the data flow. The stages without a dot add up to ``total``.
@@ -45,7 +50,110 @@ def watched(model: GHGS, probe: Watcher) -> AbstractContextManager[None]:
 def forward(model: GHGS, renderer: Renderer, batch: Batch, probe: Watcher) -> tuple[Prediction, Rendering]:
     """Predict the Gaussians of a batch and render its targets, while ``probe`` watches."""
     with watched(model, probe), inside(TOTAL, probe):
-        prediction = model(dataclasses.replace(batch, targets=None))
+        prediction = model(replace(batch, targets=None))
         with inside(RENDER, probe):
             rendering = renderer(prediction.gaussians, batch.targets.cameras)
     return prediction, rendering
+
+
+class PeakProbe(Watcher):
+    """The peak memory of each stage, of the process on a CPU, of all tensors on CUDA. ``peaks`` are bytes in
+    addition to what was held when the first stage began: weights and photographs do not count. On systems
+    without Linux's counters there are no peaks."""
+
+    def __init__(self, device: torch.device):
+        self.device = device
+        self.peaks: dict[str, int] = {}
+        self._open: list[str] = []
+        self._base = 0
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        if self.is_available:
+            if self._open:
+                self._note()
+            else:
+                self._base = self.held()
+            self.reset()
+            self._open.append(stage)
+
+    def end(self, stage: str, result: Any = None) -> None:
+        if self.is_available:
+            self._note()
+            self._open.pop()
+            self.reset()
+
+    def _note(self) -> None:
+        peak = self.peak() - self._base
+        for stage in self._open:
+            self.peaks[stage] = max(self.peaks.get(stage, 0), peak)
+
+    @property
+    def is_available(self) -> bool:
+        """Whether the system has counters whose peak can be reset."""
+        return self.device.type == "cuda" or can_forget_peak()
+
+    def held(self) -> int:
+        """Bytes now."""
+        if self.device.type == "cuda":
+            return torch.cuda.memory_allocated(self.device)
+        return_free_memory()
+        return resident_bytes()
+
+    def peak(self) -> int:
+        """Most bytes since the last :meth:`reset`."""
+        is_cuda = self.device.type == "cuda"
+        return torch.cuda.max_memory_allocated(self.device) if is_cuda else resident_bytes("VmHWM")
+
+    def reset(self) -> None:
+        """Forget the peak."""
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            return_free_memory()  # what an earlier stage freed is not this one's
+            forget_peak()
+
+
+#: PyTorch's attention on a CPU, which its own counter does not know.
+_CPU_ATTENTION = {
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: (
+        lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)
+    ),
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward: (
+        lambda gradient, q, k, v, *_, **__: sdpa_backward_flop_count(gradient, q, k, v)
+    ),
+}
+
+
+class FlopsProbe(Watcher):
+    """A watcher that counts while it is open as a context; ``flops`` has the multiplications and additions of
+    products by stage, with those of the encoder's compiled kernel. The rasterizer's are not counted."""
+
+    def __init__(self) -> None:
+        self.flops: dict[str, int] = {}
+        self._counter = FlopCounterMode(display=False, custom_mapping=_CPU_ATTENTION)
+        self._in_kernel = 0
+        self._open: list[int] = []
+        self._stack = ExitStack()
+
+    def begin(self, stage: str, inputs: Inputs = ((), {})) -> None:
+        self._open.append(self._so_far())
+
+    def end(self, stage: str, result: Any = None) -> None:
+        self.flops[stage] = self.flops.get(stage, 0) + self._so_far() - self._open.pop()
+
+    def __enter__(self) -> "FlopsProbe":
+        kernel = cpu.attend
+
+        def counting(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+            self._in_kernel += sdpa_flop_count(q.shape, k.shape, v.shape)
+            return kernel(q, k, v)
+
+        self._stack.enter_context(self._counter)
+        self._stack.enter_context(mock.patch.object(cpu, "attend", counting))
+        return self
+
+    def __exit__(self, *details: Any) -> None:
+        self._stack.close()
+
+    def _so_far(self) -> int:
+        return self._counter.get_total_flops() + self._in_kernel

@@ -12,8 +12,6 @@ from ghgs_lit.diagnostics.benchmark.machine import machine_facts
 from ghgs_lit.rendering import gsplat_backend
 
 DISTRIBUTION = "ghgs-lit"
-#: Extras that no feature of a user needs.
-_WITHOUT_FEATURE = ("dev",)
 
 Line = tuple[str, str]
 
@@ -39,7 +37,7 @@ def missing_extras() -> Iterator[Line]:
     wanted: dict[str, list[str]] = {}
     for requirement in importlib.metadata.requires(DISTRIBUTION) or []:
         extra = re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if extra and extra[1] not in _WITHOUT_FEATURE:
+        if extra and extra[1] != "dev":  # which no feature of a user needs
             wanted.setdefault(extra[1], []).append(re.match(r"[\w.-]+", requirement)[0])
     for extra, names in wanted.items():
         absent = [name for name in names if _version(name) is None]
@@ -59,10 +57,9 @@ def _gpus() -> list[Line]:
         return [("GPU", f"none that PyTorch can use (built for CUDA {torch.version.cuda})")]
     found = []
     for number in range(torch.cuda.device_count()):
-        free, total = torch.cuda.mem_get_info(number)
-        about = torch.cuda.get_device_properties(number)
-        text = f"{about.name}, {decimal(free)} free of {decimal(total)}, CUDA {torch.version.cuda}"
-        found.append((f"GPU {number}", text))
+        free, total = map(decimal, torch.cuda.mem_get_info(number))
+        name = torch.cuda.get_device_properties(number).name
+        found.append((f"GPU {number}", f"{name}, {free} free of {total}, CUDA {torch.version.cuda}"))
     return found
 
 

@@ -1,17 +1,15 @@
 """Whether a device computes as the CPU does in float64: renderer, stages, gradient of all weights."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES
-from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch
-from ghgs_lit.diagnostics.benchmark.weights import random_model
+from ghgs_lit.diagnostics.benchmark.measure import ATTRIBUTES
+from ghgs_lit.diagnostics.benchmark.scene import ellipsoid_batch, random_model
 from ghgs_lit.errors import InputError
 from ghgs_lit.kernels.precision import has_bfloat16
 from ghgs_lit.kernels.watching import Results, watched
@@ -32,8 +30,7 @@ LIMITS = {"float32": 1e-4, "tf32": 2.0**-8, "bfloat16": 2.0**-5, "float16": 2.0*
 #: another neighbour: 2e-6 to 4e-2 on a CPU. Of three models one at least is spared; a wrong kernel spares
 #: none.
 GRADIENT_LIMIT, _MODELS = 1e-2, 3
-#: Side of the photographs of splats, and characters of an error that are shown.
-_SIZE, _LONGEST = 48, 300
+_SIZE, _LONGEST = 48, 300  #: Side of the photographs of splats, and characters of an error that are shown
 
 
 @dataclass(frozen=True)
@@ -47,11 +44,8 @@ class Outcome:
 
 def selfcheck(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcome]:
     """All checks, each outcome as soon as it is known; an error ends its check alone, and is an outcome.
-
-    Args:
-        config: of a run of ``ghgs train``; its model gets random weights.
-        device: what is compared with the CPU.
-    """
+    ``config``: of a run of ``ghgs train``; its model gets random weights. ``device``: what is compared with
+    the CPU."""
     for check in CHECKS:
         try:
             yield from check(config, device)
@@ -99,16 +93,16 @@ def renderer(config: Mapping[str, Any], device: torch.device) -> Iterator[Outcom
             yield compared(f"renderer {backend}, {name}: {part}", found[part], value, limit)
 
 
-def _random_splats(counts: tuple[int, int] = (150, 90)) -> Gaussians:
+def _random_splats() -> Gaussians:
     """Of two elements with different numbers of splats, about as large as a person."""
-    n, g = sum(counts), torch.Generator().manual_seed(0)
+    n, g = 240, torch.Generator().manual_seed(0)
     return Gaussians(
         means=torch.randn(n, 3, generator=g) * torch.tensor([0.2, 0.5, 0.2]),
         quaternions=torch.randn(n, 4, generator=g),
         scales=0.01 + 0.05 * torch.rand(n, 3, generator=g),
         opacities=0.1 + 0.8 * torch.rand(n, generator=g),
         colors=torch.rand(n, 3, generator=g),
-        splits=counts,
+        splits=(150, 90),
     )
 
 
@@ -185,11 +179,11 @@ CHECKS = (renderer, stages, gradient)
 def _small_batch(config: Mapping[str, Any]) -> Batch:
     """Two elements of three views of four by four patches, without targets."""
     batch = ellipsoid_batch(0.15, 3, 4 * config["encoder"]["patch_size"], 2)
-    return dataclasses.replace(batch, targets=None)
+    return replace(batch, targets=None)
 
 
 def _in_float64(batch: Batch) -> Batch:
-    return dataclasses.replace(batch, images=batch.images.double(), cameras=batch.cameras.to(torch.float64))
+    return replace(batch, images=batch.images.double(), cameras=batch.cameras.to(torch.float64))
 
 
 def _unsupported(precision: str, device: torch.device) -> str | None:

@@ -8,8 +8,7 @@ from torch.nn import functional
 
 F64 = torch.float64
 
-#: Size of the scene by family.
-UNITS = {"large": 1e3, "small": 1e-3}
+UNITS = {"large": 1e3, "small": 1e-3}  #: Size of the scene by family
 #: What the values of an ingredient are multiplied with, by family.
 FACTORS = {
     "depths": {"zero_depth": 0.0, "negative_depth": -1.0, "near_zero_depth": 1e-12, "huge_depth": 1e12},

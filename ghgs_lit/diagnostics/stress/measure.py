@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ghgs_lit.diagnostics.stress.families import FAMILIES, PLANTED
-from ghgs_lit.diagnostics.stress.stage import Stage, Values, stack
+from ghgs_lit.diagnostics.stress.stage import FAMILIES, PLANTED, Stage, Values, stack
 from ghgs_lit.errors import InputError
 from ghgs_lit.runs.results import plain
 
@@ -28,25 +27,12 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was found for n cases.
+    """What was found for n cases."""
 
-    Args:
-        errors: over eps times the condition number [n]; infinite where there is no bound.
-        lost: whether a value is not finite [n].
-        said: what has the error, of each case.
-        gradient: median of the largest gradient.
-    """
-
-    errors: Tensor
-    lost: Tensor
-    said: Sequence[str]
-    gradient: float = 0.0
-
-
-def make_cases(stage: Stage, family: str, seeds: Sequence[int]) -> Values:
-    """Stacked inputs [n, ...] in float64; a case depends on stage, family and seed only."""
-    keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in seeds]
-    return stack([stage.make(family, torch.Generator().manual_seed(key)) for key in keys])
+    errors: Tensor  #: over eps times the condition number [n]; infinite where there is no bound
+    lost: Tensor  #: whether a value is not finite [n]
+    said: Sequence[str]  #: what has the error, of each case
+    gradient: float = 0.0  #: median of the largest gradient
 
 
 def measure(
@@ -55,7 +41,9 @@ def measure(
     """The cells of a family: one for each dtype of the stage (or for those of ``dtypes`` among them)."""
     started = time.perf_counter()
     chosen = [dtype for dtype in stage.dtypes if dtypes is None or dtype in dtypes]
-    cases = make_cases(stage, family, seeds)
+    # A case depends on stage, family and seed only.
+    keys = [zlib.crc32(f"{stage.name}/{family}/{seed}".encode()) for seed in seeds]
+    cases = stack([stage.make(family, torch.Generator().manual_seed(key)) for key in keys])
     if family in PLANTED:
         check = partial(_planted, stage, PLANTED[family], cases, seeds)
     elif family in stage.refused:
@@ -131,10 +119,8 @@ def _inputs(cases: Values, dtype: str) -> Values:
 
 def _spread(run: Callable[[Values], Values], exact: Values, truth: Values, stage: Stage) -> Values:
     """How far each output of the reference moves where the inputs are rounded at random, over the rounding.
-
     Two roundings are of one step. The other two are opposite and as large as the budget: a decision that
-    falls within it (a ray that grazes a box) jumps for one of them.
-    """
+    falls within it (a ray that grazes a box) jumps for one of them."""
     spread = {name: torch.zeros(len(value), dtype=torch.float64) for name, value in truth.items()}
     for seed, size in ((0, 1), (1, 1), (2, stage.factor), (2, -stage.factor)):
         g, step, moved = torch.Generator().manual_seed(seed), size * _STEP, dict(exact)

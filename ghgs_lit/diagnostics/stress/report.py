@@ -11,13 +11,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ghgs_lit.diagnostics.output import document, save_figure, texts
-from ghgs_lit.diagnostics.stress.families import FAMILIES
 from ghgs_lit.diagnostics.stress.measure import Row
+from ghgs_lit.diagnostics.stress.stage import FAMILIES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.files import write_text_atomically
 
-#: Columns of the worst cells.
-_WORST = ("stage", "family", "dtype", "error", "budget")
+_WORST = ("stage", "family", "dtype", "error", "budget")  #: Columns of the worst cells
 
 
 def frame_of(rows: Sequence[Row]) -> pd.DataFrame:

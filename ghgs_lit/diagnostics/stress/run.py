@@ -1,20 +1,48 @@
 """All cases of a run: divided among processes, written as they end, and not computed twice."""
 
+import json
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
 import torch
 
-from ghgs_lit.diagnostics.stress.families import FAMILIES
+import ghgs_lit
 from ghgs_lit.diagnostics.stress.measure import Row, measure
+from ghgs_lit.diagnostics.stress.stage import FAMILIES
 from ghgs_lit.diagnostics.stress.stages import STAGES
 from ghgs_lit.errors import choice
-from ghgs_lit.runs.journal import Journal
+from ghgs_lit.files import append_line
+from ghgs_lit.readers import read_lines_of_json
 from ghgs_lit.runs.progress import track
+
+
+@cache
+def code_digest() -> str:
+    """Of the sources of the package: rows of other code are not taken over."""
+    digest = 0
+    for path in sorted(Path(ghgs_lit.__file__).parent.rglob("*.py")):
+        digest = zlib.crc32(path.read_bytes(), digest)
+    return f"{digest:08x}"
+
+
+class Journal(dict[str, list[Row]]):
+    """Rows of finished pieces by key; those that an earlier run with the same code wrote are there."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        entries = read_lines_of_json(path) if path.exists() else ()
+        super().__init__((e["key"], e["rows"]) for e in entries if e.get("code") == code_digest())
+
+    def add(self, key: str, rows: list[Row]) -> None:
+        """Note a finished piece; its line is on its way to the disk when this returns."""
+        append_line(self.path, json.dumps({"key": key, "code": code_digest(), "rows": rows}))
+        self[key] = rows
 
 
 @dataclass(frozen=True)
@@ -60,8 +88,9 @@ def run_tasks(tasks: Sequence[Task], journal: Path, workers: int) -> list[Row]:
     """The rows of all tasks; those that ``journal`` has already are read from it. ``journal``: a file of one
     line for each task, which is written as the tasks end. ``workers``: processes; 0: this one."""
     done = Journal(journal)
-    done.say_done([task.key for task in tasks], "families")
     left = [task for task in tasks if task.key not in done]
+    if count := len(tasks) - len(left):
+        print(f"{journal}: {count} of {len(tasks)} families are done already", flush=True)
     with _mapping(workers) as map_tasks:
         for task, rows in zip(track(left, "stages and families"), map_tasks(Task.run, left), strict=True):
             done.add(task.key, rows)

@@ -5,10 +5,9 @@ without the subject. Large parts of a mask that show the background are not the 
 beside it that do not, are. Outlines stay as they are: to say where they run is what mattes are for.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -17,16 +16,13 @@ from ghgs_lit.kernels.cores import allowed_cores
 from ghgs_lit.prediction.capture.capture import Capture
 from ghgs_lit.prediction.capture.crops import Photograph
 
-#: Photographs of a camera that a background takes, at least.
-_ENOUGH = 6
+_ENOUGH = 6  #: Photographs of a camera that a background takes, at least
 #: Levels of 255 by which the photographs of a background differ at most, and by which the subject does.
 _STEADY, _DIFFERENT = 20.0, 12.0
-#: Deviations of the noise beyond which a pixel differs.
-_DEVIATIONS = 4.0
+_DEVIATIONS = 4.0  #: Deviations of the noise beyond which a pixel differs
 #: Parts of a mask's area: what is large, and what is a speck beside the largest part.
 _LARGE, _SPECK = 0.03, 0.05
-#: Share of the light that a shadow leaves, at least.
-_DARK = 0.3
+_DARK = 0.3  #: Share of the light that a shadow leaves, at least
 #: Correlation of brightness from which a part shows the background: a grey shirt is no grey wall.
 _ALIKE = 0.9
 
@@ -67,7 +63,7 @@ class _Background:
             return photograph
         matte = photograph.matte.copy()
         matte[box] = found
-        return dataclasses.replace(photograph, matte=matte)
+        return replace(photograph, matte=matte)
 
 
 def _mended(
@@ -139,20 +135,16 @@ class Backgrounds:
         photographs: dict[str, list[Photograph]] = {}
         for photograph in (photograph for capture in captures for photograph in capture.photographs):
             photographs.setdefault(photograph.name, []).append(photograph)
-        return cls(
-            {
-                name: _Background.of(found)
-                for name, found in photographs.items()
-                if len(found) >= _ENOUGH and len({photograph.mask.shape for photograph in found}) == 1
-            }
-        )
+        cameras = {}
+        for name, found in photographs.items():
+            if len(found) >= _ENOUGH and len({photograph.mask.shape for photograph in found}) == 1:
+                cameras[name] = _Background.of(found)
+        return cls(cameras)
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with masks that are mended where large parts contradict the background."""
         with ThreadPoolExecutor(allowed_cores()) as pool:
-            return dataclasses.replace(
-                capture, photographs=tuple(pool.map(self._mended, capture.photographs))
-            )
+            return replace(capture, photographs=tuple(pool.map(self._mended, capture.photographs)))
 
     def _mended(self, photograph: Photograph) -> Photograph:
         background = self.cameras.get(photograph.name)

@@ -1,8 +1,7 @@
 """Calibrations as files store them, and their meaning in the conventions of :mod:`ghgs_lit.types`.
 
 Most files do not say whether poses map the world to the camera, or with which axes: the format tells it, or
-the user. A :class:`Convention` is such a meaning; :mod:`ghgs_lit.prediction.capture.camera_report` tries
-others.
+the user.
 """
 
 from collections.abc import Mapping
@@ -14,12 +13,11 @@ import numpy as np
 
 from ghgs_lit.data.decoding import check_array, check_extrinsics, check_intrinsics
 from ghgs_lit.data.view import half_centers
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import InputError, require
 
 EXTRINSICS = ("world_to_camera", "camera_to_world")
 AXES = ("opencv", "opengl")
 INTRINSICS = ("pixels", "normalized", "normalized_principal")
-PIXEL_CENTERS = ("half", "integer")
 
 #: A camera multiplies colours by at most this beside the mean of all, and at least by one over it.
 MOST_GAIN = 2.0
@@ -55,12 +53,7 @@ class Convention:
     unit: float = 1.0
 
     def __post_init__(self) -> None:
-        choice("calibration.extrinsics", self.extrinsics, EXTRINSICS)
-        choice("calibration.axes", self.axes, AXES)
-        choice("calibration.intrinsics", self.intrinsics, INTRINSICS)
-        choice("calibration.pixel_centers", self.pixel_centers, PIXEL_CENTERS)
-        for name in ("resized", "unit"):
-            value = getattr(self, name)
+        for name, value in (("resized", self.resized), ("unit", self.unit)):
             expected = "a number above 0, from 1e-9 to 1e9"
             require(1e-9 <= value <= 1e9, f"calibration.{name}", expected, value)
 
@@ -98,13 +91,12 @@ class StoredCamera:
 
     def has_numbers_of(self, other: "StoredCamera") -> bool:
         """Whether both mean the same camera."""
-        both = [(c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other)]
-        return all(np.array_equal(*pair) for pair in zip(*both, strict=True))
+        both = ((c.intrinsics, c.pose, c.distortion, c.size or (), c.fisheye) for c in (self, other))
+        return all(map(np.array_equal, *both))
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "intrinsics", check_intrinsics(f"{self.origin}: intrinsics", self.intrinsics)
-        )
+        lens = check_intrinsics(f"{self.origin}: intrinsics", self.intrinsics)
+        object.__setattr__(self, "intrinsics", lens)
         object.__setattr__(self, "pose", check_extrinsics(f"{self.origin}: rotation", self.pose))
         counts = (0, 4) if self.fisheye else (0, 4, 5, 8, 12, 14)
         expected = f"{', '.join(map(str, counts))} distortion coefficients"
@@ -122,17 +114,11 @@ class StoredCamera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """One camera for photographs of one size, in the conventions of :mod:`ghgs_lit.types`.
+    """One camera for photographs of one size, in the conventions of :mod:`ghgs_lit.types`."""
 
-    Attributes:
-        intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
-        extrinsics: [4, 4] float64, world to camera, OpenCV axes.
-        distortion, fisheye, gains: as for :class:`StoredCamera`.
-    """
-
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
-    distortion: np.ndarray
+    intrinsics: np.ndarray  #: [3, 3] float64 in pixels, pixel centres at +0.5
+    extrinsics: np.ndarray  #: [4, 4] float64, world to camera, OpenCV axes
+    distortion: np.ndarray  #: this and what follows: as for :class:`StoredCamera`
     fisheye: bool
     gains: np.ndarray | None = None
 
@@ -160,8 +146,8 @@ def calibrate(camera: StoredCamera, convention: Convention, photograph: tuple[in
             )
         intrinsics[:2] *= np.array([[photograph[1] / width], [photograph[0] / height]])
     intrinsics[:2] *= convention.resized
-    extrinsics = extrinsics_of(camera.pose, convention)
-    return Calibration(intrinsics, extrinsics, camera.distortion, camera.fisheye, camera.gains)
+    pose = extrinsics_of(camera.pose, convention)
+    return Calibration(intrinsics, pose, camera.distortion, camera.fisheye, camera.gains)
 
 
 def extrinsics_of(pose: np.ndarray, convention: Convention) -> np.ndarray:
@@ -189,17 +175,11 @@ def same_ratio(one: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def quarter_turned(calibration: Calibration, turns: int, size: tuple[int, int]) -> Calibration:
-    """The camera of an image that was turned, as ``numpy.rot90`` turns it.
-
-    Args:
-        calibration: of the image before, without distortion.
-        turns: quarter turns counterclockwise.
-        size: (height, width) of the image before.
-    """
+    """The camera of an image after quarter ``turns`` counterclockwise, as of ``numpy.rot90``. ``calibration``
+    (without distortion) and ``size`` (height, width): of the image before."""
     for _ in range(turns % 4):
         k = calibration.intrinsics
-        # New x is the old y, new y is the width less the old x.
-        height, width = size
+        height, width = size  # new x is the old y, new y is the width less the old x
         turned = np.array([[k[1, 1], 0, k[1, 2]], [0, k[0, 0], width - k[0, 2]], [0, 0, 1.0]])
         rotation = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
         calibration = replace(calibration, intrinsics=turned, extrinsics=rotation @ calibration.extrinsics)

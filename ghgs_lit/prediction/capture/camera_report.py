@@ -20,12 +20,9 @@ from ghgs_lit.prediction.capture.photographs import Pixels
 
 #: Least agreement of every view of a right calibration, and by how much a better meaning must win.
 AGREES, BETTER = 0.9, 0.05
-# Longer side of the photographs that are compared, in pixels.
-_SIDE = 320
-# Shares of a photograph between which a principal point is plausible.
-_MIDDLE = (0.3, 0.7)
-#: Largest extents that are taken for a person in metres.
-PERSON = (0.5, 2.5)
+_SIDE = 320  # Longer side of the photographs that are compared, in pixels
+_MIDDLE = (0.3, 0.7)  # Shares of a photograph between which a principal point is plausible
+PERSON = (0.5, 2.5)  #: Largest extents that are taken for a person in metres
 # What photographs are resized by after a calibration.
 _RESIZES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 1.0, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 # A part of a mask is another person where it has this share of the largest part's area, or more.
@@ -46,19 +43,13 @@ class StoredView:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A meaning of a calibration, and how well masks and cameras agree with it.
-
-    Attributes:
-        option: of the command line, which makes it so; empty: as it is, or nothing does.
-        blames: the cameras that it says are wrong; empty: all, or none.
-        shares: by view, the share of the mask that lies in the hull of the others; empty before it is ranked.
-    """
+    """A meaning of a calibration, and how well masks and cameras agree with it."""
 
     says: str
-    option: str
+    option: str  #: of the command line, which makes it so; empty: as it is, or nothing does
     views: tuple[StoredView, ...]
-    blames: tuple[str, ...] = ()
-    shares: dict[str, float] = field(default_factory=dict)
+    blames: tuple[str, ...] = ()  #: the cameras that it says are wrong; empty: all, or none
+    shares: dict[str, float] = field(default_factory=dict)  #: of each mask in the hull of the others
 
     @property
     def score(self) -> float:
@@ -94,21 +85,14 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The report on a calibration.
-
-    Attributes:
-        option: of the command line, which mends it; empty where none does.
-        ranking: all meanings that were tried, the best first.
-        size: the subject's largest extent, in the user's unit, of the best meaning.
-        suspects: cameras that disagree with the others.
-    """
+    """The report on a calibration."""
 
     consistent: bool
     lines: tuple[str, ...]
-    option: str
-    ranking: tuple[Hypothesis, ...]
-    size: float
-    suspects: tuple[str, ...] = ()
+    option: str  #: of the command line, which mends it; empty where none does
+    ranking: tuple[Hypothesis, ...]  #: all meanings that were tried, the best first
+    size: float  #: the subject's largest extent, in the user's unit, of the best meaning
+    suspects: tuple[str, ...] = ()  #: cameras that disagree with the others
 
 
 def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
@@ -121,11 +105,11 @@ def diagnose(folder: CaptureFolder, instant: str | None = None) -> Diagnosis:
         line = f"{' and '.join(same)} have the same pose: one of them is a copy"
         return Diagnosis(False, (line,), "", (given,), given.size(folder), same)
     if given.score >= AGREES:
-        size = given.size(folder)
-        line = (
-            f"cameras and masks agree ({given.score:.0%} of each mask or more lies in the hull of the others)"
+        size, agree = (
+            given.size(folder),
+            f"{given.score:.0%} of each mask or more lies in the hull of the others",
         )
-        return Diagnosis(True, (line, _size_line(size)), "", (given,), size)
+        return Diagnosis(True, (f"cameras and masks agree ({agree})", _size_line(size)), "", (given,), size)
     tried = [given, *(hypothesis.ranked(folder) for hypothesis in _for_all(views))]
     best = max(tried, key=lambda hypothesis: hypothesis.score)
     if best.score < AGREES:
@@ -172,7 +156,10 @@ def in_parts(views: Sequence[StoredView]) -> list[str]:
 
 def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
     given = views[0].convention
-    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, _likely_resize(views))):
+    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
+    scale = 0.5 / max(float(np.median(points)), 0.01)  # brings principal points to the middle
+    likely = min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
+    for intrinsics, resized in itertools.product(INTRINSICS, (given.resized, likely)):
         inner = replace(given, intrinsics=intrinsics, resized=resized)
         if not all(_plausible(replace(view, convention=inner)) for view in views):
             continue
@@ -180,34 +167,23 @@ def _for_all(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
             convention = replace(inner, extrinsics=extrinsics, axes=axes)
             if convention == given:
                 continue
-            changed = {
-                key: getattr(convention, key)
-                for key in ("extrinsics", "axes", "intrinsics", "resized")
-                if getattr(convention, key) != getattr(given, key)
-            }
+            changed = [
+                (key, value if isinstance(value, str) else f"{value:.4g}")
+                for key, value in vars(convention).items()
+                if value != getattr(given, key)
+            ]
             yield Hypothesis(
-                f"all cameras: {', '.join(f'{key} {_plain(value)}' for key, value in changed.items())}",
-                " ".join(f"calibration.{key}={_plain(value)}" for key, value in changed.items()),
+                f"all cameras: {', '.join(map(' '.join, changed))}",
+                " ".join(f"calibration.{key}={value}" for key, value in changed),
                 tuple(replace(view, convention=convention) for view in views),
             )
-
-
-def _plain(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
-
-
-def _likely_resize(views: Sequence[StoredView]) -> float:
-    """The usual factor that brings the principal points nearest to the middle."""
-    points = [view.camera.intrinsics[:2, 2] / np.array(view.camera.size)[::-1] for view in views]
-    scale = 0.5 / max(float(np.median(points)), 0.01)
-    return min(_RESIZES, key=lambda resize: abs(np.log(resize / scale)))
 
 
 def _plausible(view: StoredView) -> bool:
     share = view.camera.intrinsics[:2, 2] * view.convention.resized
     if view.convention.intrinsics == "pixels":
         share = share / np.array(view.camera.size)[::-1]
-    return bool((share >= _MIDDLE[0]).all() and (share <= _MIDDLE[1]).all())
+    return bool(((share >= _MIDDLE[0]) & (share <= _MIDDLE[1])).all())
 
 
 def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
@@ -222,7 +198,11 @@ def _for_some(views: tuple[StoredView, ...]) -> Iterator[Hypothesis]:
         swapped[i] = replace(one, camera=other.camera)
         swapped[j] = replace(other, camera=one.camera)
         names, blames = f"{one.name} and {other.name}", (one.name, other.name)
-        if one.mask.shape == other.mask.shape and _masks_are_swapped(one, other):
+        # Outlines of the masks may follow edges of the other photograph rather than of their own.
+        if one.mask.shape == other.mask.shape and (
+            _contrast(one, other.mask) * _contrast(other, one.mask)
+            > _contrast(one, one.mask) * _contrast(other, other.mask)
+        ):
             swapped[i], swapped[j] = replace(one, mask=other.mask), replace(other, mask=one.mask)
             yield Hypothesis(f"the masks of {names} are exchanged", "", tuple(swapped), blames)
             continue
@@ -253,12 +233,6 @@ def _mistakes(view: StoredView) -> Iterator[tuple[str, StoredView]]:
         intrinsics = view.camera.intrinsics * [[factor], [factor], [1.0]]
         says = f"its intrinsics are for photographs {1 / factor:g} times as large"
         yield with_camera(says, intrinsics=intrinsics)
-
-
-def _masks_are_swapped(one: StoredView, other: StoredView) -> bool:
-    """Whether the outlines of the masks follow edges of the other photograph rather than of their own."""
-    as_given = _contrast(one, one.mask) * _contrast(other, other.mask)
-    return _contrast(one, other.mask) * _contrast(other, one.mask) > as_given
 
 
 def _contrast(view: StoredView, mask: np.ndarray) -> float:

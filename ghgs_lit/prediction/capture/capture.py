@@ -23,15 +23,10 @@ class Capture:
 
     @classmethod
     def read(cls, images: str | Path, cameras: str | Path, **options: Any) -> "Capture":
-        """The photographs of a folder with their cameras.
-
-        Args:
-            cameras: the calibration, in one of :data:`ghgs_lit.prediction.capture.formats.FORMATS`.
-            options: as for :class:`ghgs_lit.prediction.capture.folder.CaptureFolder`, such as ``masks``.
-
-        Raises:
-            InputError: a file is missing or wrong, or the folder holds several instants.
-        """
+        """The photographs of a folder with their cameras. ``cameras``: the calibration, in one of
+        :data:`ghgs_lit.prediction.capture.formats.FORMATS`. ``options``: as for
+        :class:`ghgs_lit.prediction.capture.folder.CaptureFolder`, such as ``masks``. InputError: a file is
+        missing or wrong, or the folder holds several instants."""
         folder = CaptureFolder(images, cameras, **options)
         instants = folder.instants
         require(len(instants) == 1, str(images), "one instant (CaptureFolder reads several)", len(instants))
@@ -41,12 +36,9 @@ class Capture:
         """Crops around the subject on a black background, as a model sees them: a batch of one element.
 
         Cameras are in the user's world, in float64, which a world far from its origin needs. Photographs are
-        divided by the gains of their cameras where those of all are known.
-
-        Args:
-            size: (height, width) of the crops in pixels.
-            refine_masks: by how many pixels of a crop the outlines of masks may be wrong; mattes are then
-                searched in the photographs (:func:`refined_matte`). 0: masks are right.
+        divided by the gains of their cameras where those of all are known. ``size``: (height, width) of the
+        crops in pixels. ``refine_masks``: by how many pixels of a crop the outlines of masks may be wrong;
+        mattes are then searched in the photographs (:func:`refined_matte`). 0: masks are right.
         """
         crops = [crop_to_subject(photograph, size, refine_masks) for photograph in self.photographs]
         images, mattes, intrinsics, extrinsics = (

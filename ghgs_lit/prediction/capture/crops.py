@@ -9,28 +9,19 @@ from ghgs_lit.data.view import area_image
 
 #: How much of a crop's height or width the subject takes, as in the photographs of training data.
 SHARE = 0.8
-#: Mattes are searched in photographs of at most this times the size of their crops.
-_FINER = 2
+_FINER = 2  #: Mattes are searched in photographs of at most this times the size of their crops
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph without lens distortion, upright.
-
-    Attributes:
-        image: [h, w, 3] uint8, RGB.
-        matte: [h, w] uint8, 255 times the share of each pixel that shows the subject.
-        intrinsics: [3, 3] float64 in pixels, pixel centres at +0.5.
-        extrinsics: [4, 4] float64, world to camera, OpenCV axes, in the user's unit.
-        gains: [3] float64, by what the camera multiplies colours beside others; None: it is not known.
-    """
+    """One photograph without lens distortion, upright."""
 
     name: str
-    image: np.ndarray
-    matte: np.ndarray
-    intrinsics: np.ndarray
-    extrinsics: np.ndarray
-    gains: np.ndarray | None = None
+    image: np.ndarray  #: [h, w, 3] uint8, RGB
+    matte: np.ndarray  #: [h, w] uint8, 255 times the share of each pixel that shows the subject
+    intrinsics: np.ndarray  #: [3, 3] float64 in pixels, pixel centres at +0.5
+    extrinsics: np.ndarray  #: [4, 4] float64, world to camera, OpenCV axes, in the user's unit
+    gains: np.ndarray | None = None  #: [3], by what it multiplies colours beside others; None: not known
 
     @property
     def mask(self) -> np.ndarray:

@@ -12,10 +12,8 @@ from ghgs_lit.prediction.capture.crops import SHARE, Photograph
 from ghgs_lit.prediction.refinement.coherence import contradiction
 from ghgs_lit.types import Batch
 
-#: Pixels of masks, and rounds of cameras, that mend what is found.
-ENOUGH = 4
-#: Pixels beside an outline at which photographs are looked at.
-_REACH = 6
+ENOUGH = 4  #: Pixels of masks, and rounds of cameras, that mend what is found
+_REACH = 6  #: Pixels beside an outline at which photographs are looked at
 #: Pixels of crops by which outlines lie beside the masks', on average, above which masks are off.
 _OFF = 0.35
 #: Pixels that rays near outlines miss other silhouettes by, on average, above which cameras are off.
@@ -25,9 +23,9 @@ _MISSED = 4e-3
 def doubt_of_masks(capture: Capture, size: tuple[int, int]) -> str:
     """Where photographs show outlines, in pixels of crops of ``size``, if masks are off; else ""."""
     off = [_outline(photograph, size) for photograph in capture.photographs]
-    places = ", ".join(f"{pixels:+.1f}" for pixels in off)
-    is_off = np.abs(off).mean() > _OFF
-    return f"photographs show outlines {places} pixels inside the masks'" if is_off else ""
+    if np.abs(off).mean() <= _OFF:
+        return ""
+    return f"photographs show outlines {', '.join(f'{n:+.1f}' for n in off)} pixels inside the masks'"
 
 
 def doubt_of_cameras(capture: Capture, batch: Batch) -> str:
@@ -46,20 +44,18 @@ def _outline(photograph: Photograph, size: tuple[int, int]) -> float:
     step = max(*steps, 1)
     reach = (_REACH + 2) * step
     # One pixel of the photograph for each of a crop: as fast for a large one, and edges stay where they are.
-    seen = np.ix_(
-        *(
-            np.arange(max(start - reach, 0), min(end + reach, whole - 1) + 0.5, step).astype(int)
-            for (start, end), whole in zip(extents, photograph.mask.shape, strict=True)
-        )
-    )
+    lines = [
+        np.arange(max(start - reach, 0), min(end + reach, whole - 1) + 0.5, step).astype(int)
+        for (start, end), whole in zip(extents, photograph.mask.shape, strict=True)
+    ]
+    seen = np.ix_(*lines)
     distance = signed_distance(photograph.mask[seen])
     near = np.abs(distance) < _REACH
     if not near.any():
         return 0.0
     slopes = np.gradient(photograph.image[seen].astype(np.float32), axis=(0, 1))
-    across = sum(
-        slope[near] * n[near][:, None] for slope, n in zip(slopes, np.gradient(distance), strict=True)
-    )
+    pairs = zip(slopes, np.gradient(distance), strict=True)
+    across = sum(slope[near] * n[near][:, None] for slope, n in pairs)
     lines = np.floor(distance[near]).astype(int) + _REACH
     count = np.maximum(np.bincount(lines, minlength=2 * _REACH), 1)
     contrast = np.bincount(lines, np.abs(across).sum(-1), 2 * _REACH) / count

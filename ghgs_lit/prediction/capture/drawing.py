@@ -22,26 +22,23 @@ def camera_sheet(
 
     The first picture of a row of lines has points of the mask, the others the lines on which each must be,
     where it is as far away as the subject: a line passes the same part of the body in every photograph.
-
-    Args:
-        images: photographs [h, w, 3] uint8.
-        views: masks of the photographs' sizes with their cameras.
-
-    Returns:
-        [H, W, 3] uint8.
+    Returns: [H, W, 3] uint8. ``images``: photographs [h, w, 3] uint8. ``views``: masks of the photographs'
+    sizes with their cameras.
     """
     focus, radius = subject_sphere(views)
-    small = [_smaller(view) for view in views]
-    tiles = [
-        _outlined(image, view.mask, _enlarged(hull_in_view(small, i), view.mask.shape))
-        for i, (image, view) in enumerate(zip(images, views, strict=True))
-    ]
+    small, tiles = [_smaller(view) for view in views], []
+    for i, (image, view) in enumerate(zip(images, views, strict=True)):
+        hull = Image.fromarray(hull_in_view(small, i)).resize(view.mask.shape[::-1], Image.Resampling.NEAREST)
+        picture = image.copy()
+        for shape, color in ((np.asarray(hull), _HULL), (view.mask, _MASK)):
+            picture[shape ^ ndimage.binary_erosion(shape)] = color
+        tiles.append(picture)
     rows = [row(tiles, [f"{name}: mask green, hull of the others red" for name in names])]
     for i, view in enumerate(views):
         order = [i, *(j for j in range(len(views)) if j != i)]
-        points = _extremes(view.mask)
+        points, depths = _extremes(view.mask), view.depths_around(focus, radius, _STEPS)
         tiles = [_dots(images[i], points)]
-        tiles += [_lines(images[j], view, views[j], points, focus, radius) for j in order[1:]]
+        tiles += [_lines(images[j], view, views[j], points, depths) for j in order[1:]]
         rows.append(row(tiles, [f"points of {names[i]}", *(f"on {names[j]}" for j in order[1:])]))
     return stack(rows)
 
@@ -52,17 +49,6 @@ def _smaller(view: Silhouette) -> Silhouette:
     intrinsics = view.intrinsics.copy()
     intrinsics[:2] /= step
     return Silhouette(view.mask[step // 2 :: step, step // 2 :: step], intrinsics, view.extrinsics)
-
-
-def _enlarged(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    return np.asarray(Image.fromarray(mask).resize(shape[::-1], Image.Resampling.NEAREST))
-
-
-def _outlined(image: np.ndarray, mask: np.ndarray, hull: np.ndarray) -> np.ndarray:
-    picture = image.copy()
-    for shape, color in ((hull, _HULL), (mask, _MASK)):
-        picture[shape ^ ndimage.binary_erosion(shape)] = color
-    return picture
 
 
 def _extremes(mask: np.ndarray) -> np.ndarray:
@@ -82,17 +68,11 @@ def _dots(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _lines(
-    image: np.ndarray,
-    view: Silhouette,
-    other: Silhouette,
-    points: np.ndarray,
-    focus: np.ndarray,
-    radius: float,
+    image: np.ndarray, view: Silhouette, other: Silhouette, points: np.ndarray, depths: np.ndarray
 ) -> np.ndarray:
-    """The lines of a view's ``points`` on the photograph of another, as far from it as the subject is."""
+    """The lines of a view's ``points`` at ``depths`` on the photograph of another."""
     picture = Image.fromarray(image)
     draw = ImageDraw.Draw(picture)
-    depths = view.depths_around(focus, radius, _STEPS)
     for ray, color in zip(view.rays(points), _COLORS, strict=True):
         local = (view.center + ray * depths[:, None]) @ other.extrinsics[:3, :3].T + other.extrinsics[:3, 3]
         local = local[local[:, 2] > 0]

@@ -14,13 +14,7 @@ from ghgs_lit.config import nodes
 from ghgs_lit.data.silhouettes import implausible
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.kernels.cores import allowed_cores
-from ghgs_lit.prediction.capture.calibration import (
-    Calibration,
-    Convention,
-    StoredCamera,
-    calibrate,
-    quarter_turned,
-)
+from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera, calibrate, quarter_turned
 from ghgs_lit.prediction.capture.crops import Photograph
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.frames import Frame, Source, VideoFrame, find_frames, has_videos
@@ -37,13 +31,13 @@ from ghgs_lit.prediction.capture.photographs import (
 if TYPE_CHECKING:  # photographs are read while PyTorch is imported
     import torch
 
-#: Photographs that an instant needs where others of its are missing.
-ENOUGH = 3
+ENOUGH = 3  #: Photographs that an instant needs where others of its are missing
 
 
 @dataclass(frozen=True)
 class CaptureFolder:
-    """``folder.photographs(instant)`` for each of ``folder.instants``.
+    """``folder.photographs(instant)`` for each of ``folder.instants``. InputError: a folder or file is
+    missing or wrong.
 
     Args:
         images: folder of photographs named after their cameras; of such folders, one for each instant; or of
@@ -57,9 +51,6 @@ class CaptureFolder:
             :class:`ghgs_lit.config.nodes.Calibration`.
         sequence: which instants count, and how videos fit together: the fields of
             :class:`ghgs_lit.config.nodes.Sequence`.
-
-    Raises:
-        InputError: a folder or file is missing or wrong.
     """
 
     images: str | Path | Mapping[str, Frame]
@@ -69,6 +60,8 @@ class CaptureFolder:
     segment: str | None = None
     calibration: Mapping[str, Any] = field(default_factory=dict)
     sequence: Mapping[str, Any] = field(default_factory=dict)
+    #: The views of one instant that are decoded, or are being decoded.
+    _begun: dict[str, dict[str, Future]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("images", "cameras", "masks", "backgrounds"):
@@ -86,11 +79,6 @@ class CaptureFolder:
     @functools.cached_property
     def _part(self) -> nodes.Sequence:
         return nodes.Sequence.read(self.sequence, "sequence")
-
-    @functools.cached_property
-    def _begun(self) -> dict[str, dict[str, Future]]:
-        """The views of one instant that are decoded, or are being decoded."""
-        return {}
 
     @functools.cached_property
     def file(self) -> CameraFile:
@@ -163,11 +151,9 @@ class CaptureFolder:
     def decode(self, instant: str) -> dict[str, tuple[StoredCamera, Pixels, np.ndarray]]:
         """Camera, photograph and matte as shown of each view, before the calibration is applied.
 
-        They are kept until :meth:`photographs` has them, or those of another instant are decoded.
-
-        Raises:
-            InputError: a photograph or mask is missing or wrong; of several instants one may lack photographs
-                (:attr:`missing`) where three or more remain.
+        They are kept until :meth:`photographs` has them, or those of another instant are decoded. InputError:
+        a photograph or mask is missing or wrong; of several instants one may lack photographs
+        (:attr:`missing`) where three or more remain.
         """
         self.begin(instant)
         return self._complete(instant, {name: view.result for name, view in self._begun[instant].items()})
@@ -222,13 +208,17 @@ class CaptureFolder:
         if calibration.distortion.any():
             from ghgs_lit.geometry.undistortion import undistort
 
-            image, matte = undistort(image, matte, _grid(_key(calibration), *size))
+            # Everything that undistortion depends on, as a key of a cache: many instants share it.
+            lens = (
+                *map(tuple, (calibration.intrinsics.ravel(), calibration.distortion)),
+                calibration.fisheye,
+            )
+            image, matte = undistort(image, matte, _grid(*lens, *size))
             expected, lens = "a lens distortion that leaves some of the subject", calibration.distortion
             require(bool((matte > 127).any()), camera.origin, expected, lens.tolist())
-        calibration = quarter_turned(calibration, turns, size)
+        found = quarter_turned(calibration, turns, size)
         image, matte = np.rot90(image, turns), np.rot90(matte, turns)
-        cameras = calibration.intrinsics, calibration.extrinsics, calibration.gains
-        return Photograph(name, image, matte, *cameras)
+        return Photograph(name, image, matte, found.intrinsics, found.extrinsics, found.gains)
 
     def _matte(self, name: str, camera: StoredCamera, path: Source, pixels: Pixels) -> np.ndarray:
         """The matte [h, w] uint8 as the photograph is shown, of the first source that there is."""
@@ -259,14 +249,8 @@ class CaptureFolder:
 _segmenter = functools.cache(segmenter)
 
 
-def _key(calibration: Calibration) -> tuple:
-    """Everything that undistortion depends on, as a key of a cache: many instants share it."""
-    return tuple(calibration.intrinsics.ravel()), tuple(calibration.distortion), calibration.fisheye
-
-
 @functools.lru_cache(maxsize=16)
-def _grid(key: tuple, height: int, width: int) -> "torch.Tensor":
+def _grid(intrinsics: tuple, distortion: tuple, fisheye: bool, height: int, width: int) -> "torch.Tensor":
     from ghgs_lit.geometry.undistortion import undistorting_grid
 
-    intrinsics, distortion, fisheye = key
     return undistorting_grid(np.reshape(intrinsics, (3, 3)), np.array(distortion), height, width, fisheye)

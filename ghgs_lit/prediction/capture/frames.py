@@ -65,8 +65,7 @@ class VideoFrame:
         return np.where(grey < _CODED, 0, np.where(grey > 255 - _CODED, 255, grey)).astype(np.uint8)
 
 
-#: Where a photograph comes from.
-Source = Path | Frame | VideoFrame
+Source = Path | Frame | VideoFrame  #: Where a photograph comes from
 
 
 def has_videos(folder: Path, cameras: Mapping[str, StoredCamera], names: Mapping[str, str]) -> bool:
@@ -87,7 +86,9 @@ def find_frames(
     sync: Mapping[str, int] | str | None,
     step: int,
 ) -> tuple[dict[str, dict[str, VideoFrame]], str]:
-    """The frames of each instant that all videos show.
+    """The frames of each instant that all videos show. Returns: ``{instant: {camera: frame}}``, instants
+    named by the frame of the first camera; and a line about frames that are left over. InputError: videos and
+    cameras, or videos and one another, do not fit together.
 
     Args:
         masks: folder of masks: a video of the same name for each, or a folder of numbered images; None:
@@ -95,13 +96,6 @@ def find_frames(
         sync: frames by which a camera began before the others; or a CSV of ``camera,frame,seconds``, by which
             each frame of the first camera gets the nearest one of every other; None: all began together.
         step: of the instants that will be read.
-
-    Returns:
-        ``{instant: {camera: frame}}``, instants named by the frame of the first camera; and a line about
-        frames that are left over.
-
-    Raises:
-        InputError: videos and cameras, or videos and one another, do not fit together.
     """
     paths = by_camera(folder, images_in(folder, SUFFIXES), cameras, names)
     with ThreadPoolExecutor(allowed_cores()) as pool:
@@ -113,7 +107,10 @@ def find_frames(
         numbers, step = _by_time(videos, Path(sync).expanduser(), names), 1
     else:
         numbers = _by_number(videos, {names.get(str(key), str(key)): n for key, n in (sync or {}).items()})
-    frames = {name: _frames_of(video, folder, masks, step) for name, video in videos.items()}
+    frames = {}
+    for name, video in videos.items():
+        reader, drawn = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
+        frames[name] = {n: VideoFrame(reader, n, drawn.get(n)) for n in video.numbers.tolist()}
     instants = {
         f"{instant:0{_DIGITS}d}": {name: frames[name][n] for name, n in shown.items() if n in frames[name]}
         for instant, shown in numbers.items()
@@ -169,12 +166,6 @@ def _by_time(videos: Mapping[str, Video], path: Path, names: Mapping[str, str]) 
         shared = pd.merge_asof(shared, found, on="seconds", direction="nearest", tolerance=half)
     entries = shared.drop(columns="seconds").to_dict("records")
     return {entry[first]: {name: int(n) for name, n in entry.items() if n == n} for entry in entries}
-
-
-def _frames_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame]:
-    """The frames of a video by their numbers."""
-    reader, found = Reader(video, "rgb24", step), _masks_of(video, folder, masks, step)
-    return {n: VideoFrame(reader, n, found.get(n)) for n in video.numbers.tolist()}
 
 
 def _masks_of(video: Video, folder: Path, masks: Path | None, step: int) -> dict[int, VideoFrame | Path]:

@@ -1,8 +1,10 @@
 """Captures of what goes on: instants of a folder that is being written, videos at their rate, or cameras."""
 
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,15 +12,81 @@ import numpy as np
 from ghgs_lit.config.nodes import Sequence
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.capture import Capture
-from ghgs_lit.prediction.capture.devices import newest_frames, opened
 from ghgs_lit.prediction.capture.folder import ENOUGH, CaptureFolder
 from ghgs_lit.prediction.capture.formats import CameraFile, read_cameras
 from ghgs_lit.prediction.capture.frames import Frame
 from ghgs_lit.prediction.capture.photographs import by_camera, composed, counted, images_in
 from ghgs_lit.prediction.capture.videos import SUFFIXES
 
-#: Seconds after which a folder is looked at again.
-_POLL = 0.02
+#: Seconds after which a frame, and a folder, is looked for again, and that closing waits for a camera.
+_FRAME_POLL, _FOLDER_POLL, _PATIENCE = 0.002, 0.02, 2.0
+
+
+def opened(devices: Mapping[str, int | str]) -> dict[str, Any]:
+    """OpenCV's captures by camera, of its number, the address of a stream or the path of a video. InputError:
+    one cannot be opened, or OpenCV is not installed."""
+    try:
+        import cv2
+    except ImportError:
+        hint = "pip install opencv-python-headless"
+        raise InputError(f"images: expected the package cv2 for cameras ({hint}); found none") from None
+    found = {name: cv2.VideoCapture(device) for name, device in devices.items()}
+    for name, device in devices.items():
+        require(found[name].isOpened(), f"images.{name}", "a camera or stream that OpenCV opens", device)
+    return found
+
+
+def newest_frames(
+    captures: Mapping[str, Any], least: int, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> Iterator[tuple[dict[str, Frame], int, float]]:
+    """The newest frame of each camera that has one whenever they are asked for, how many times frames were
+    taken and not asked for before, and when these were. It ends where fewer than ``least`` cameras go on, and
+    releases them. A thread takes frames as they come, so that none waits in a camera's buffer; it decodes
+    those alone that somebody asks for."""
+    wanted, stopped, ready = threading.Event(), threading.Event(), SimpleQueue()
+    wanted.set()  # the first frames that there are
+
+    def take() -> None:
+        passed = 0
+        try:
+            while not stopped.is_set():
+                # All are taken before the first is decoded, which takes longer.
+                shown = {name: capture for name, capture in captures.items() if capture.grab()}
+                taken = clock()
+                if len(shown) < least:
+                    break
+                if not wanted.is_set():
+                    passed += 1
+                    continue
+                decoded = {name: capture.retrieve() for name, capture in shown.items()}
+                # OpenCV's pixels are BGR.
+                frames = {
+                    name: Frame(f"images.{name}", np.ascontiguousarray(image[..., ::-1]))
+                    for name, (is_read, image) in decoded.items()
+                    if is_read
+                }
+                wanted.clear()
+                ready.put((frames, passed, taken))
+                passed = 0
+        finally:
+            for capture in captures.values():
+                capture.release()
+            ready.put(None)
+
+    thread = threading.Thread(target=take, daemon=True)
+    thread.start()
+    try:
+        while True:
+            while ready.empty():
+                sleep(_FRAME_POLL)
+            found = ready.get()
+            if found is None:
+                return
+            yield found
+            wanted.set()
+    finally:
+        stopped.set()
+        thread.join(_PATIENCE)
 
 
 class Arrived(NamedTuple):
@@ -40,7 +108,8 @@ def live_frames(
 ) -> Iterator[Arrived]:
     """The newest capture whenever one is asked for.
 
-    Dropped is what comes while the one before is in use, and what cannot be read.
+    Dropped is what comes while the one before is in use, and what cannot be read. InputError: the
+    calibration, a video, a camera or the folder is missing or wrong.
 
     Args:
         images: a folder of videos, which are shown at their own rate; or of instants, each a folder that
@@ -51,9 +120,6 @@ def live_frames(
         idle: seconds without a new instant after which a folder of instants ends; None: never.
         clock, sleep: tells seconds, and lets some pass.
         options: as for :class:`CaptureFolder`.
-
-    Raises:
-        InputError: the calibration, a video, a camera or the folder is missing or wrong.
     """
     said, part = options.get("calibration", {}), options.get("sequence", {})
     if is_folder := not isinstance(images, Mapping):
@@ -141,7 +207,7 @@ def _arriving(
         still = [name for name, found in sizes.items() if before.get(name) == found != unread.get(name)]
         newest, before = max(filter(is_whole, still), key=counted, default=None), sizes
         if newest is None:
-            sleep(_POLL)
+            sleep(_FOLDER_POLL)
             continue
         try:
             capture = read(newest)

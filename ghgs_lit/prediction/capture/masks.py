@@ -13,14 +13,11 @@ from ghgs_lit.data.decoding import read_image
 from ghgs_lit.errors import choice, installed, require
 from ghgs_lit.prediction.capture.photographs import MASK_ENDING, Pixels, image_named, read_pixels
 
-#: Choices of ``segment``.
-SEGMENTERS = ("rembg",)
-# Labels of body parts are numbers below this; alpha and probabilities reach 255.
-_LABELS = 32
+SEGMENTERS = ("rembg",)  #: Choices of ``segment``
+_LABELS = 32  # Labels of body parts are numbers below this; alpha and probabilities reach 255
 # By how many deviations of the noise a pixel differs from the background, and by how much at least.
 _DEVIATIONS, _LEAST_DIFFERENCE = 6.0, 12.0
-# Regions below this share of the largest one's area are not of the subject.
-_SPECK = 0.05
+_SPECK = 0.05  # Regions below this share of the largest one's area are not of the subject
 
 
 def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
@@ -51,11 +48,8 @@ def matte_of_file(path: Path, pixels: Pixels) -> np.ndarray:
 
 
 def matte_of_background(pixels: Pixels, path: Path) -> np.ndarray:
-    """A mask: where a photograph differs from one without the subject, without specks and holes.
-
-    Raises:
-        InputError: the background's photograph has another size, or nothing differs.
-    """
+    """A mask: where a photograph differs from one without the subject, without specks and holes. InputError:
+    the background's photograph has another size, or nothing differs."""
     from scipy import ndimage  # here: masks of files do not need it
 
     background = read_pixels(path)

@@ -16,8 +16,7 @@ from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import StoredCamera, same_ratio
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-#: A mask beside its photograph ends with this.
-MASK_ENDING = "_mask"
+MASK_ENDING = "_mask"  #: A mask beside its photograph ends with this
 #: How EXIF says to show a photograph: orientation to quarter turns as of ``numpy.rot90``.
 _TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
 _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
@@ -25,17 +24,11 @@ _EIGHT_BITS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr"
 
 @dataclass(frozen=True)
 class Pixels:
-    """One decoded photograph as it is shown.
+    """One decoded photograph as it is shown."""
 
-    Attributes:
-        image: [h, w, 3] uint8, RGB.
-        alpha: [h, w] uint8 where the file has it.
-        turns: quarter turns that showing it took, as of ``numpy.rot90``.
-    """
-
-    image: np.ndarray
-    alpha: np.ndarray | None
-    turns: int
+    image: np.ndarray  #: [h, w, 3] uint8, RGB
+    alpha: np.ndarray | None  #: [h, w] uint8 where the file has it
+    turns: int  #: quarter turns that showing it took, as of ``numpy.rot90``
 
     @property
     def size(self) -> tuple[int, int]:
@@ -64,14 +57,9 @@ def read_pixels(path: Path) -> Pixels:
 
 
 def fits_stored(pixels: Pixels, camera: StoredCamera, exif: str) -> bool:
-    """Whether a camera was calibrated with the photograph as it is stored, not as it is shown.
-
-    The size of the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns
-    photographs when it reads them.
-
-    Args:
-        exif: ``auto`` | ``stored`` | ``shown``: what the user says.
-    """
+    """Whether a camera was calibrated with the photograph as it is stored, not as it is shown. The size of
+    the calibration tells it for quarter turns. Elsewhere it is as shown: OpenCV turns photographs when it
+    reads them. ``exif``: ``auto`` | ``stored`` | ``shown``: what the user says."""
     if exif != "auto" or not pixels.turns:
         return exif == "stored"
     size = camera.size
@@ -116,16 +104,10 @@ def find_instants(
     """The photographs of each instant: those of the folder itself, or of its folders.
 
     Folders are instants, each with a photograph of every camera; folders with the names of cameras hold one
-    photograph for each instant. Of several instants one may lack photographs.
-
-    Args:
-        names: the camera of a photograph (or of a camera's folder) whose name differs from the camera's.
-
-    Returns:
-        Paths by camera, by instant: ``{instant: {camera: path}}``.
-
-    Raises:
-        InputError: there are none, or photographs and cameras do not fit together.
+    photograph for each instant. Of several instants one may lack photographs. Returns: Paths by camera, by
+    instant: ``{instant: {camera: path}}``. ``names``: the camera of a photograph (or of a camera's folder)
+    whose name differs from the camera's. InputError: there are none, or photographs and cameras do not fit
+    together.
     """
     problem = "a file" if folder.exists() else "no such folder"
     require(folder.is_dir(), str(folder), "a folder of photographs", problem)

@@ -1,11 +1,10 @@
 """Gaussians of a capture in the user's world, and of any batch after its cameras are corrected."""
 
-import dataclasses
 import functools
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,24 +28,15 @@ from ghgs_lit.weights.reading import SHIPPED, file_of
 
 @dataclass(frozen=True)
 class TimedPrediction:
-    """A prediction with the batch that the model saw.
+    """A prediction with the batch that the model saw."""
 
-    Attributes:
-        batch: photographs (of a capture: crops around the subject), masks and cameras, corrected where asked.
-        prediction: of this batch, in the world and unit of its cameras.
-        moved: pixels that correcting moved the subject by in each photograph; nothing where cameras stay.
-        changed: which share of the subject refining changed in each crop; nothing where masks stay.
-        refined: what refining the Gaussians gained; None where they are as predicted. Depths stay.
-        why: what photographs or silhouettes contradict, by the name of the refinement that ``auto`` chose.
-    """
-
-    batch: Batch
-    prediction: Prediction
+    batch: Batch  #: photographs or crops around the subject, masks and cameras, corrected where asked
+    prediction: Prediction  #: of this batch, in the world and unit of its cameras
     seconds: dict[str, float] = field(default_factory=dict)
-    moved: tuple[float, ...] = ()
-    changed: tuple[float, ...] = ()
-    refined: Report | None = None
-    why: dict[str, str] = field(default_factory=dict)
+    moved: tuple[float, ...] = ()  #: pixels that correcting cameras moved the subject by in each photograph
+    changed: tuple[float, ...] = ()  #: share of the subject that refining masks changed in each crop
+    refined: Report | None = None  #: what refining the Gaussians gained, where asked; depths stay
+    why: dict[str, str] = field(default_factory=dict)  #: doubts, by the refinement that ``auto`` chose
 
     @property
     def gaussians(self) -> Gaussians:
@@ -64,7 +54,8 @@ def predict(
     renderer: Renderer | None = None,
     temporal: Temporal | None = None,
 ) -> TimedPrediction:
-    """The Gaussians of a capture.
+    """The Gaussians of a capture. InputError: the checkpoint cannot be used, or the size does not fit the
+    model.
 
     Args:
         model: a model in evaluation mode, or a checkpoint (kept in memory for further calls): a path, or the
@@ -80,9 +71,6 @@ def predict(
         renderer: what refining draws with; None: that of the device.
         temporal: what predicted the instants before, in their order; None: this one has nothing to do with
             them.
-
-    Raises:
-        InputError: the checkpoint cannot be used, or the size does not fit the model.
     """
     if not isinstance(model, GHGS):
         path = file_of(model)
@@ -101,7 +89,7 @@ def predict(
     forward = functools.partial(in_frame, model)
     result = predict_batch(batch, model, renderer or Renderer(), refine_cameras, refine, forward, temporal)
     why = {name: doubt for name, doubt in why.items() if doubt}
-    return dataclasses.replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
+    return replace(result, seconds=seconds | result.seconds, changed=changed, why=why)
 
 
 def in_frame(model: GHGS, batch: Batch) -> Prediction:
@@ -135,16 +123,16 @@ def predict_batch(
         moved = tuple(pixels_moved(given, batch)[0])
         seconds["refine_cameras"] = time.perf_counter() - start
         start = time.perf_counter()
-    prediction = (temporal or forward)(dataclasses.replace(batch, targets=None))
+    prediction = (temporal or forward)(replace(batch, targets=None))
     if batch.images.device.type == "cuda":
         torch.cuda.synchronize()
     seconds["predict"] = time.perf_counter() - start
     refined = None
     if refine:
         refinement, before, start = Refinement(refine, renderer), prediction.gaussians, time.perf_counter()
-        prediction = dataclasses.replace(prediction, gaussians=refinement(before, batch))
+        prediction = replace(prediction, gaussians=refinement(before, batch))
         seconds["refine"] = time.perf_counter() - start
-        untold = dataclasses.replace(batch, targets=None)
+        untold = replace(batch, targets=None)
         refined = refinement.report(before, prediction.gaussians, untold, lambda b: forward(b).gaussians)
     return TimedPrediction(batch, prediction, seconds, moved, refined=refined)
 
@@ -166,19 +154,14 @@ def _crops(
 
 
 def trained_size(config: Mapping[str, Any]) -> int | tuple[int, int]:
-    """Side or (height, width) of the photographs that a checkpoint's model was trained with.
-
-    Imported weights were trained elsewhere: it is the size of the encoder's position embedding.
-    """
+    """Side or (height, width) of the photographs that a checkpoint's model was trained with. Imported weights
+    were trained elsewhere: it is the size of the encoder's position embedding."""
     return lookup(config, "data.size") or lookup(config, "encoder.image_size") or 518
 
 
 def crop_size(size: int | tuple[int, int] | None, config: Mapping[str, Any], model: GHGS) -> tuple[int, int]:
-    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained.
-
-    Larger ones give a warning: they make results worse, not sharper. InputError: the model cannot take this
-    size.
-    """
+    """(height, width) of the crops that a checkpoint's model sees; None: as it was trained. Larger ones give
+    a warning: they make results worse, not sharper. InputError: the model cannot take this size."""
     trained, patch = image_size("size", trained_size(config)), model.encoder.patch_size
     height, width = trained if size is None else image_size("size", size)
     multiple = side_multiple(model.options, patch)

@@ -4,11 +4,10 @@ One instant shows one pose, often with a mask that is wrong somewhere; several t
 cameras, and cameras that are the same in all of them do not flicker.
 """
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -26,54 +25,40 @@ from ghgs_lit.rendering import Renderer
 from ghgs_lit.rounds.gains import log_gains
 from ghgs_lit.types import Batch, Cameras
 
-#: Instants, spread over a sequence, that its cameras are corrected with.
-INSTANTS = 8
+INSTANTS = 8  #: Instants, spread over a sequence, that its cameras are corrected with
 #: Median deviation of the logarithms of gains from which a camera changes its exposure between instants.
 _CHANGING = 0.05
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Corrected cameras, and what else photographs of all instants share, by name.
+    """Corrected cameras, and what else photographs of all instants share, by name; gains where found."""
 
-    Attributes:
-        extrinsics: [4, 4] float64, world to camera.
-        zoom: by how much their focal lengths grow.
-        moved: pixels of a crop that the correction moved the subject by.
-        why: what the given cameras contradicted, where ``auto`` decided.
-        gains: [3], by what they multiply red, green and blue, with a geometric mean of 1; of those alone of
-            which it is found here.
-    """
-
-    extrinsics: Mapping[str, np.ndarray]
-    zoom: Mapping[str, float]
-    moved: Mapping[str, float]
-    why: str = ""
-    gains: Mapping[str, np.ndarray] = field(default_factory=dict)
+    extrinsics: Mapping[str, np.ndarray]  #: [4, 4] float64, world to camera
+    zoom: Mapping[str, float]  #: by how much their focal lengths grow
+    moved: Mapping[str, float]  #: pixels of a crop that the correction moved the subject by
+    why: str = ""  #: what the given cameras contradicted, where ``auto`` decided
+    gains: Mapping[str, np.ndarray] = field(default_factory=dict)  #: [3], with a geometric mean of 1
 
     def applied(self, capture: Capture) -> Capture:
         """The capture with the corrected cameras."""
-        return dataclasses.replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
+        return replace(capture, photographs=tuple(map(self._corrected, capture.photographs)))
 
     def _corrected(self, photograph: Photograph) -> Photograph:
         """A camera that most instants lack stays as it is."""
         pose = self.extrinsics.get(photograph.name, photograph.extrinsics)
-        lens = self._zoomed(photograph.name, photograph.intrinsics)
+        lens = photograph.intrinsics * self._zoom_of(photograph.name)
         gains = self.gains.get(photograph.name, photograph.gains)
-        return dataclasses.replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
+        return replace(photograph, intrinsics=lens, extrinsics=pose, gains=gains)
 
-    def _zoomed(self, name: str, intrinsics: np.ndarray) -> np.ndarray:
-        zoom = self.zoom.get(name, 1.0)
-        return intrinsics * [zoom, zoom, 1.0]
+    def _zoom_of(self, name: str) -> list[float]:
+        return [self.zoom.get(name, 1.0)] * 2 + [1.0]
 
     def calibrations(
         self, folder: CaptureFolder, captures: Sequence[Capture]
     ) -> dict[str, tuple[Calibration, tuple[int, int]]]:
         """The corrected cameras of a folder's photographs as they are stored, and their (height, width).
-
-        Args:
-            captures: of the folder, with the cameras as they were given.
-        """
+        ``captures``: of the folder, with the cameras as they were given."""
         found = {}
         for name, photograph in {p.name: p for c in captures for p in c.photographs}.items():
             stored = folder.file.cameras[name]
@@ -82,9 +67,9 @@ class Rig:
             # A photograph may be turned upright: what moved is the same before.
             corrected = self._corrected(photograph)
             moved = np.linalg.inv(photograph.extrinsics) @ corrected.extrinsics
-            lens, pose = self._zoomed(name, given.intrinsics), given.extrinsics @ moved
-            changed = {"intrinsics": lens, "extrinsics": pose, "gains": corrected.gains}
-            found[name] = (dataclasses.replace(given, **changed), size)
+            lens, pose = given.intrinsics * self._zoom_of(name), given.extrinsics @ moved
+            changed = replace(given, intrinsics=lens, extrinsics=pose, gains=corrected.gains)
+            found[name] = changed, size
         return found
 
 
@@ -136,10 +121,8 @@ def corrected_rig(
 @torch.no_grad()
 def shared_gains(batch: Batch, model: GHGS) -> np.ndarray | None:
     """By what the cameras [V, 3] of several instants multiply colours: the median, and 1 in the mean of all.
-
     None: exposures change from instant to instant, photographs are divided by gains already, or the model
-    does not ask for any. ``batch``: an element for each instant, in the world.
-    """
+    does not ask for any. ``batch``: an element for each instant, in the world."""
     if model.rounds is None or not model.rounds.options.gains or batch.log_gains is not None:
         return None
     batch = Frame.of(batch).enter(batch)
@@ -161,8 +144,7 @@ def _together(batches: Sequence[Batch]) -> Batch:
     names = ("images", "masks", "alpha", "log_gains")
     known = [name for name in names if getattr(batches[0], name) is not None]
     parts = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in known}
-    lenses = torch.cat([batch.cameras.intrinsics for batch in batches])
-    poses = torch.cat([batch.cameras.extrinsics for batch in batches])
+    both = ([getattr(batch.cameras, name) for batch in batches] for name in ("intrinsics", "extrinsics"))
+    cameras = Cameras(*map(torch.cat, both), *parts["masks"].shape[2:])
     subjects, views = zip(*((b.subjects[0], b.views[0]) for b in batches), strict=True)
-    cameras = Cameras(lenses, poses, *parts["masks"].shape[2:])
     return Batch(**parts, cameras=cameras, subjects=subjects, views=views)

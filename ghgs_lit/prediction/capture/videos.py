@@ -26,24 +26,17 @@ _TIME = re.compile(rb"pts_time:(\S+)")
 _EXACT = "bicubic+accurate_rnd+full_chroma_int"
 # How framecrc lists a packet that says no time, and one that is not shown.
 _UNTIMED, _HIDDEN = -(2**63), re.compile("F=0x[4-7]")
-#: Seconds of a video that are decoded for nothing before it is sought in.
-_PATIENCE = 10.0
+_PATIENCE = 10.0  #: Seconds of a video that are decoded for nothing before it is sought in
 
 
 @dataclass(frozen=True)
 class Video:
-    """The frames of a video, as its file lists them.
-
-    Attributes:
-        size: (height, width) in pixels as shown.
-        seconds: [n] float64, when each frame is shown, ascending.
-        numbers: [n] int64, the number of each; one that the camera dropped has a number, too.
-    """
+    """The frames of a video, as its file lists them."""
 
     path: Path
-    size: tuple[int, int]
-    seconds: np.ndarray
-    numbers: np.ndarray
+    size: tuple[int, int]  #: (height, width) in pixels as shown
+    seconds: np.ndarray  #: [n] float64, when each frame is shown, ascending
+    numbers: np.ndarray  #: [n] int64, the number of each; one that the camera dropped has a number, too
 
     @property
     def count(self) -> int:
@@ -64,11 +57,8 @@ class Video:
 
 
 def read_video(path: Path) -> Video:
-    """What a video's file says of its frames; no frame but the first is decoded.
-
-    Raises:
-        InputError: it is missing, ffmpeg cannot read it or is not installed, or there is no frame.
-    """
+    """What a video's file says of its frames; no frame but the first is decoded. InputError: it is missing,
+    ffmpeg cannot read it or is not installed, or there is no frame."""
     require_file(path, "a video")
     return _read_video(path, path.stat().st_mtime_ns)
 
@@ -108,12 +98,8 @@ def _command(path: Path, pixels: str, *output: str, select: str = "1", **source:
 
 
 class Reader:
-    """Frames of one video, decoded in order as they are asked for; elsewhere it is sought.
-
-    Args:
-        pixels: ``rgb24`` | ``gray``.
-        step: frames between those that will be asked for: others never reach Python.
-    """
+    """Frames of one video, decoded in order as they are asked for; elsewhere it is sought. ``pixels``:
+    ``rgb24`` | ``gray``. ``step``: frames between those that will be asked for: others never reach Python."""
 
     def __init__(self, video: Video, pixels: str, step: int = 1) -> None:
         self.video, self.pixels, self.step = video, pixels, step

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ghgs_lit.prediction.export.ply import stored_values
+from ghgs_lit.prediction.export.ply import ply_bytes, stored_values
 from ghgs_lit.types import Gaussians
 
 CONVERTED = {"compressed_ply": "compressed.ply", "spz": "spz", "sog": "sog"}
@@ -20,22 +20,20 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 the rotation (w, x, y, z), of which 128 is zero."""
 
 
-def converted(ply: bytes, name: str) -> bytes:
+def converted(name: str, gaussians: Gaussians) -> bytes:
     """The content of a file of another format. ``name``: one of ``CONVERTED``. RuntimeError: gaussforge
     refuses."""
     from gaussforge import GaussForge
 
-    answer = GaussForge().convert(ply, "ply", CONVERTED[name])
+    answer = GaussForge().convert(ply_bytes(gaussians), "ply", CONVERTED[name])
     if answer.get("error"):
         raise RuntimeError(f"{name}: gaussforge: {answer['error']}")
     return answer["data"]
 
 
 def to_records(gaussians: Gaussians) -> np.ndarray:
-    """The records [N] of dtype ``RECORD`` of the Gaussians of one subject with RGB colours.
-
-    Large and opaque ones come first, so that a part of a ``.splat`` file is a picture, too.
-    """
+    """The records [N] of dtype ``RECORD`` of the Gaussians of one subject with RGB colours. Large and opaque
+    ones come first, so that a part of a ``.splat`` file is a picture, too."""
     values = {name: value[visible_first(gaussians).cpu()] for name, value in stored_values(gaussians).items()}
     records = np.empty(len(gaussians), RECORD)
     records["mean"], records["scale"] = values["means"].numpy(), values["scales"].numpy()

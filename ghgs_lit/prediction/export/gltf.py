@@ -10,7 +10,7 @@ import torch
 from ghgs_lit.errors import require
 from ghgs_lit.prediction.export.compact import rgba
 from ghgs_lit.prediction.export.ply import SH_CONSTANT, stored_values
-from ghgs_lit.prediction.export.world import AXES, turn
+from ghgs_lit.prediction.export.subject import AXES, turn
 from ghgs_lit.types import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -28,7 +28,6 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
     import pygltflib as gltf
 
     require(len(gaussians) > 0, "formats=glb", "at least one Gaussian", 0)
-
     stored = stored_values(gaussians)
     columns = {
         "POSITION": stored["means"],
@@ -41,9 +40,8 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
     model, blob = gltf.GLTF2(scene=0, scenes=[gltf.Scene(nodes=[0])]), b""
     for name, values in columns.items():
         data = np.ascontiguousarray(values.numpy()).tobytes()
-        model.bufferViews.append(
-            gltf.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(data), target=gltf.ARRAY_BUFFER)
-        )
+        span = {"byteOffset": len(blob), "byteLength": len(data)}
+        model.bufferViews.append(gltf.BufferView(buffer=0, **span, target=gltf.ARRAY_BUFFER))
         is_bytes = values.dtype == torch.uint8
         accessor = gltf.Accessor(
             bufferView=len(model.bufferViews) - 1,
@@ -59,10 +57,8 @@ def glb_bytes(gaussians: Gaussians, up: torch.Tensor) -> bytes:
     attributes = gltf.Attributes(**{name: index for index, name in enumerate(columns)})
     primitive = gltf.Primitive(attributes=attributes, mode=gltf.POINTS, extensions={EXTENSION: _KERNEL})
     w, x, y, z = turn(up.cpu(), torch.tensor(AXES["y"])).tolist()
-    model.nodes, model.meshes = (
-        [gltf.Node(mesh=0, rotation=[x, y, z, w])],
-        [gltf.Mesh(primitives=[primitive])],
-    )
+    model.nodes = [gltf.Node(mesh=0, rotation=[x, y, z, w])]
+    model.meshes = [gltf.Mesh(primitives=[primitive])]
     model.extensionsUsed, model.buffers = [EXTENSION], [gltf.Buffer(byteLength=len(blob))]
     model.set_binary_blob(blob)
     return b"".join(model.save_to_bytes())

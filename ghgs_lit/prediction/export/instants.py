@@ -6,17 +6,17 @@ import shutil
 import time
 from collections.abc import Iterable
 from functools import partial
+from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 
 from ghgs_lit.files import write_atomically
-from ghgs_lit.prediction.export.packed import COARSE, pack, unpack
-from ghgs_lit.prediction.export.page import page
+from ghgs_lit.prediction.export.page import COARSE, pack, page, unpack
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, smoothed
-from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
@@ -24,19 +24,15 @@ from ghgs_lit.visualization.turntable import orbit
 
 #: How far the video's camera swings to each side of the first photograph, in radians.
 _SWING = math.radians(20)
-#: The longer side of its pictures in pixels, at least.
-_VIDEO_SIDE = 720
+_VIDEO_SIDE = 720  #: The longer side of its pictures in pixels, at least
 
 
 class Instants:
     """Files beside the folders of several instants: for ``html`` ``viewer.html``; for ``ply``
     ``sequence/0000.ply`` and so on, which other programs import as a sequence; for ``mp4`` ``instants.mp4``.
 
-    The cameras of page and video follow the mean of the subject, smoothed over a second.
-
-    Args:
-        count: how many instants there may be.
-        others: names and, once they are known, contents of further files.
+    The cameras of page and video follow the mean of the subject, smoothed over a second. ``count``: how many
+    instants there may be. ``others``: names and, once they are known, contents of further files.
     """
 
     def __init__(self, count: int, options: OutputOptions, others: Iterable[str] = ()):
@@ -72,14 +68,9 @@ class Instants:
         self._seconds += time.perf_counter() - begin
 
     def write(self, directory: Path) -> list[Path]:
-        """Write the files after all instants are added and their own files are written.
-
-        Returns:
-            What was written, the report of these files last; nothing where ``formats`` has none of them.
-
-        Raises:
-            InputError: a file of another origin is in the way.
-        """
+        """Write the files after all instants are added and their own files are written. Returns: What was
+        written, the report of these files last; nothing where ``formats`` has none of them. InputError: a
+        file of another origin is in the way."""
         self.count, self.others = len(self.folders), {n: made for n, made in self.others.items() if made}
         names = self.files
         if not names:
@@ -109,9 +100,8 @@ class Instants:
         return means - means[0]
 
     def _page(self) -> bytes:
-        first, name = self._first, self.folders[0].parent.name
-        facts = (first.gaussians, first.cameras, first.views, first.up, first.center, name)
-        return page(*facts, self._packed, self._path().tolist(), self.options.fps).encode()
+        name, path = self.folders[0].parent.name, self._path().tolist()
+        return page(self._first, name, self._packed, path, self.options.fps).encode()
 
     def _video(self) -> bytes:
         """From a camera that swings about the subject and shows all of it."""
@@ -140,3 +130,35 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copyfile(source, target)
+
+
+# RGB is told apart from video levels by these: a player that guesses the matrix shows other colours.
+_COLORS = (
+    "-vf scale=out_color_matrix=bt709:out_range=tv -colorspace bt709 -color_primaries bt709 -color_trc bt709"
+)
+
+
+def mp4_bytes(pictures: Iterable[np.ndarray], fps: int) -> bytes:
+    """The content of a video of pictures [h, w, 3] uint8 of one size; odd sides get one more row or column.
+    ``pictures``: at least one; they are taken one after another, so that a long video fits in memory."""
+    import imageio_ffmpeg
+
+    pictures = iter(pictures)
+    first = next(pictures)
+    height, width = first.shape[:2]
+    pad = ((0, height % 2), (0, width % 2), (0, 0))
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "video.mp4")
+        writer = imageio_ffmpeg.write_frames(
+            str(path),
+            (width + width % 2, height + height % 2),
+            fps=fps,
+            quality=8,
+            macro_block_size=2,
+            output_params=[*_COLORS.split(), "-movflags", "+faststart"],
+        )
+        writer.send(None)
+        for picture in chain([first], pictures):
+            writer.send(np.ascontiguousarray(np.pad(picture, pad, mode="edge")))
+        writer.close()
+        return path.read_bytes()

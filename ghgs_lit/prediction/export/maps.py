@@ -27,9 +27,7 @@ def png(picture: np.ndarray, text: PngInfo | None = None) -> bytes:
 
 def depth_unit(largest: float) -> float:
     """The length of one grey level of a depth picture: 0.001, and other powers of ten where these fit better.
-
-    So that ``largest`` fits into 16 bits and has at least 1000 levels.
-    """
+    So that ``largest`` fits into 16 bits and has at least 1000 levels."""
     exponent = -3
     while largest > _LEVELS * 10.0**exponent:
         exponent += 1
@@ -39,10 +37,8 @@ def depth_unit(largest: float) -> float:
 
 
 def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Makers of a PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ.
-
-    The NPZ has ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``.
-    """
+    """Makers of a PNG of 16 bits for each view (0: none; the unit stands in the file), then an exact NPZ. The
+    NPZ has ``depth`` [V, H, W] (nan: none), ``intrinsics``, ``extrinsics`` and ``views``."""
     valid = subject.depth_valid.cpu().numpy()
     depth = np.where(valid, subject.depth.float().cpu().numpy(), np.float32(np.nan))
     unit = depth_unit(float(np.max(depth, where=valid, initial=0)))
@@ -50,19 +46,14 @@ def depth_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
     text.add_text("Unit", f"{unit:g} (length of one grey level; 0: no depth)")
     for values in depth:
         yield partial(png, np.nan_to_num(np.round(values / unit)).astype(np.uint16), text)
-    yield partial(
-        _npz,
-        depth=depth,
-        intrinsics=subject.cameras.intrinsics.cpu().numpy(),
-        extrinsics=subject.cameras.extrinsics.cpu().numpy(),
-        views=np.array(subject.views),
-    )
+    cameras = {name: getattr(subject.cameras, name).cpu().numpy() for name in ("intrinsics", "extrinsics")}
 
+    def exact() -> bytes:
+        content = BytesIO()
+        np.savez_compressed(content, depth=depth, **cameras, views=np.array(subject.views))
+        return content.getvalue()
 
-def _npz(**arrays: np.ndarray) -> bytes:
-    content = BytesIO()
-    np.savez_compressed(content, **arrays)
-    return content.getvalue()
+    yield exact
 
 
 def points_ply(subject: ExportedSubject) -> bytes:
@@ -74,13 +65,10 @@ def points_ply(subject: ExportedSubject) -> bytes:
 
 
 def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
-    """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras.
-
-    Both are what ``ghgs predict images=inputs cameras=cameras.json`` reads.
-    """
+    """Makers of PNGs of the views as the model saw them, with matte or mask as alpha, then the cameras. Both
+    are what ``ghgs predict images=inputs cameras=cameras.json`` reads."""
     for image, matte in zip(subject.images, subject.mattes, strict=True):
-        # Colours of a PNG are not premultiplied.
-        colors = to_uint8(unmultiplied(image, matte))
+        colors = to_uint8(unmultiplied(image, matte))  # Colours of a PNG are not premultiplied
         alpha = (matte * 255).round().byte().cpu().numpy()[..., None]
         yield partial(png, np.concatenate([colors, alpha], -1))
     cameras = subject.cameras
@@ -91,18 +79,10 @@ def input_files(subject: ExportedSubject) -> Iterator[Callable[[], bytes]]:
 
 
 def camera_entry(intrinsics: Any, extrinsics: Any, size: tuple[int, int]) -> dict[str, Any]:
-    """A camera of this package's JSON.
-
-    Args:
-        intrinsics, extrinsics: arrays [3, 3] and [4, 4].
-        size: (height, width) of its photograph in pixels.
-    """
-    return {
-        "intrinsics": intrinsics.tolist(),
-        "extrinsics": extrinsics.tolist(),
-        "width": size[1],
-        "height": size[0],
-    }
+    """A camera of this package's JSON. ``intrinsics``, ``extrinsics``: arrays [3, 3] and [4, 4]. ``size``:
+    (height, width) of its photograph in pixels."""
+    matrices = {"intrinsics": intrinsics.tolist(), "extrinsics": extrinsics.tolist()}
+    return {**matrices, "width": size[1], "height": size[0]}
 
 
 def cameras_json(entries: Mapping[str, dict[str, Any]]) -> str:

@@ -89,11 +89,9 @@ def _read(path: Path) -> PlyData:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read such a file as the Gaussians of one subject, without colours that depend on the direction.
-
-    A file without this package's comment is taken for one that was made for 3D Gaussian Splatting's own
-    renderer: a low-pass of 0.3 px^2, not antialiased. InputError: not such a file.
-    """
+    """Read such a file as the Gaussians of one subject, without colours that depend on the direction. A file
+    without this package's comment is taken for one that was made for 3D Gaussian Splatting's own renderer: a
+    low-pass of 0.3 px^2, not antialiased. InputError: not such a file."""
     try:
         content = _read(path)
         vertices = content["vertex"]

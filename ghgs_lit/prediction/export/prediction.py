@@ -17,38 +17,29 @@ from ghgs_lit.metrics import psnr
 from ghgs_lit.metrics.functional import box_of
 from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
 from ghgs_lit.prediction.export.gltf import glb_bytes
+from ghgs_lit.prediction.export.instants import mp4_bytes
 from ghgs_lit.prediction.export.maps import depth_files, depth_unit, input_files, png, points_ply
 from ghgs_lit.prediction.export.page import page
 from ghgs_lit.prediction.export.ply import ply_bytes
 from ghgs_lit.prediction.export.reports import begin_files, end_files, write_file
 from ghgs_lit.prediction.export.subject import ExportedSubject, OutputOptions, exported_subject, file_names
 from ghgs_lit.prediction.export.unseen import unseen
-from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.runs.provenance import versions
 from ghgs_lit.types import Batch, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import palette, sheet
 
-#: The picture to look at.
-SHEET = "sheet.png"
+SHEET = "sheet.png"  #: The picture to look at
 
 
 @dataclass(frozen=True)
 class Format:
-    """One format.
+    """One format. ``contents`` makes functions that make each of the files, in their order and in threads."""
 
-    Attributes:
-        files: their names below the directory of the prediction; one with ``{view}`` or ``{frame}`` stands
-            for a file of each view, or of each picture of the turntable.
-        contents: functions that make each of these files, in their order; they are called in threads.
-        package: that it needs.
-        extra: of this package, which installs it.
-    """
-
-    files: tuple[str, ...]
+    files: tuple[str, ...]  #: their names; ``{view}`` and ``{frame}``: one of each view, of the turntable
     contents: Callable[[ExportedSubject], Iterable[Callable[[], bytes]]]
-    package: str | None = None
-    extra: str = "formats"
+    package: str | None = None  #: that it needs
+    extra: str = "formats"  #: of this package, which installs it
 
     def names(self, views: Sequence[str], frames: int) -> list[str]:
         """The names of all files."""
@@ -63,11 +54,6 @@ class Format:
         return names
 
 
-def _converted(name: str) -> Format:
-    contents = _of_viewers(lambda gaussians: converted(ply_bytes(gaussians), name))
-    return Format((f"gaussians.{CONVERTED[name]}",), contents, "gaussforge")
-
-
 def _one(content: Callable[[ExportedSubject], bytes]) -> Callable[[ExportedSubject], list]:
     """The contents of a format with one file."""
     return lambda subject: [partial(content, subject)]
@@ -80,15 +66,15 @@ def _of_viewers(content: Callable[[Gaussians], bytes]) -> Callable[[ExportedSubj
 
 FORMATS: dict[str, Format] = {
     "ply": Format(("gaussians.ply",), _one(lambda s: ply_bytes(s.stored))),
-    **{name: _converted(name) for name in CONVERTED},
+    **{
+        name: Format((f"gaussians.{suffix}",), _of_viewers(partial(converted, name)), "gaussforge")
+        for name, suffix in CONVERTED.items()
+    },
     "splat": Format(("gaussians.splat",), _of_viewers(lambda g: to_records(g).tobytes())),
     "glb": Format(
         ("gaussians.glb",), lambda s: [partial(glb_bytes, s.for_other_renderers, s.up)], "pygltflib"
     ),
-    "html": Format(
-        ("viewer.html",),
-        _one(lambda s: page(s.gaussians, s.cameras, s.views, s.up, s.center, s.name).encode()),
-    ),
+    "html": Format(("viewer.html",), _one(lambda s: page(s, s.name).encode())),
     "turntable": Format(("turntable/{frame:03d}.png",), lambda s: (partial(png, p) for p in s.turntable)),
     "mp4": Format(
         ("turntable.mp4",),
@@ -136,7 +122,8 @@ def write_prediction(
 ) -> list[Path]:
     """Write the prediction of one subject, ``sheet.png`` to look at and ``report.json`` about it.
 
-    Lengths in the files are in the unit of the batch's cameras.
+    Lengths in the files are in the unit of the batch's cameras. Returns: What was written, ``report.json``
+    last. InputError: several subjects, or a file of another origin is in the way.
 
     Args:
         directory: files that an earlier prediction wrote are replaced, others stay.
@@ -144,12 +131,6 @@ def write_prediction(
             or with the photographs where it has none.
         renderer: draws the turntable, and the input views for the report.
         facts: further plain data for the report, such as the seconds of each stage.
-
-    Returns:
-        What was written, ``report.json`` last.
-
-    Raises:
-        InputError: several subjects, or a file of another origin is in the way.
     """
     subject = exported_subject(batch, prediction, renderer, options)
     names, seconds = output_files(options, subject.views), {}

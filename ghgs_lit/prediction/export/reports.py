@@ -11,8 +11,7 @@ from ghgs_lit.files import write_atomically, write_text_atomically
 from ghgs_lit.readers import read_json
 from ghgs_lit.runs.results import plain
 
-#: The file that lists the others.
-REPORT = "report.json"
+REPORT = "report.json"  #: The file that lists the others
 
 
 def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] = ()) -> None:
@@ -30,13 +29,7 @@ def require_free(directory: Path, names: Iterable[str], inputs: Iterable[Path] =
 
 def begin_files(directory: Path, names: Sequence[str]) -> list[str]:
     """Note files that are about to be written; those of a run that is cut off are known as ours, too.
-
-    Returns:
-        Files of earlier predictions beside these.
-
-    Raises:
-        InputError: a file of another origin is in the way.
-    """
+    Returns: Files of earlier predictions beside these. InputError: a file of another origin is in the way."""
     require_free(directory, names)
     earlier = _beside(directory, names)
     known = {"files": dict.fromkeys(names), "earlier_files": earlier}

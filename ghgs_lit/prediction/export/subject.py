@@ -1,8 +1,7 @@
 """One subject as its files hold it: prediction, photographs and cameras, in the frame of the files."""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,42 +12,62 @@ from torch import Tensor
 from ghgs_lit.errors import choice, require
 from ghgs_lit.geometry.masks import coverage, surface_colors
 from ghgs_lit.geometry.projection import unproject_maps
-from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
+from ghgs_lit.geometry.rotations import multiply_quaternions, quaternion_to_matrix
 from ghgs_lit.prediction.refinement import Change, Descent
 from ghgs_lit.rendering import Renderer
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 from ghgs_lit.visualization.pictures import to_uint8
 from ghgs_lit.visualization.turntable import center_of, pixel_size, subject_points, turntable, up_direction
 
+AXES = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def turn(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
+    """The unit quaternion of the shortest rotation from unit vector ``start`` to ``end``, float64."""
+    start, end = start.double(), end.double()
+    axis = torch.linalg.cross(start, end)
+    quaternion = torch.cat([(1 + start @ end)[None], axis])
+    if quaternion.norm() < 1e-7:  # opposite: half a turn about any axis at right angles
+        other = torch.zeros_like(start).index_fill(0, start.abs().argmin(), 1)
+        quaternion = torch.cat([start.new_zeros(1), torch.linalg.cross(start, other)])
+    return torch.nn.functional.normalize(quaternion, dim=0)
+
+
+def rotate_world(
+    quaternion: Float[Tensor, "4"], gaussians: Gaussians, cameras: Cameras
+) -> tuple[Gaussians, Cameras]:
+    """The same scene in a world rotated by the unit ``quaternion``: every image stays as it is. Colours must
+    not depend on the direction."""
+    quaternion = quaternion.double()
+    rotation = quaternion_to_matrix(quaternion)
+    means = gaussians.means.double() @ rotation.to(gaussians.means.device).mT
+    quaternions = multiply_quaternions(quaternion.to(means.device), gaussians.quaternions.double())
+    extrinsics = cameras.extrinsics.double().clone()
+    extrinsics[..., :3, :3] = extrinsics[..., :3, :3] @ rotation.to(extrinsics.device).mT
+    values = {"means": means.to(gaussians.means.dtype), "quaternions": quaternions.to(gaussians.quaternions)}
+    moved = replace(cameras, extrinsics=extrinsics.to(cameras.extrinsics.dtype))
+    return replace(gaussians, **values), moved
+
+
 #: Square pixels that the renderers of other viewers add to each Gaussian; those are not antialiased.
 VIEWER_LOW_PASS = 0.3
-#: The least standard deviation of a Gaussian in pixels.
-_SMALLEST = 1e-3
+_SMALLEST = 1e-3  #: The least standard deviation of a Gaussian in pixels
 #: How Gaussians for other viewers are brought nearer to ours: what may change, steps, and cameras around the
 #: subject beside the inputs, of which two take part in a step.
 _FIT = {"scales": Change(3.0, 0.15), "opacities": Change(5.0, 0.3), "colors": Change(0.1, 0.006)}
 _FIT_STEPS, _AROUND, _AT_ONCE = 32, 8, 2
-#: Of L1, 1 - SSIM, which would take half of the time, and the silhouette.
-_WEIGHTS = (1.0, 0.0, 0.1)
+_WEIGHTS = (1.0, 0.0, 0.1)  #: Of L1, 1 - SSIM, which would take half of the time, and the silhouette
 
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Choices for the files of a prediction.
+    """Choices for the files of a prediction."""
 
-    Args:
-        formats: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`.
-        up: the axis (``y``, ``-y`` or ``z``) that points up in all files; None: the world of the cameras.
-        smooth: the files of Gaussians hold what a renderer adds in pixels of the photographs.
-        frames: pictures of the turntable.
-        fps: of these, per second of the video.
-    """
-
-    formats: tuple[str, ...] = ("ply",)
-    up: str | None = None
-    smooth: bool = False
-    frames: int = 24
-    fps: int = 12
+    formats: tuple[str, ...] = ("ply",)  #: names of :data:`ghgs_lit.prediction.export.prediction.FORMATS`
+    up: str | None = None  #: axis (``y``, ``-y``, ``z``) that points up in files; None: as of the cameras
+    smooth: bool = False  #: the files of Gaussians hold what a renderer adds in pixels of the photographs
+    frames: int = 24  #: pictures of the turntable
+    fps: int = 12  #: of these, per second of the video
 
     def __post_init__(self):
         choice("up", self.up, (None, *AXES))
@@ -56,20 +75,16 @@ class OutputOptions:
 
 
 def smoothed(gaussians: Gaussians, pixel: float) -> Gaussians:
-    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide.
-
-    These are ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
-    Gaussians, for others the geometric mean of their axes.
-    """
+    """Gaussians that hold what a renderer adds in pixels of the photographs, ``pixel`` metres wide. These are
+    ``low_pass`` square pixels, and with ``antialiased`` the opacity that they take: exact for round
+    Gaussians, for others the geometric mean of their axes."""
     variances = gaussians.scales.square()
     wider = variances + gaussians.low_pass * pixel**2
     opacities = gaussians.opacities
     if gaussians.antialiased:
         ratio = variances / torch.where(wider > 0, wider, 1.0)
         opacities = opacities * ratio.prod(-1).pow(1 / 3)
-    return dataclasses.replace(
-        gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False
-    )
+    return replace(gaussians, scales=wider.sqrt(), opacities=opacities, low_pass=0.0, antialiased=False)
 
 
 def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
@@ -84,25 +99,22 @@ def for_other_renderers(gaussians: Gaussians, pixel: float) -> Gaussians:
     drawn = smoothed(gaussians, pixel)
     variances = drawn.scales.square() - VIEWER_LOW_PASS * pixel**2
     scales = variances.clamp(min=(_SMALLEST * pixel) ** 2).sqrt()
-    return dataclasses.replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
+    return replace(drawn, scales=scales, low_pass=VIEWER_LOW_PASS)
 
 
-def fitted(
-    gaussians: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer
-) -> Gaussians:
-    """``gaussians`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
-
-    ``cameras``: sets of cameras [n], which take part in turn.
-    """
+def fitted(theirs: Gaussians, ours: Gaussians, cameras: Sequence[Cameras], renderer: Renderer) -> Gaussians:
+    """``theirs`` with scales, opacities and colours with which they are drawn more as ``ours`` are.
+    ``cameras``: sets of cameras [n], which take part in turn."""
     drawn = [renderer(ours, some[None], background=0.0) for some in cameras]
-    search = Descent(gaussians, None, _FIT)
+    search = Descent(theirs, None, _FIT)
     for step in range(_FIT_STEPS):
         lap, among = divmod(step, len(cameras))
         seen, wanted = cameras[among], drawn[among]
         count = seen.extrinsics.shape[0]
         # Far apart, so that the two see different sides.
         views = [(lap + part * max(count // _AT_ONCE, 1)) % count for part in range(_AT_ONCE)]
-        search.step(renderer, wanted.image[:, views], wanted.alpha[:, views], seen[views][None], _WEIGHTS)
+        part = (wanted.image[:, views], wanted.alpha[:, views], seen[views][None])
+        search.step(renderer, part, _WEIGHTS)
     return search.gaussians
 
 
@@ -138,15 +150,9 @@ class ExportedSubject:
 
     @cached_property
     def stored(self) -> Gaussians:
-        """The Gaussians as the PLY holds them, which says what image they were made for.
-
-        A renderer adds ``low_pass`` square pixels of its own screen to a Gaussian that was made for the
-        photographs' pixels; with ``smooth`` the file has these already (as the 3D smoothing of
-        Mip-Splatting, Yu et al. 2024), and a larger screen shows no gaps.
-        """
-        if not self.options.smooth:
-            return self.gaussians
-        return smoothed(self.gaussians, self.pixel)
+        """The Gaussians as the PLY holds them, which says what image they were made for; with ``smooth`` they
+        hold what a renderer adds (as of Mip-Splatting, Yu et al. 2024): a larger screen shows no gaps."""
+        return smoothed(self.gaussians, self.pixel) if self.options.smooth else self.gaussians
 
     @cached_property
     def for_other_renderers(self) -> Gaussians:
@@ -179,11 +185,8 @@ class ExportedSubject:
     def turntable(self) -> list[np.ndarray]:
         """Pictures [h, w, 3] uint8 from all around."""
         orbit = turntable(self.cameras, self.options.frames, self.body)
-        images = (
-            self.renderer(self.gaussians, orbit[frame : frame + 1][None]).image[0, 0]
-            for frame in range(self.options.frames)
-        )
-        return [to_uint8(image) for image in images]
+        seen = (orbit[frame : frame + 1][None] for frame in range(self.options.frames))
+        return [to_uint8(self.renderer(self.gaussians, cameras).image[0, 0]) for cameras in seen]
 
 
 def exported_subject(

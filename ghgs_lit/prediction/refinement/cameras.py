@@ -1,19 +1,14 @@
 """Cameras of a capture, corrected until the photographs agree with one another.
 
-A calibration that is off by a pixel or two costs a model several dB: views contradict one another. First
-cameras move and zoom until silhouettes explain one another (:mod:`ghgs_lit.prediction.refinement.coherence`);
-where a prediction does not agree that this is better, as with wrong masks, they stay. Then predictions say
-more: what the other views say of a view is drawn with that view's camera and compared with its photograph,
-and the camera moves until they fit. A view's own Gaussians take no part, as they reproduce its photograph
-wherever its camera is. Bundle adjustment with a rendering loss is that of BARF (Lin et al., ICCV 2021).
-
-Photographs do not tell where the whole rig is, so cameras only move beside one another
-(:mod:`ghgs_lit.geometry.rotations`); where a minority of them explains the silhouettes, beside the others.
+First cameras move and zoom until silhouettes explain one another
+(:mod:`ghgs_lit.prediction.refinement.coherence`); where a prediction does not agree that this is better, as
+with wrong masks, they stay. Then what the other views say of a view is drawn with that view's camera, which
+moves until it fits the photograph (bundle adjustment as of BARF, Lin et al., ICCV 2021). Photographs do not
+tell where the whole rig is, so cameras only move beside one another (:mod:`ghgs_lit.geometry.rotations`).
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,15 +24,14 @@ from ghgs_lit.prediction.refinement.coherence import coherent_cameras
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction, Rendering
 
 Renderer = Callable[..., Rendering]
+#: Of the elements of a batch: numbers, and which of its cameras.
+Numbers, Which = Float[Tensor, " B"], Bool[Tensor, "B V"]
 
 #: Steps of the optimiser in each round, and its first step: radians, and half heights of the subject.
 _STEPS, _RATE = 15, 0.006
-#: Weight of the silhouettes beside that of colours.
-_OUTLINE = 0.5
-#: Metres between depths of one surface.
-_SAME = 0.05
-#: Weight of the squared motion.
-_STAY = 4.0
+_OUTLINE = 0.5  #: Weight of the silhouettes beside that of colours
+_SAME = 0.05  #: Metres between depths of one surface
+_STAY = 4.0  #: Weight of the squared motion
 #: Part of the disagreement that the first round and any later one must take away for its cameras to be kept.
 #: With exact cameras it is up to 0.01, 0.02 from above; with cameras that are off by a pixel 0.02 to 0.2.
 #: The first also holds for cameras that silhouettes propose.
@@ -49,10 +43,7 @@ _TELLING, _EXACT, _DOUBTED = 4, 1.5e-4, 0.05
 
 @dataclass(frozen=True)
 class _Views:
-    """The ``n`` views of a batch, each with the Gaussians that are drawn in it and its photograph.
-
-    ``owner`` is the number of the view that each of the ``N`` Gaussians is drawn in.
-    """
+    """The ``n`` views of a batch, each with its photograph and the Gaussians whose ``owner`` it is."""
 
     gaussians: Gaussians
     owner: Int[Tensor, " N"]
@@ -80,11 +71,8 @@ class CameraRefinement:
         self.rounds, self.predict, self.renderer, self.shared = rounds, predict, renderer, shared
 
     def __call__(self, batch: Batch) -> Batch:
-        """The batch with corrected cameras; targets stay as they are.
-
-        Args:
-            batch: photographs, masks and cameras, of two views or more.
-        """
+        """The batch with corrected cameras; targets stay as they are. ``batch``: photographs, masks and
+        cameras, of two views or more."""
         frame = Frame.of(batch).shared if self.shared else Frame.of(batch)
         inside, moved, free, first = self._coherent(frame.enter(batch))
         for _ in range(self.rounds):
@@ -94,44 +82,46 @@ class CameraRefinement:
             cameras, is_better = self._corrected(prediction, inside, free, worth)
             if not bool(is_better.any()):
                 break
-            inside, moved = dataclasses.replace(inside, cameras=cameras), moved | is_better
-        # To the frame and back is not exact.
-        left = frame.leave_cameras(inside.cameras, batch.cameras)
-        return dataclasses.replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
+            inside, moved = replace(inside, cameras=cameras), moved | is_better
+        left = frame.leave_cameras(inside.cameras, batch.cameras)  # to the frame and back is not exact
+        return replace(batch, cameras=_chosen(moved[:, None] & free, left, batch.cameras))
 
     @torch.no_grad()
-    def _coherent(
-        self, batch: Batch
-    ) -> tuple[Batch, Bool[Tensor, " B"], Bool[Tensor, "B V"], Float[Tensor, " B"]]:
-        """Elements with coherent silhouettes, which agree better for it, and what a first round must gain.
-
-        The third is which cameras may be wrong: all, but where silhouettes and prediction agree on a few.
-        """
+    def _coherent(self, batch: Batch) -> tuple[Batch, Bool[Tensor, " B"], Which, Numbers]:
+        """Elements with coherent silhouettes; which agree better for it; which cameras may be wrong (all, but
+        where silhouettes and prediction agree on a few); and what a first round must gain."""
         cameras, free, distance = coherent_cameras(batch, self.shared)
         are_right = (distance < _EXACT) & (batch.masks.shape[1] >= _TELLING)
         first = torch.where(are_right, _DOUBTED, _FIRST)
         moved = (cameras.extrinsics != batch.cameras.extrinsics).flatten(1).any(1)
         if not bool(moved.any()):
             return batch, moved, free, first
-        proposal = dataclasses.replace(batch, cameras=cameras)
+        proposal = replace(batch, cameras=cameras)
         before, after = map(self._disagreement, (batch, proposal))
         is_better = moved & (after < (1 - _FIRST) * before)
         free = free | ~is_better[:, None]
         cameras = _chosen(is_better[:, None] & free, cameras, batch.cameras)
-        return dataclasses.replace(batch, cameras=cameras), is_better, free, first
+        return replace(batch, cameras=cameras), is_better, free, first
 
-    def _disagreement(self, batch: Batch) -> Float[Tensor, " B"]:
+    def _disagreement(self, batch: Batch) -> Numbers:
         """The loss of the rounds with the cameras as they are."""
         views = _views(self.predict(batch), batch)
         return self._loss(self.renderer(views.gaussians, views.cameras, background=0.0), views, batch)
 
-    def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Float[Tensor, " B"]:
-        """:func:`_loss`, or its mean over the instants."""
-        loss = _loss(drawn, views, batch)
+    def _loss(self, drawn: Rendering, views: _Views, batch: Batch) -> Numbers:
+        """L1 of colours and silhouettes for each pixel of an element's subject, or its mean over instants."""
+        image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
+        # Where no other view shows the surface of the photograph, one sees through to what lies behind it.
+        same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
+        errors = same * (image - views.photographs).abs().mean(1)
+        errors = errors + _OUTLINE * (alpha - views.silhouettes).abs()
+        shape = batch.masks.shape[:2]
+        subject, errors = (each.reshape(*shape, -1).sum((1, 2)) for each in (views.silhouettes, errors))
+        loss = errors / torch.where(subject > 0, subject, 1)
         return loss.mean().expand(len(loss)) if self.shared else loss
 
     def _corrected(
-        self, prediction: Prediction, batch: Batch, free: Bool[Tensor, "B V"], worth: Float[Tensor, " B"]
+        self, prediction: Prediction, batch: Batch, free: Which, worth: Numbers
     ) -> tuple[Cameras, Bool[Tensor, " B"]]:
         """Cameras after one round, and which elements agree better by ``worth``; those of the others stay."""
         cameras, losses = batch.cameras, []
@@ -155,26 +145,22 @@ class CameraRefinement:
         with exact(axes.device.type):
             motion = _of_free(raw.detach().expand(len(axes), -1, -1), axes, free)
             extrinsics = after_motions(cameras.extrinsics, motion, axes.new_zeros(3), HEIGHT / 2)
-        corrected = dataclasses.replace(cameras, extrinsics=extrinsics)
+        corrected = replace(cameras, extrinsics=extrinsics)
         return _chosen(is_better[:, None] & free, corrected, cameras), is_better
 
 
-def _of_free(
-    motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Bool[Tensor, "B V"]
-) -> Float[Tensor, "B V 6"]:
+def _of_free(motions: Float[Tensor, "B V 6"], axes: Float[Tensor, "B V 3"], free: Which) -> Tensor:
     """Motions of the free cameras: beside one another where all are, and beside the others where some are."""
     all_are = free.all(1)[:, None, None]
     return torch.where(all_are, without_common(motions, axes), motions * free[..., None])
 
 
-def _chosen(which: Bool[Tensor, "B V"], first: Cameras, second: Cameras) -> Cameras:
+def _chosen(which: Which, first: Cameras, second: Cameras) -> Cameras:
     """The first cameras of some views, the second of the others."""
     which = which[..., None, None]
-    return dataclasses.replace(
-        first,
-        intrinsics=torch.where(which, first.intrinsics, second.intrinsics),
-        extrinsics=torch.where(which, first.extrinsics, second.extrinsics),
-    )
+    lenses = torch.where(which, first.intrinsics, second.intrinsics)
+    poses = torch.where(which, first.extrinsics, second.extrinsics)
+    return replace(first, intrinsics=lenses, extrinsics=poses)
 
 
 def pixels_moved(before: Batch, after: Batch) -> list[list[float]]:
@@ -201,35 +187,17 @@ def _views(prediction: Prediction, batch: Batch) -> _Views:
     counts = tuple(map(len, kept))
     others = gaussians.select(torch.cat(kept), counts)
     if others.metre is not None:
-        others = dataclasses.replace(others, metre=others.metre.repeat_interleave(v))
+        others = replace(others, metre=others.metre.repeat_interleave(v))
     owner = torch.repeat_interleave(torch.tensor(counts, device=element.device))
     cameras = batch.cameras
     lenses, poses = (matrix.flatten(0, 1)[:, None] for matrix in (cameras.intrinsics, cameras.extrinsics))
     apart = Cameras(lenses, poses, cameras.height, cameras.width)
-    photographs = at_least_float32(on_black(batch)).flatten(0, 1)
-    return _Views(
-        others,
-        owner,
-        apart,
-        photographs,
-        coverage(batch).flatten(0, 1),
-        prediction.depth.detach().flatten(0, 1),
-    )
+    maps = (at_least_float32(on_black(batch)), coverage(batch), prediction.depth.detach())
+    return _Views(others, owner, apart, *(each.flatten(0, 1) for each in maps))
 
 
 def _moved(views: _Views, motion: Float[Tensor, "B V 6"]) -> Gaussians:
     """The Gaussians of each view, moved as if its camera had moved the other way; their axes stay."""
     rotations, shifts = (value.flatten(0, 1)[views.owner] for value in rigid(motion, HEIGHT / 2))
     means = (rotations @ views.gaussians.means[..., None])[..., 0] + shifts
-    return dataclasses.replace(views.gaussians, means=means)
-
-
-def _loss(drawn: Rendering, views: _Views, batch: Batch) -> Float[Tensor, " B"]:
-    """L1 of colours and silhouettes of each element, for each pixel of its subject."""
-    image, alpha = drawn.image[:, 0], drawn.alpha[:, 0, 0]
-    # Where no other view shows the surface of the photograph, one sees through to what lies behind it.
-    same = (drawn.depth.detach()[:, 0, 0] - views.depths).abs() < _SAME
-    errors = same * (image - views.photographs).abs().mean(1) + _OUTLINE * (alpha - views.silhouettes).abs()
-    shape = batch.masks.shape[:2]
-    subject, errors = (each.reshape(*shape, -1).sum((1, 2)) for each in (views.silhouettes, errors))
-    return errors / torch.where(subject > 0, subject, 1)
+    return replace(views.gaussians, means=means)

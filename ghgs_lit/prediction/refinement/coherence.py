@@ -6,10 +6,9 @@ near the outlines have none: how far their best points lie beside the other silh
 steps make small. This needs no model and no surface that two photographs share.
 """
 
-import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from itertools import combinations
 from operator import add
@@ -27,8 +26,13 @@ from ghgs_lit.kernels.precision import exact
 from ghgs_lit.prediction.refinement.outlines import QUICK, TO, Outlines
 from ghgs_lit.types import Batch, Cameras
 
-#: Depths along a ray.
-_DEPTHS = 48
+Lens, Pose = Float[Tensor, "V 3 3"], Float[Tensor, "V 4 4"]
+#: Of ``K`` instants, whose crops have lenses of their own.
+Lenses, Middles = Float[Tensor, "K V 3 3"], Float[Tensor, "K 3"]
+#: One of each camera, and one of each ray.
+Which, Numbers, Points = Bool[Tensor, " V"], Int[Tensor, " R"], Float[Tensor, "R 3"]
+
+_DEPTHS = 48  #: Depths along a ray
 #: Mean distance in pixels of rays near outlines below which silhouettes explain one another.
 _COHERENT = 5e-4
 #: Weight of the squared steps, in pixels, beside the mean of the squared distances of the rays; and of those
@@ -45,10 +49,9 @@ _AS_WELL, _TELLING, _BUMPED, _REST = 1.5, 4, 2e-3, 0.02
 class _Phase:
     """Some steps, what they make small, and the weight of a ray whose distance is ``r`` pixels.
 
-    First, rays must meet the other silhouettes: those that do have no weight, those that miss them by more
-    than ``scale`` one that falls with 1 / r. Then, they must lie as deep in the others as in their
-    own: outlines seen from the front and from behind show nearly the same points. Rays that differ by more
-    than ``scale`` lose their weight (Geman and McClure).
+    First, rays must meet the other silhouettes: the weight of those that miss them by more than ``scale``
+    falls with 1 / r. Then, they must lie as deep in the others as in their own, as outlines from the front
+    and from behind do; those that differ by more than ``scale`` lose their weight (Geman and McClure).
     """
 
     steps: int
@@ -70,13 +73,11 @@ _MEET, _LIE = _Phase(12, TO, 1.0, is_exact=False), _Phase(6, 3.0, 0.3, is_exact=
 
 @dataclass(frozen=True)
 class _Alignment:
-    """Cameras after some steps of those that are ``free``, and the mean distance of rays before each step.
+    """Cameras after some steps of those that are ``free``, and the mean distance of rays before each step."""
 
-    Crops of ``K`` instants have lenses of their own, which zoom alike."""
-
-    lens: Float[Tensor, "K V 3 3"]
-    pose: Float[Tensor, "V 4 4"]
-    free: Bool[Tensor, " V"]
+    lens: Lenses
+    pose: Pose
+    free: Which
     distances: tuple[float, ...] = ()
 
     def after(self, phase: _Phase, silhouettes: "_Silhouettes") -> "_Alignment":
@@ -90,10 +91,8 @@ class _Alignment:
         return found
 
     def shows_motions_from(self, start: "_Alignment") -> bool:
-        """Whether the subject moves by more than it grows in the image of each free camera.
-
-        Growth is that of a focal length, which is only known beside those of the others: then all are free.
-        """
+        """Whether the subject moves by more than it grows in the image of each free camera: focal lengths are
+        known only beside one another."""
         scale, before = (each.lens[0, :, 0, 0] / each.pose[:, 2, 3] for each in (self, start))
         seen, was = (s[:, None] * each.pose[:, :2, 3] for s, each in ((scale, self), (before, start)))
         growth = HEIGHT / 2 * before * (scale / before).log().abs()
@@ -105,12 +104,17 @@ def contradiction(batch: Batch) -> Float[Tensor, " B"]:
     """How far rays near outlines pass beside other silhouettes, in pixels on average: a quick look at a batch
     as of :func:`coherent_cameras`. With exact cameras it is up to 0.0025, with ones off by 1.5 0.007 to 0.09.
     """
-    parts, found = (coverage(batch), batch.cameras.intrinsics, batch.cameras.extrinsics), []
-    for mattes, lens, pose in zip(*(part.float().cpu() for part in parts), strict=True):
+    found = []
+    for mattes, lens, pose in zip(*_on_cpu(batch), strict=True):
         outlines = Outlines.of(mattes, QUICK)
         depth = _best_points(outlines, lens, pose, outlines.view, outlines.pixels)[2]
         found.append(-depth.clamp(max=0).sum() / max(len(depth), 1))
     return torch.stack(found)
+
+
+def _on_cpu(batch: Batch) -> list[Tensor]:
+    parts = (coverage(batch), batch.cameras.intrinsics, batch.cameras.extrinsics)
+    return [part.float().cpu() for part in parts]
 
 
 @torch.no_grad()
@@ -125,16 +129,13 @@ def coherent_cameras(
     Also returned is which cameras were free to move, and how far rays near outlines pass beside other
     silhouettes, in pixels on average, with the given cameras: 0 to 0.00014 with exact cameras and mattes,
     0.0001 to 0.0004 with four cameras that are off by up to half a pixel, 0.002 by one, 0.04 to 0.08 by
-    three; infinite where no silhouette has an outline.
-
-    Args:
-        batch: in the subject's frame (:class:`ghgs_lit.geometry.frame.Frame`).
-        shared: the elements are instants of one rig, in one frame; its cameras move and zoom alike in all.
+    three; infinite where no silhouette has an outline. ``batch``: in the subject's frame
+    (:class:`ghgs_lit.geometry.frame.Frame`). ``shared``: the elements are instants of one rig, in one frame;
+    its cameras move and zoom alike in all.
     """
     cameras = batch.cameras
-    parts = (coverage(batch), cameras.intrinsics, cameras.extrinsics)
     # A small problem of many short steps, and distances to outlines are computed on a CPU.
-    mattes, lens, pose = (part.float().cpu() for part in parts)
+    mattes, lens, pose = _on_cpu(batch)
     middle = subject_center(batch.masks, cameras).float().cpu() if shared else pose.new_zeros(len(pose), 3)
     each = [slice(None)] if shared else [slice(b, b + 1) for b in range(len(pose))]
     with exact("cpu"):
@@ -142,18 +143,14 @@ def coherent_cameras(
     lenses, poses, free, distances = zip(*rigs, strict=True)
     count, device = len(pose) // len(rigs), batch.masks.device
     poses, free = (torch.stack(found).repeat_interleave(count, 0) for found in (poses, free))
-    moved = dataclasses.replace(
-        cameras, intrinsics=torch.cat(lenses).to(cameras.intrinsics), extrinsics=poses.to(cameras.extrinsics)
-    )
+    lenses, poses = torch.cat(lenses).to(cameras.intrinsics), poses.to(cameras.extrinsics)
+    moved = replace(cameras, intrinsics=lenses, extrinsics=poses)
     return moved, free.to(device), torch.tensor(distances, device=device).repeat_interleave(count)
 
 
 def _coherent(
-    mattes: Float[Tensor, "K V H W"],
-    lens: Float[Tensor, "K V 3 3"],
-    pose: Float[Tensor, "V 4 4"],
-    middle: Float[Tensor, "K 3"],
-) -> tuple[Float[Tensor, "K V 3 3"], Float[Tensor, "V 4 4"], Bool[Tensor, " V"], float]:
+    mattes: Float[Tensor, "K V H W"], lens: Lenses, pose: Pose, middle: Middles
+) -> tuple[Lenses, Pose, Which, float]:
     """Of one rig: intrinsics, extrinsics, which were free, and the mean distance with the given ones."""
     silhouettes = _Silhouettes(tuple(Outlines.of(each) for each in mattes), middle)
     every = torch.ones(len(pose), dtype=torch.bool)
@@ -176,7 +173,7 @@ def _coherent(
     return found.lens, found.pose, found.free, given.distance
 
 
-def _minorities(equations: "_Equations", count: int) -> Iterator[Bool[Tensor, " V"]]:
+def _minorities(equations: "_Equations", count: int) -> Iterator[Which]:
     """Of ``count`` cameras the one that explains most when it alone moves, the two, and so on to half."""
     for size in range(1, (count + 1) // 2):
         sets = [
@@ -200,16 +197,16 @@ class _Equations:
         return self.total / max(self.rays, 1)
 
     def __add__(self, other: "_Equations") -> "_Equations":
-        sums = (getattr(self, f.name) + getattr(other, f.name) for f in dataclasses.fields(self))
+        sums = (getattr(self, f.name) + getattr(other, f.name) for f in fields(self))
         return _Equations(*sums)
 
-    def solved(self, free: Bool[Tensor, " V"]) -> Float[Tensor, "V 7"]:
+    def solved(self, free: Which) -> Float[Tensor, "V 7"]:
         """The step of the free cameras; that of the others is 0."""
         index = free.repeat_interleave(7).nonzero()[:, 0]
         steps = torch.linalg.solve(self.normal[index][:, index], self.right[index])
         return torch.zeros_like(self.right).index_copy(0, index, steps).view(-1, 7)
 
-    def gain(self, free: Bool[Tensor, " V"]) -> float:
+    def gain(self, free: Which) -> float:
         """What the step of the free cameras takes from the squared distances, to first order."""
         return float((self.solved(free).flatten() * self.right).sum())
 
@@ -219,24 +216,16 @@ class _Silhouettes:
     """Those of each instant, and where its subject is in the frame."""
 
     outlines: tuple[Outlines, ...]
-    middle: Float[Tensor, "K 3"]
+    middle: Middles
 
-    def equations(
-        self, lens: Float[Tensor, "K V 3 3"], pose: Float[Tensor, "V 4 4"], phase: _Phase
-    ) -> "_Equations":
-        """The sum over the instants."""
+    def equations(self, lens: Lenses, pose: Pose, phase: _Phase) -> "_Equations":
         pixel = _pixel(lens, pose)
         parts = zip(self.outlines, lens, self.middle, strict=True)
         return reduce(add, (_equations(*part, pose, phase, pixel) for part in parts))
 
 
 def _equations(
-    outlines: Outlines,
-    lens: Float[Tensor, "V 3 3"],
-    middle: Float[Tensor, " 3"],
-    pose: Float[Tensor, "V 4 4"],
-    phase: _Phase,
-    pixel: Float[Tensor, ""],
+    outlines: Outlines, lens: Lens, middle: Float[Tensor, " 3"], pose: Pose, phase: _Phase, pixel: Tensor
 ) -> _Equations:
     """The unknowns are motions about the frame's origin and zooms of all cameras, each in about a pixel."""
     count = len(pose)
@@ -259,20 +248,15 @@ def _equations(
     return _Equations(normal, -(weighted.mT @ distances), len(distances), float(distances.abs().sum()))
 
 
-def _pixel(lens: Float[Tensor, "K V 3 3"], pose: Float[Tensor, "V 4 4"]) -> Float[Tensor, ""]:
+def _pixel(lens: Lenses, pose: Pose) -> Float[Tensor, ""]:
     """Pixels of half a height of the subject."""
     return HEIGHT / 2 * (lens[..., 0, 0] / pose[:, 2, 3]).mean()
 
 
-def _stepped(
-    steps: Float[Tensor, "V 7"],
-    lens: Float[Tensor, "K V 3 3"],
-    pose: Float[Tensor, "V 4 4"],
-    are_all_free: bool,
-) -> tuple[Float[Tensor, "K V 3 3"], Float[Tensor, "V 4 4"]]:
+def _stepped(steps: Float[Tensor, "V 7"], lens: Lenses, pose: Pose, are_all: bool) -> tuple[Lenses, Pose]:
     """Intrinsics and extrinsics after a step; where all cameras are free they move beside one another."""
     motions, zooms = (steps / _pixel(lens, pose)).split((6, 1), -1)
-    if are_all_free:
+    if are_all:
         motions, zooms = without_common(motions, pose[:, 2, :3]), zooms - zooms.mean(0)
     zoomed = lens.clone()
     zoomed[..., [0, 1], [0, 1]] *= zooms.exp()
@@ -280,15 +264,10 @@ def _stepped(
 
 
 def _best_points(
-    outlines: Outlines,
-    lens: Float[Tensor, "V 3 3"],
-    pose: Float[Tensor, "V 4 4"],
-    view: Int[Tensor, " R"],
-    pixels: Float[Tensor, "R 2"],
-) -> tuple[Float[Tensor, "R 3"], Int[Tensor, " R"], Float[Tensor, " R"]]:
-    """Points deepest in the other silhouettes, one of each ray, with the silhouette that it is least deep in.
-    Returns: The points, the numbers of these silhouettes, and the signed depths in them in pixels. ``view``:
-    the silhouette of each ray, in ascending order."""
+    outlines: Outlines, lens: Lens, pose: Pose, view: Numbers, pixels: Float[Tensor, "R 2"]
+) -> tuple[Points, Numbers, Float[Tensor, " R"]]:
+    """The point of each ray (of silhouettes in ascending order) that is deepest in the other silhouettes, the
+    one that it is least deep in, and its signed depth in that in pixels."""
     centers = -(pose[:, :3, :3].mT @ pose[:, :3, 3:])[..., 0]
     along = torch.linspace(-HEIGHT / 2, HEIGHT / 2, _DEPTHS).to(pixels)
     views, points = range(len(pose)), []
@@ -311,13 +290,7 @@ def _best_points(
     return points, other, depth
 
 
-def _gradients(
-    outlines: Outlines,
-    lens: Float[Tensor, "V 3 3"],
-    pose: Float[Tensor, "V 4 4"],
-    points: Float[Tensor, "R 3"],
-    other: Int[Tensor, " R"],
-) -> Float[Tensor, "R 3"]:
+def _gradients(outlines: Outlines, lens: Lens, pose: Pose, points: Points, other: Numbers) -> Points:
     """Derivatives of the distances by the positions of the points, in the world's axes."""
     seen, depth = project(points, lens[other], pose[other])
     slopes = outlines.slopes(other, seen) * lens[other][:, [0, 1], [0, 1]]
@@ -328,16 +301,10 @@ def _gradients(
 
 
 def _rows(
-    points: Float[Tensor, "R 3"],
-    gradients: Float[Tensor, "R 3"],
-    pose: Float[Tensor, "R 4 4"],
-    middle: Float[Tensor, " 3"],
+    points: Points, gradients: Points, pose: Float[Tensor, "R 4 4"], middle: Float[Tensor, " 3"]
 ) -> Float[Tensor, "R 7"]:
-    """Derivatives of the distances by small changes of a camera.
-
-    These are rotation vectors of the points, which lie around ``middle``, their shifts in half heights, and
-    the logarithm of the focal length, which moves points away from the optical axis.
-    """
+    """Derivatives of the distances by a camera's rotation vector around the points, its shift in half heights
+    and the logarithm of its focal length, which moves points away from the optical axis."""
     across = world_to_camera(points, pose)[:, :2]
     zoom = ((pose[:, :3, :3] @ gradients[..., None])[:, :2, 0] * across).sum(-1, keepdim=True)
     return torch.cat((torch.linalg.cross(points + middle, gradients), HEIGHT / 2 * gradients, zoom), -1)

@@ -11,16 +11,12 @@ from torch import Tensor
 from ghgs_lit.geometry.masks import signed_distance, soft_signed_distance
 from ghgs_lit.geometry.projection import pixel_centers, sample
 
-#: Size of the distance maps over that of the photographs.
-_FINER = 4
-#: Farther than this from an outline, in pixels, distances are all the same.
-_FAR = 20.0
-#: Pixels inside their outline whose rays are tried: from, and to.
-_FROM, TO = 0.25, 8.0
+_FINER = 4  #: Size of the distance maps over that of the photographs
+_FAR = 20.0  #: Farther than this from an outline, in pixels, distances are all the same
+_FROM, TO = 0.25, 8.0  #: Pixels inside their outline whose rays are tried: from, and to
 #: Of a look: size of the maps, pixels inside outlines to which rays are tried, and of how many one is.
 CAREFUL, QUICK = (_FINER, TO, 1), (1, 1.5, 2)
-#: Half the width in pixels over which a slope of a distance map is taken.
-_REACH = 0.75
+_REACH = 0.75  #: Half the width in pixels over which a slope of a distance map is taken
 
 
 @dataclass(frozen=True)
@@ -51,24 +47,14 @@ class Outlines:
 
     def at(self, view: Int[Tensor, "*n"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
         """Distances at pixels; beyond the photograph those of its border, where a subject may go on."""
-        height, width = self.size
         half = 0.5 / self.finer
-        within = [
-            side.clamp(half, whole - half)
-            for side, whole in zip(pixels.unbind(-1), (width, height), strict=True)
-        ]
-        return sample(self.maps, view, self.finer * torch.stack(within, -1))[..., 0]
+        within = torch.minimum(pixels.clamp(min=half), pixels.new_tensor(self.size[::-1]) - half)
+        return sample(self.maps, view, self.finer * within)[..., 0]
 
     def along(
-        self,
-        view: int,
-        lens: Float[Tensor, "3 3"],
-        pose: Float[Tensor, "4 4"],
-        start: Float[Tensor, "3"],
-        ahead: Float[Tensor, "R 3"],
-        depths: Float[Tensor, " D"],
+        self, view: int, lens: Tensor, pose: Tensor, start: Tensor, ahead: Tensor, depths: Float[Tensor, " D"]
     ) -> Float[Tensor, "R D"]:
-        """Distances in one silhouette at ``start + depth * ahead``."""
+        """Distances in a silhouette (lens [3, 3], pose [4, 4]) at ``start`` [3] + depth ``ahead`` [R, 3]."""
         # From -1 to 1 over the photograph; what is seen of a ray is a ratio of two lines.
         height, width = self.size
         onto = lens.new_tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]]) @ lens
@@ -76,13 +62,10 @@ class Outlines:
         x, y, z = (first[axis] + slope[:, axis, None] * depths for axis in range(3))
         z = torch.where(z > 0, z, 1)
         places = torch.stack((x / z, y / z), -1)[None]
-        return F.grid_sample(self.maps[view : view + 1], places, padding_mode="border", align_corners=False)[
-            0, 0
-        ]
+        one = self.maps[view : view + 1]
+        return F.grid_sample(one, places, padding_mode="border", align_corners=False)[0, 0]
 
     def slopes(self, view: Int[Tensor, " n"], pixels: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
         steps = _REACH * torch.eye(2).to(pixels)
-        return torch.stack(
-            [(self.at(view, pixels + step) - self.at(view, pixels - step)) / (2 * _REACH) for step in steps],
-            -1,
-        )
+        rises = [self.at(view, pixels + step) - self.at(view, pixels - step) for step in steps]
+        return torch.stack(rises, -1) / (2 * _REACH)

@@ -2,14 +2,12 @@
 
 A prediction is near enough that a few steps suffice, and every change is bounded, so that what no photograph
 shows stays as predicted. Photographs that are reproduced say nothing of other views (with wrong geometry they
-are reproduced, too), so :meth:`Refinement.report` holds one out and predicts again from the others. To stop
-where that one is best was worse than a fixed number of steps: fewer inputs want fewer steps.
+are reproduced, too), so :meth:`Refinement.report` holds one out and predicts again from the others.
 """
 
-import dataclasses
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,7 +20,7 @@ from ghgs_lit.metrics.functional import psnr, ssim
 from ghgs_lit.types import Batch, Cameras, Gaussians, Rendering
 
 Renderer = Callable[..., Rendering]
-Predict = Callable[[Batch], Gaussians]
+Seen = tuple[Tensor, Tensor, Cameras]  #: Photographs on black, silhouettes and cameras
 
 
 @dataclass(frozen=True)
@@ -33,8 +31,7 @@ class Change:
     rate: float
 
 
-#: Of a mean along each axis, in footprints of its pixel; of the logarithm of a scale; of the logit of an
-#: opacity; of a colour. Near enough to a prediction that what no photograph shows stays as predicted.
+#: Near enough to a prediction that what no photograph shows stays as predicted.
 NEAR = {
     "means": Change(1.0, 0.02),
     "scales": Change(1.0, 0.02),
@@ -45,16 +42,14 @@ NEAR = {
 Weights = tuple[float, float, float]
 WEIGHTS: Weights = (0.8, 0.2, 0.1)
 
-BeforeAfter = tuple[float, float]
-
 
 @dataclass(frozen=True)
 class Report:
     """PSNR in dB before and after: of the inputs, and of one that the others predicted (of four or more)."""
 
     steps: int
-    inputs: BeforeAfter
-    held_out: BeforeAfter | None
+    inputs: tuple[float, float]
+    held_out: tuple[float, float] | None
 
     def __str__(self) -> str:
         line = f"refine: {self.steps} steps; inputs {{:.2f}} -> {{:.2f}} dB".format(*self.inputs)
@@ -64,15 +59,13 @@ class Report:
 
 
 class Descent:
-    """Gaussians with bounded changes, and the optimiser of these; at first nothing is changed.
+    """Gaussians with bounded changes, and the optimiser of these; at first nothing is changed. InputError:
+    means that belong to no pixel.
 
     Args:
         gaussians: predicted from ``batch``, each at a pixel of an input.
         batch: None where ``means`` are not changed.
         changes: what may change, as of :class:`Refinement`.
-
-    Raises:
-        InputError: means that belong to no pixel.
     """
 
     def __init__(self, gaussians: Gaussians, batch: Batch | None, changes: Mapping[str, Change]):
@@ -80,9 +73,7 @@ class Descent:
         if "means" in changes:
             require(gaussians.image is not None, "refine", "Gaussians of the inputs' pixels", "others")
             self._footprint = _footprints(self.start, batch)
-        self._raw = {
-            name: torch.zeros_like(getattr(self.start, name), requires_grad=True) for name in changes
-        }
+        self._raw = {n: torch.zeros_like(getattr(self.start, n), requires_grad=True) for n in changes}
         # Without an epsilon: the loss is a mean, whose gradients shrink with images and batch.
         groups = [{"params": [self._raw[name]], "lr": change.rate} for name, change in changes.items()]
         self._optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95), eps=1e-15)
@@ -93,29 +84,19 @@ class Descent:
         """As they are now, without a gradient."""
         return self._changed()
 
-    def step(
-        self,
-        renderer: Renderer,
-        photographs: Tensor,
-        silhouettes: Tensor,
-        cameras: Cameras,
-        weights: Weights = WEIGHTS,
-    ) -> Rendering:
+    def step(self, renderer: Renderer, seen: Seen, weights: Weights = WEIGHTS) -> Rendering:
         """One step towards photographs on black and silhouettes; the renders that it follows from."""
         with exact(self.start.means.device.type), torch.enable_grad():
-            drawn = renderer(self._changed(), cameras, background=0.0)
+            drawn = renderer(self._changed(), seen[2], background=0.0)
             self._optimizer.zero_grad()
-            _loss(drawn, photographs, silhouettes, weights).backward()
+            _loss(drawn, *seen[:2], weights).backward()
             self._optimizer.step()
         return drawn
 
     def _changed(self) -> Gaussians:
         """Gaussians with bounded changes; none where they are 0."""
         start = self.start
-        change = {
-            name: allowed.limit * torch.tanh(self._raw[name] / allowed.limit)
-            for name, allowed in self.changes.items()
-        }
+        change = {n: c.limit * torch.tanh(self._raw[n] / c.limit) for n, c in self.changes.items()}
         changed = {name: getattr(start, name) + value for name, value in change.items()}
         if "means" in change:
             changed["means"] = start.means + self._footprint * change["means"]
@@ -125,7 +106,7 @@ class Descent:
             # No step could leave an opacity of exactly 0 or 1.
             logit = torch.logit(start.opacities.clamp(1e-4, 1 - 1e-4))
             changed["opacities"] = torch.sigmoid(logit + change["opacities"])
-        return dataclasses.replace(start, **changed)
+        return replace(start, **changed)
 
 
 class Refinement:
@@ -142,59 +123,45 @@ class Refinement:
         require(steps >= 1, "refine", "1 or more steps", steps)
         self.steps, self.renderer, self.changes = steps, renderer, changes
 
-    def __call__(self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None) -> Gaussians:
-        """The refined Gaussians.
+    def __call__(self, gaussians: Gaussians, batch: Batch) -> Gaussians:
+        """The refined Gaussians. ``gaussians``: predicted from ``batch``, each at a pixel of an input.
+        InputError: Gaussians that belong to no pixel."""
+        return deque(self.states(gaussians, batch), maxlen=1).pop()
 
-        Args:
-            gaussians: predicted from ``batch``, each at a pixel of an input.
-            views: numbers of the photographs that take part; None: all.
-
-        Raises:
-            InputError: Gaussians that belong to no pixel.
-        """
-        return deque(self.states(gaussians, batch, views), maxlen=1).pop()
-
-    def states(
-        self, gaussians: Gaussians, batch: Batch, views: Sequence[int] | None = None
-    ) -> Iterator[Gaussians]:
+    def states(self, gaussians: Gaussians, batch: Batch) -> Iterator[Gaussians]:
         """The Gaussians before the first step and after each; arguments and errors as for a call."""
-        views = range(batch.images.shape[1]) if views is None else views
-        seen, search = seen_by(batch, views), Descent(gaussians, batch, self.changes)
+        seen, search = seen_by(batch), Descent(gaussians, batch, self.changes)
         yield gaussians.detach()
         for _ in range(self.steps):
-            search.step(self.renderer, *seen)
+            search.step(self.renderer, seen)
             yield search.gaussians
 
-    def report(self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Predict) -> Report:
+    def report(
+        self, gaussians: Gaussians, refined: Gaussians, batch: Batch, predict: Callable[[Batch], Gaussians]
+    ) -> Report:
         """The gain of a refinement; holding out the last input takes as long as prediction and refinement.
-
-        Args:
-            batch: one element, of which they were predicted.
-            predict: the Gaussians of a batch, here of the inputs without the last: of fewer than four none
-                is held out, since two show too little of a person.
-        """
-        views = list(range(batch.images.shape[1]))
-        inputs = tuple(self._psnr(splats, batch, views) for splats in (gaussians, refined))
-        held_out = None
-        if len(views) > 3:
-            *seen, hidden = views
+        ``batch``: one element, of which they were predicted. ``predict``: the Gaussians of a batch, here of
+        the inputs without the last: of fewer than four none is held out, since two show too little of a
+        person."""
+        inputs, held_out = tuple(self._psnr(splats, batch) for splats in (gaussians, refined)), None
+        *seen, hidden = range(batch.images.shape[1])
+        if len(seen) > 2:
             others = batch.of_views(seen)
             predicted = predict(others)
             both = predicted, self(predicted, others)
-            held_out = tuple(self._psnr(splats, batch, [hidden]) for splats in both)
+            held_out = tuple(self._psnr(splats, batch.of_views([hidden])) for splats in both)
         return Report(self.steps, inputs, held_out)
 
     @torch.no_grad()
-    def _psnr(self, gaussians: Gaussians, batch: Batch, views: Sequence[int]) -> float:
-        photographs, _, cameras = seen_by(batch, views)
+    def _psnr(self, gaussians: Gaussians, batch: Batch) -> float:
+        photographs, _, cameras = seen_by(batch)
         drawn = self.renderer(gaussians, cameras, background=0.0).image
         return float(psnr(drawn.flatten(0, 1).clamp(0, 1), photographs.flatten(0, 1)).mean())
 
 
-def seen_by(batch: Batch, views: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
-    """Photographs on black, silhouettes and cameras of some views."""
-    part = batch.of_views(views)
-    return on_black(part), coverage(part)[:, :, None], part.cameras
+def seen_by(batch: Batch) -> Seen:
+    """What the inputs show."""
+    return on_black(batch), coverage(batch)[:, :, None], batch.cameras
 
 
 def _footprints(gaussians: Gaussians, batch: Batch) -> Tensor:

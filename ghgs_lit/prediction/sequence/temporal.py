@@ -1,16 +1,13 @@
 """Instants that start from the last: Gaussians move with the photographs and are predicted anew now and then.
 
-A body moves little from one instant to the next, and a rig not at all. So the Gaussians of the last instant
-follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few gradient steps on the inputs' renders,
-whose optimiser goes on over the instants, take back what flow leaves and what light changes (the streams of
-Luiten et al., 3DV 2024, begin with an optimised scene; these with a prediction). What appears is seen by the
-renders, and so is a mask that changes more than the body: where they no longer fit photographs or masks, and
+The Gaussians of the last instant follow the scene flow (:mod:`ghgs_lit.geometry.scene_flow`), and a few
+gradient steps on the inputs' renders, whose optimiser goes on over the instants, take back what flow leaves
+and what light changes (as in Luiten et al., 3DV 2024). Where renders no longer fit photographs or masks, and
 every few instants, all is predicted anew.
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,30 +17,22 @@ from ghgs_lit.geometry.masks import coverage, on_black
 from ghgs_lit.geometry.projection import at_least_float32, project, sample, unproject_maps
 from ghgs_lit.geometry.rotations import multiply_quaternions, unit
 from ghgs_lit.geometry.scene_flow import Instant, pyramid, scene_flow
-from ghgs_lit.prediction.refinement.refinement import Change, Descent, Renderer, seen_by
+from ghgs_lit.prediction.refinement.refinement import NEAR, Change, Descent, Renderer, seen_by
 from ghgs_lit.types import Batch, Cameras, Gaussians, Prediction
 
-#: Metres behind the rendered surface up to which a view shows a Gaussian.
-_SHOWN = 0.03
+_SHOWN = 0.03  #: Metres behind the rendered surface up to which a view shows a Gaussian
 #: Steps at each instant. They may go farther than those of a single one: an error of the flow is larger than
 #: that of a prediction.
 _STEPS = 2
-_CHANGES = {
-    "means": Change(10.0, 0.1),
-    "scales": Change(1.0, 0.02),
-    "opacities": Change(2.0, 0.04),
-    "colors": Change(0.1, 0.004),
-}
+_CHANGES = NEAR | {"means": Change(10.0, 0.1), "colors": Change(0.1, 0.004)}
 #: Of L1 and of the silhouettes' L1; without SSIM, which takes as long as the renders.
 _WEIGHTS = (0.8, 0.0, 0.1)
-#: Times the misfit after a new prediction at which Gaussians no longer fit.
-_WORSE = 1.5
+_WORSE = 1.5  #: Times the misfit after a new prediction at which Gaussians no longer fit
 
 
 @dataclass(frozen=True)
 class _Last:
-    """The last instant: its batch, prediction, photographs for the flow, and depth [1, V, 1, H, W] of the
-    inputs' renders."""
+    """The last instant, its photographs for the flow, and depth [1, V, 1, H, W] of the inputs' renders."""
 
     batch: Batch
     prediction: Prediction
@@ -102,9 +91,9 @@ class Temporal:
     ) -> tuple[Prediction, Float[Tensor, " 2"]]:
         """The prediction after some steps, and by how much the inputs' renders before the last one do not
         fit: the error within masks, and the share of the subject beyond its mask in the worst view."""
-        photographs, silhouettes, cameras = seen_by(batch, range(batch.images.shape[1]))
+        photographs, silhouettes, _ = seen = seen_by(batch)
         for _ in range(_STEPS):
-            drawn = self._descent.step(self.renderer, photographs, silhouettes, cameras, _WEIGHTS)
+            drawn = self._descent.step(self.renderer, seen, _WEIGHTS)
         masks, depth = batch.masks[:, :, None], drawn.depth.detach()
         error = ((drawn.image - photographs).abs() * masks).sum() / (3 * masks.sum()).clamp(min=1)
         beyond = (drawn.alpha - silhouettes).clamp(min=0).sum((-2, -1))
@@ -116,10 +105,8 @@ class Temporal:
 
 def _are_equal(first: Batch, second: Batch) -> bool:
     """Whether two instants have the same photographs, mattes and cameras."""
-    pairs = [(first.images, second.images), (coverage(first), coverage(second))]
-    for name in ("intrinsics", "extrinsics"):
-        pairs.append((getattr(first.cameras, name), getattr(second.cameras, name)))
-    return all(torch.equal(one, other) for one, other in pairs)
+    known = ((b.images, coverage(b), b.cameras.intrinsics, b.cameras.extrinsics) for b in (first, second))
+    return all(map(torch.equal, *known))
 
 
 def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]) -> Gaussians:
@@ -136,7 +123,7 @@ def _moved(gaussians: Gaussians, last: _Last, batch: Batch, levels: list[Tensor]
     shown = _shown(points, before.cameras, (last.depth[0] / metre).to(points))
     moved, turned = scene_flow(points, shown, before, after)
     half = torch.cat((torch.ones_like(turned[:, :1]), turned / 2), -1)
-    return dataclasses.replace(
+    return replace(
         gaussians,
         means=gaussians.means + (metre * moved).to(gaussians.means),
         quaternions=multiply_quaternions(unit(half).to(gaussians.quaternions), gaussians.quaternions),
@@ -147,7 +134,7 @@ def _around(cameras: Cameras, origin: Float[Tensor, " 3"], metre: float) -> Came
     """The cameras [V] of one element in metres around a point of the world."""
     extrinsics = cameras.extrinsics[0].double().clone()
     extrinsics[:, :3, 3] = (extrinsics[:, :3, :3] @ origin + extrinsics[:, :3, 3]) / metre
-    return dataclasses.replace(cameras, intrinsics=cameras.intrinsics[0], extrinsics=extrinsics)
+    return replace(cameras, intrinsics=cameras.intrinsics[0], extrinsics=extrinsics)
 
 
 def _shown(
@@ -170,15 +157,7 @@ def _as_drawn(
     mean = torch.where(counts > 0, sums / counts.clamp(min=1), 1)
     depth = torch.where(valid, torch.where(drawn, depth, mean), 1)
     pixels = unproject_maps(depth, batch.cameras).to(prediction.points.pixels)
-    points = dataclasses.replace(prediction.points, pixels=pixels, valid=valid)
-    maps = dataclasses.replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
-    return dataclasses.replace(
-        prediction,
-        gaussians=gaussians,
-        depth=depth,
-        depth_valid=valid,
-        points=points,
-        depth_maps=maps,
-        rounds=(),
-        drafts=(),
-    )
+    points = replace(prediction.points, pixels=pixels, valid=valid)
+    maps = replace(prediction.depth_maps, depth=depth, valid=valid, bounds=None)
+    found = {"gaussians": gaussians, "depth": depth, "depth_valid": valid, "points": points}
+    return replace(prediction, **found, depth_maps=maps, rounds=(), drafts=())

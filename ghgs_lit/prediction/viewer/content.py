@@ -19,7 +19,7 @@ from ghgs_lit.prediction.capture.calibration import calibrate
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
 from ghgs_lit.prediction.export.compact import visible_first
 from ghgs_lit.prediction.export.ply import read_ply
-from ghgs_lit.prediction.export.world import AXES
+from ghgs_lit.prediction.export.subject import AXES
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Batch, Cameras, Gaussians
 from ghgs_lit.visualization.pictures import colorize, to_uint8
@@ -111,10 +111,8 @@ def _read_inputs(directory: Path) -> Batch:
     shapes = {picture.shape for picture in pictures}
     require(len(shapes) == 1, str(directory / "inputs"), "photographs of one size", sorted(shapes))
     values = torch.from_numpy(np.stack(pictures)).movedim(-1, 1).float()[None] / 255
-    stacked = [
-        torch.from_numpy(np.stack([getattr(camera, name) for camera in cameras])).float()[None]
-        for name in ("intrinsics", "extrinsics")
-    ]
+    matrices = ([getattr(c, name) for c in cameras] for name in ("intrinsics", "extrinsics"))
+    stacked = [torch.from_numpy(np.stack(each)).float()[None] for each in matrices]
     colors, alpha = values[:, :, :3], values[:, :, 3:]
     return Batch(
         images=torch.where(alpha > 0, colors * alpha, colors),

@@ -1,12 +1,12 @@
 """A page that shows the newest of what goes on, and how fast that is."""
 
 import contextlib
-import dataclasses
 import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 
 from ghgs_lit.prediction.capture.capture import Capture
@@ -18,8 +18,7 @@ from ghgs_lit.prediction.viewer.content import Content
 from ghgs_lit.prediction.viewer.server import Viewer
 from ghgs_lit.types import Batch
 
-#: Instants over which times are means, the newest with the largest weight.
-_RECENT = 30
+_RECENT = 30  #: Instants over which times are means, the newest with the largest weight
 
 
 class Recording:
@@ -87,7 +86,7 @@ def show_live(
                     late, dropped = late + 1, dropped + 1
                     line = f"{shown} shown, {dropped} dropped, {late} of them later than {delay:g} s"
                     continue
-                seen = dataclasses.replace(batch, cameras=subject.cameras[None].to("cpu"))
+                seen = replace(batch, cameras=subject.cameras[None].to("cpu"))
                 content = Content(subject.stored.to("cpu"), subject.up.cpu(), seen)
                 predicted = time.perf_counter()
                 if page is None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ghgs_lit.errors import InputError
+from ghgs_lit.errors import InputError, installed
 from ghgs_lit.geometry.rotations import quaternion_to_matrix
 from ghgs_lit.prediction.export.subject import smoothed
 from ghgs_lit.prediction.viewer.content import Content
@@ -56,24 +56,16 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 class Viewer:
-    """A running page.
+    """A running page. InputError: viser is not installed, or this machine has no such address.
 
     Args:
         host: the address to listen at; ``127.0.0.1`` is seen by this machine alone.
         port: the first one to try.
         layers: cameras, photographs, point cloud and hull are there, too, of the first content alone.
-
-    Raises:
-        InputError: viser is not installed, or this machine has no such address.
     """
 
     def __init__(self, content: Content, host: str = "127.0.0.1", port: int = 8080, layers: bool = True):
-        try:
-            import viser
-        except ImportError as error:
-            raise InputError(
-                f"ghgs view: expected the extra viewer (pip install 'ghgs-lit[viewer]'); found {error}"
-            ) from error
+        viser = installed("viser", "viewer", "ghgs view")
         _require_address(host)
         self.content = content
         self._lock = threading.Lock()  # controls are answered by several threads
@@ -115,8 +107,7 @@ class Viewer:
             # On a screen that is larger than the photographs there would be gaps.
             g = smoothed(g, pixel_size(self.content.cameras, self.content.center))
         root = quaternion_to_matrix(g.quaternions[order]) * g.scales[order][:, None, :]
-        covariances = (root @ root.mT).numpy()
-        self._covariances = covariances
+        self._covariances = (root @ root.mT).numpy()
         self._colors = g.colors[order].clamp(0, 1).numpy()
         self._opacities = g.opacities[order][:, None].numpy()
 
@@ -230,13 +221,10 @@ class Viewer:
         go.on_click(lambda _: self.go_to(views.index(self.view.value)))
 
         def show() -> None:
-            values = self._comparison
             self._show_frustums()
-            self.image.image = values[self._shown]
-            self.text.content = (
-                f"{self._shown} of {self.view.value}; in the subject's box:"
-                f" FLIP {values['flip']:.4f}, PSNR {values['psnr']:.2f} dB"
-            )
+            self.image.image = self._comparison[self._shown]
+            quality = "FLIP {flip:.4f}, PSNR {psnr:.2f} dB".format(**self._comparison)
+            self.text.content = f"{self._shown} of {self.view.value}; in the subject's box: {quality}"
 
         @self.view.on_update
         def _(_) -> None:

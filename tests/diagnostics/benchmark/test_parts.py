@@ -9,10 +9,15 @@ import torch.nn.functional as F
 
 from ghgs_lit import encoder
 from ghgs_lit.diagnostics.benchmark import measure
-from ghgs_lit.diagnostics.benchmark.error import ATTRIBUTES, differences, partners, relative_difference
-from ghgs_lit.diagnostics.benchmark.flops import FlopsProbe
-from ghgs_lit.diagnostics.benchmark.measure import Times, order, time_cases
-from ghgs_lit.diagnostics.benchmark.memory import PeakProbe
+from ghgs_lit.diagnostics.benchmark.measure import (
+    ATTRIBUTES,
+    Times,
+    differences,
+    order,
+    partners,
+    relative_difference,
+    time_cases,
+)
 from ghgs_lit.diagnostics.benchmark.presets import Case, combinations
 from ghgs_lit.diagnostics.benchmark.scene import ellipse, ellipsoid_batch
 from ghgs_lit.diagnostics.benchmark.stages import (
@@ -20,6 +25,8 @@ from ghgs_lit.diagnostics.benchmark.stages import (
     OTHER,
     ROUNDS,
     TOTAL,
+    FlopsProbe,
+    PeakProbe,
     SecondsProbe,
     forward,
     top_level,

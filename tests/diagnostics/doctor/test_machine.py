@@ -4,7 +4,7 @@ import importlib.metadata
 
 import torch
 
-from ghgs_lit.cli import doctor_machine
+from ghgs_lit.cli import doctor
 from ghgs_lit.diagnostics.doctor.machine import machine_lines, missing_extras
 from tests.helpers.verbs import ghgs
 
@@ -27,7 +27,7 @@ def test_the_machine_is_described():
 def test_the_verb_prints_both(tmp_path, capsys, monkeypatch):
     """Brackets are no markup."""
     missing = [("magic", "x missing: pip install 'ghgs-lit[magic]'")]
-    monkeypatch.setattr(doctor_machine, "missing_extras", lambda: missing)
+    monkeypatch.setattr(doctor, "missing_extras", lambda: missing)
     assert ghgs("doctor", "task=machine", "device=cpu", f"hydra.run.dir={tmp_path}") == 0
     out = capsys.readouterr().out
     assert "This machine" in out

@@ -6,9 +6,9 @@ from collections import Counter
 import pytest
 import torch
 
-from ghgs_lit.diagnostics.stress.families import FAMILIES, PLANTED
 from ghgs_lit.diagnostics.stress.measure import measure
 from ghgs_lit.diagnostics.stress.run import Task, run_tasks, tasks_of
+from ghgs_lit.diagnostics.stress.stage import FAMILIES, PLANTED
 from ghgs_lit.diagnostics.stress.stages import STAGES
 
 

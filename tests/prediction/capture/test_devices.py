@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 
 from ghgs_lit.errors import InputError
-from ghgs_lit.prediction.capture.devices import newest_frames, opened
-from ghgs_lit.prediction.capture.live import live_frames
+from ghgs_lit.prediction.capture.live import live_frames, newest_frames, opened
 from tests.helpers.figures import Figure
 from tests.helpers.videos import STEP, number_of, numbered_frames, write_video
 

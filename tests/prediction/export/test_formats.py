@@ -22,13 +22,13 @@ from ghgs_lit.errors import InputError
 from ghgs_lit.metrics import psnr
 from ghgs_lit.prediction.export.compact import CONVERTED, converted, to_records
 from ghgs_lit.prediction.export.gltf import EXTENSION, glb_bytes
+from ghgs_lit.prediction.export.instants import mp4_bytes
 from ghgs_lit.prediction.export.maps import input_files
-from ghgs_lit.prediction.export.packed import unpack
-from ghgs_lit.prediction.export.page import page
+from ghgs_lit.prediction.export.page import page, unpack
 from ghgs_lit.prediction.export.ply import SH_CONSTANT, ply_bytes, read_ply
-from ghgs_lit.prediction.export.video import mp4_bytes
 from ghgs_lit.rendering import render
 from ghgs_lit.types import Gaussians
+from ghgs_lit.visualization.turntable import pixel_size
 from tests.helpers.splats import body, camera_ring
 
 UP = torch.tensor([0.0, -1.0, 0.0])
@@ -57,7 +57,7 @@ def read_back(data: bytes, name: str, path) -> Gaussians:
 @pytest.mark.parametrize(("name", "least"), [("compressed_ply", 45), ("spz", 45), ("sog", 55)])
 def test_compact_files_render_alike(gaussians, name, least, tmp_path):
     ply = ply_bytes(gaussians)
-    content = converted(ply, name)
+    content = converted(name, gaussians)
     assert len(content) < len(ply) / 2
     assert decibels(read_back(content, CONVERTED[name], tmp_path / "a.ply"), gaussians) > least
 
@@ -120,7 +120,10 @@ def test_a_page_holds_the_scene_and_needs_no_network(gaussians, tmp_path):
     """One file: no address, the Gaussians, the cameras; names cannot end the script."""
     cameras = camera_ring(2, 100, 80)[0]
     name, wicked = "</title><script>{{data}}", "</script><!--<script>"  # the last two open a second script
-    text = page(gaussians, cameras, ("a", wicked), UP, torch.tensor([0.0, 0.1, 0.2]), name)
+    subject = SimpleNamespace(gaussians=gaussians, cameras=cameras, views=("a", wicked), up=UP)
+    subject.center = torch.tensor([0.0, 0.1, 0.2])
+    subject.pixel = pixel_size(cameras, subject.center)
+    text = page(subject, name)
     assert not re.search(r"https?://|src=|href=|import ", text)
     assert text.count("<script") == text.count("</script>") == 3
     assert "<!--" not in text

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from ghgs_lit.prediction.export.packed import COARSE, FINE, pack, unpack
+from ghgs_lit.prediction.export.page import COARSE, FINE, pack, unpack
 from ghgs_lit.types import Gaussians
 from tests.helpers.splats import body
 

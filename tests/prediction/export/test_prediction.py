@@ -23,8 +23,14 @@ from ghgs_lit.prediction.capture.formats.json_and_toml import read_json
 from ghgs_lit.prediction.export import OutputOptions, output_options, write_prediction
 from ghgs_lit.prediction.export.maps import depth_unit
 from ghgs_lit.prediction.export.ply import read_ply
-from ghgs_lit.prediction.export.subject import exported_subject, file_names, for_other_renderers
-from ghgs_lit.prediction.export.world import AXES, rotate_world, turn
+from ghgs_lit.prediction.export.subject import (
+    AXES,
+    exported_subject,
+    file_names,
+    for_other_renderers,
+    rotate_world,
+    turn,
+)
 from ghgs_lit.rendering import Renderer, render
 from ghgs_lit.types import Batch, Cameras
 from ghgs_lit.visualization.turntable import up_direction

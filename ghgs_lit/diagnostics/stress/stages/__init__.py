@@ -1,9 +1,7 @@
 """The rows of the matrix."""
 
-from ghgs_lit.diagnostics.stress.stages import geometry, heads, images, recalibration, rendering, whole
+from ghgs_lit.diagnostics.stress.stages import geometry, heads, recalibration, rendering, whole
 
 STAGES = {
-    stage.name: stage
-    for room in (geometry, heads, recalibration, rendering, images, whole)
-    for stage in room.STAGES
+    stage.name: stage for room in (geometry, heads, recalibration, rendering, whole) for stage in room.STAGES
 }

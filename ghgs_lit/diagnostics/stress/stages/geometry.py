@@ -49,10 +49,6 @@ def _unproject_inputs(family: str, g: Generator) -> Values:
     return {**rig, "pixels": inputs.uniform(g, 0, _SIZE, 16, 2), "depth": inputs.depths(family, g, 16)}
 
 
-def _unproject(v: Values) -> Values:
-    return {"points": unproject(v["pixels"], v["depth"], *inputs.matrices(v["lenses"], v["poses"]))}
-
-
 def _unproject_slowly(v: Values) -> Values:
     """By the inverses of the matrices of the whole camera."""
     homogeneous = torch.cat((v["pixels"], torch.ones_like(v["pixels"][..., :1])), -1)
@@ -139,19 +135,9 @@ def _bounds(v: Values) -> Values:
     }
 
 
-def _bounds_slowly(v: Values) -> Values:
-    """In the double precision of its inputs; the true surface must lie inside."""
-    found = _bounds(v)
-    return {**found, "outside": torch.zeros_like(found["outside"])}
-
-
 def _cells(v: Values) -> Tensor:
     """Bounds are decisions on a grid of cells: one cell of 1/20 of the subject's depth may differ."""
     return torch.full((len(v["images"]),), 0.05 / (100 * torch.finfo(torch.float32).eps))
-
-
-def _frame_inputs(family: str, g: Generator) -> Values:
-    return {**scene(family, g, 3, _SIZE), "points": inputs.normal(g, 16, 3)}
 
 
 def _frame(v: Values) -> Values:
@@ -161,10 +147,6 @@ def _frame(v: Values) -> Values:
     element = torch.arange(len(v["points"]))[:, None]
     world = frame._to_world(v["points"], element, v["points"].dtype)
     return {"extrinsics": frame.enter(batch).cameras.extrinsics, "world": world}
-
-
-def _sample_inputs(family: str, g: Generator) -> Values:
-    return {**_project_inputs(family, g), "maps": inputs.images(family, g, 3, _SIZE, _SIZE)}
 
 
 def _places(v: Values) -> Tensor:
@@ -260,7 +242,9 @@ STAGES = (
         silent="a point behind the camera has no pixel",
     ),
     Stage(
-        "unprojection", ("cameras", "depths"), _unproject_inputs, _unproject, 20, _HOLDS, _unproject_slowly,
+        "unprojection", ("cameras", "depths"), _unproject_inputs,
+        lambda v: {"points": unproject(v["pixels"], v["depth"], *inputs.matrices(v["lenses"], v["poses"]))},
+        20, _HOLDS, _unproject_slowly,
         gradients=("pixels", "depth", "lenses", "poses"), steady=("middle",),
         silent="an infinite focal length is a ray along the axis; the model refuses it",
     ),
@@ -270,17 +254,20 @@ STAGES = (
     ),
     Stage(
         "bounds and hull", ("cameras", "masks"), lambda family, g: scene(family, g, 4, 24), _bounds, 100,
-        "decisions on a grid: one cell may differ (kappa), the true surface must be inside", _bounds_slowly,
+        "decisions on a grid: one cell may differ (kappa), the true surface must be inside",
+        lambda v: {**_bounds(v), "outside": torch.zeros_like(v["truth"])},
         steady=("truth", "middle", "images"), seeds=32, kappa=_cells, excluded=_OUTSIDE_FRAME,
         silent="cameras that are not finite are refused before this stage",
     ),
     Stage(
-        "subject frame", ("cameras", "masks"), _frame_inputs, _frame, 20,
+        "subject frame", ("cameras", "masks"),
+        lambda family, g: {**scene(family, g, 3, _SIZE), "points": inputs.normal(g, 16, 3)}, _frame, 20,
         "all of it in float64, rounded once", gradients=("points",), steady=("truth", "middle", "images"),
         excluded=_OUTSIDE_FRAME, silent="cameras that are not finite are refused before this stage",
     ),
     Stage(
-        "samples of maps", ("cameras", "points", "images"), _sample_inputs, _sample, 20,
+        "samples of maps", ("cameras", "points", "images"),
+        lambda f, g: {**_project_inputs(f, g), "maps": inputs.images(f, g, 3, _SIZE, _SIZE)}, _sample, 20,
         "a mean of four pixels; their shares lose the digits of a pixel's place (kappa)", _sample_slowly,
         steady=("middle",), seeds=64,
         excluded=except_for({"nan inf": "its callers clean their maps"}),

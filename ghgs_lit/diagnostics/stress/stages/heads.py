@@ -29,13 +29,9 @@ def _depth(v: Values) -> Values:
 
 
 def _attribute_inputs(family: str, g: Generator) -> Values:
-    return {
-        "offset": inputs.raw(family, g, 16, 3),
-        "scale": inputs.raw(family, g, 16, 3),
-        "rotation": inputs.raw(family, g, 16, 4),
-        "opacity": inputs.raw(family, g, 16),
-        "footprint": inputs.depths(family, g, 16) / 500,
-    }
+    sizes = {"offset": (3,), "scale": (3,), "rotation": (4,), "opacity": ()}
+    raw = {name: inputs.raw(family, g, 16, *size) for name, size in sizes.items()}
+    return {**raw, "footprint": inputs.depths(family, g, 16) / 500}
 
 
 _ATTRIBUTES = FootprintAttributes()
@@ -46,14 +42,6 @@ def _attributes(v: Values) -> Values:
     rows = _ATTRIBUTES(*(v[name].flatten(0, 1) for name in names))
     rows = dict(zip(("offsets", "scales", "quaternions", "opacities"), rows, strict=True))
     return {name: value.unflatten(0, v["opacity"].shape) for name, value in rows.items()}
-
-
-def _unit_inputs(family: str, g: Generator) -> Values:
-    return {"vectors": inputs.quaternions(family, g, 16)}
-
-
-def _covariance_inputs(family: str, g: Generator) -> Values:
-    return {"quaternions": inputs.quaternions(family, g, 16), "scales": inputs.scales(family, g, 16)}
 
 
 def _covariance(v: Values) -> Values:
@@ -77,10 +65,6 @@ def _covariance_slowly(v: Values) -> Values:
 
 
 _GRID = (2, 3)
-
-
-def _dpt_inputs(family: str, g: Generator) -> Values:
-    return {f"layer{i}": inputs.features(family, g, _GRID[0] * _GRID[1], 32) for i in range(4)}
 
 
 def _head() -> DPTHead:
@@ -118,15 +102,20 @@ STAGES = (
         excluded={"negative_depth": "footprints are of points before the camera"},
     ),
     Stage(
-        "unit vectors", ("quaternions",), _unit_inputs, lambda v: {"unit": unit(v["vectors"])}, 20,
+        "unit vectors", ("quaternions",), lambda family, g: {"vectors": inputs.quaternions(family, g, 16)},
+        lambda v: {"unit": unit(v["vectors"])}, 20,
         "one square root and one division", gradients=("vectors",),
     ),
     Stage(
-        "quaternion and covariance", ("quaternions", "scales"), _covariance_inputs, _covariance, 50,
-        "products of four factors, sums of three", _covariance_slowly, gradients=("quaternions", "scales"),
+        "quaternion and covariance", ("quaternions", "scales"),
+        lambda f, g: {"quaternions": inputs.quaternions(f, g, 16), "scales": inputs.scales(f, g, 16)},
+        _covariance, 50, "products of four factors, sums of three", _covariance_slowly,
+        gradients=("quaternions", "scales"),
     ),
     Stage(
-        "dense head", ("features",), _dpt_inputs, _dpt, 100,
+        "dense head", ("features",),
+        lambda f, g: {f"layer{i}": inputs.features(f, g, _GRID[0] * _GRID[1], 32) for i in range(4)},
+        _dpt, 100,
         "twenty convolutions in a row, each a sum of up to 72 products; tokens are normalised first",
         gradients=tuple(f"layer{i}" for i in range(4)), seeds=64, network=True,
     ),

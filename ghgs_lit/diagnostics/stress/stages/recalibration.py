@@ -47,14 +47,8 @@ def _neighbor_table(family: str, g: Generator, count: int, k: int) -> Values:
 
 def _cosine_inputs(family: str, g: Generator) -> Values:
     count = _COUNT.get(family, 12)
-    return {
-        "features": inputs.features(family, g, count, 16),
-        **_neighbor_table("", g, count, min(_K, count)),
-    }
-
-
-def _cosines(v: Values) -> Values:
-    return {"cosines": neighbor_cosines(v["features"], Neighbors(v["index"], v["valid"]))}
+    features = inputs.features(family, g, count, 16)
+    return {"features": features, **_neighbor_table("", g, count, min(_K, count))}
 
 
 def _cosines_slowly(v: Values) -> Values:
@@ -117,10 +111,6 @@ def _head_inputs(family: str, g: Generator) -> Values:
     return {name: value.expand(2, 20, 64).clone() for name, value in features.items()}
 
 
-def _head_kernel(v: Values) -> Values:
-    return {"attended": attend_heads(v["q"], v["k"], v["v"])}
-
-
 def _heads_slowly(v: Values) -> Values:
     weights = (v["q"] @ v["k"].mT / 8).softmax(-1)
     return {"attended": (weights @ v["v"]).transpose(1, 2)}
@@ -137,7 +127,9 @@ STAGES = [
         silent="a point that is not finite is nobody's neighbour while there are others",
     ),
     Stage(
-        "cosine", ("features", "neighbors"), _cosine_inputs, case_by_case(_cosines), 20,
+        "cosine", ("features", "neighbors"), _cosine_inputs, case_by_case(
+            lambda v: {"cosines": neighbor_cosines(v["features"], Neighbors(v["index"], v["valid"]))}
+        ), 20,
         "a product of two unit vectors of 16 components", case_by_case(_cosines_slowly),
     ),
     Stage(
@@ -149,7 +141,8 @@ STAGES = [
 ]  # fmt: skip
 if "avx512f" in processor_features():
     STAGES.append(Stage(
-        "encoder kernel", ("features",), _head_inputs, _head_kernel, 100,
+        "encoder kernel", ("features",), _head_inputs,
+        lambda v: {"attended": attend_heads(v["q"], v["k"], v["v"])}, 100,
         f"logits of sums of 64 products; exponentials by a polynomial. {_HUGE}", _heads_slowly,
         dtypes=FLOAT32_ONLY, silent=_INFINITE,
     ))  # fmt: skip

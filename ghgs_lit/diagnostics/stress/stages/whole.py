@@ -1,8 +1,8 @@
 """The whole method: a tiny model, and a training step through renderer and losses."""
 
 import copy
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 
 import torch
@@ -33,8 +33,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
                 parameter.data += 10.0 * torch.randn_like(parameter).sign()
             elif not parameter.any():
                 nn.init.normal_(parameter, std=0.1)
-    # Rounds draw their number in training.
-    model.train(name != "recurrent")
+    model.train(name != "recurrent")  # rounds draw their number in training
     exact = copy.deepcopy(model).double()
     exact.bounds = partial(_in_float32, model.bounds)
     return {torch.float32: model, torch.float64: exact}
@@ -42,7 +41,7 @@ def _models(name: str, kicked: bool) -> dict[torch.dtype, GHGS]:
 
 def _in_float32(bounds: Callable[[Batch], DepthBounds | None], batch: Batch) -> DepthBounds | None:
     """Bounds as in single precision: decisions on a grid, which "bounds and hull" measures, are the same."""
-    found = bounds(dataclasses.replace(batch, cameras=batch.cameras.to(torch.float32)))
+    found = bounds(replace(batch, cameras=batch.cameras.to(torch.float32)))
     return found if found is None else DepthBounds(found.near.double(), found.far.double())
 
 
@@ -84,7 +83,7 @@ def _step(v: Values) -> Values:
     masks = torch.ones(1, 1, _SIZE, _SIZE, dtype=torch.bool)
     surface = one["middle"] + 0.5 * inputs.directions(Generator().manual_seed(1), 40, 3).to(one["middle"])
     targets = Targets(one["target"], masks, cameras)
-    batch = dataclasses.replace(batch_of(one), targets=targets, body_vertices=[surface], depths=one["truth"])
+    batch = replace(batch_of(one), targets=targets, body_vertices=[surface], depths=one["truth"])
     prediction = model(batch)
     rendering = render(prediction.gaussians, cameras, "reference" if exact else "cpu")
     total, values = _LOSSES(prediction, rendering, batch)

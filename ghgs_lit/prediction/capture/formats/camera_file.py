@@ -65,15 +65,9 @@ def plain(key: str) -> str:
 
 
 def check_unread(origin: str, fields: Mapping[str, Any], known: Collection[str]) -> None:
-    """Name in a warning what a reader does not know.
-
-    Args:
-        fields: of a camera, or of the file.
-        known: what is read or of no matter, as :func:`plain` spells it.
-
-    Raises:
-        InputError: it is about the lens, and not empty or 0: without it the picture would be bent.
-    """
+    """Name in a warning what a reader does not know. ``fields``: of a camera, or of the file. ``known``: what
+    is read or of no matter, as :func:`plain` spells it. InputError: it is about the lens, and not empty or 0:
+    without it the picture would be bent."""
     unread = {key: value for key, value in fields.items() if plain(key) not in known}
     lens = [key for key, value in unread.items() if _LENS.search(plain(key)) and _bends(value)]
     expected = "lens distortion as D or dist: k1 k2 p1 p2 k3 k4 k5 k6, with fisheye k1 k2 k3 k4"

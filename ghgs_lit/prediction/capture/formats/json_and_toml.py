@@ -10,13 +10,8 @@ from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import require
 from ghgs_lit.files import write_text_atomically
 from ghgs_lit.prediction.capture.calibration import Calibration, Convention, StoredCamera
+from ghgs_lit.prediction.capture.formats import opencv
 from ghgs_lit.prediction.capture.formats.camera_file import CameraFile, check_unread, read_mapping
-from ghgs_lit.prediction.capture.formats.opencv import (
-    KNOWN,
-    cameras_from_fields,
-    has_intrinsics,
-    size_from_fields,
-)
 
 _KEYS = ("intrinsics", "extrinsics", "width", "height", "distortion", "fisheye", "gains")
 
@@ -38,7 +33,7 @@ def read_json(path: Path) -> CameraFile:
     with_extrinsics = {n: c for n, c in named.items() if isinstance(c, Mapping) and "extrinsics" in c}
     if not with_extrinsics:
         return _read_matrices(path, named, "opencv")
-    check_unread(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, KNOWN)
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_extrinsics}, opencv.KNOWN)
     cameras = [_camera(name, f"{path}: {name}", camera) for name, camera in with_extrinsics.items()]
     return CameraFile.of(cameras, Convention(), "ghgs")
 
@@ -50,7 +45,7 @@ def _cameras_of(path: Path, content: Mapping[str, Any]) -> dict[str, Any]:
         named = {str(camera.get("name", i)): camera for i, camera in enumerate(named)}
     require(isinstance(named, dict), f"{path}: cameras", "cameras by name", type(named).__name__)
     if "cameras" in content:
-        check_unread(str(path), content, KNOWN)
+        check_unread(str(path), content, opencv.KNOWN)
     return named
 
 
@@ -65,9 +60,9 @@ def read_toml(path: Path) -> CameraFile:
 def _read_matrices(path: Path, named: Mapping[str, Any], name_of_format: str) -> CameraFile:
     """OpenCV's matrices by the names of cameras."""
     expected = "cameras with intrinsics and extrinsics (or K, R and T)"
-    with_intrinsics = {name: camera for name, camera in named.items() if has_intrinsics(camera)}
-    cameras = cameras_from_fields(path, with_intrinsics, expected, sorted(named))
-    check_unread(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, KNOWN)
+    with_intrinsics = {name: camera for name, camera in named.items() if opencv.has_intrinsics(camera)}
+    cameras = opencv.cameras_from_fields(path, with_intrinsics, expected, sorted(named))
+    check_unread(str(path), {n: c for n, c in named.items() if n not in with_intrinsics}, opencv.KNOWN)
     return CameraFile.of(cameras, Convention(pixel_centers="integer"), name_of_format)
 
 
@@ -77,7 +72,7 @@ def _camera(name: str, origin: str, camera: Mapping[str, Any]) -> StoredCamera:
     require("intrinsics" in camera, origin, "intrinsics", sorted(camera))
     pose = check_array(f"{origin}: extrinsics", camera["extrinsics"], [(4, 4), (3, 4)])
     distortion = check_array(f"{origin}: distortion", camera.get("distortion", []), [(None,)])
-    size, fisheye = size_from_fields(origin, camera), bool(camera.get("fisheye", False))
+    size, fisheye = opencv.size_from_fields(origin, camera), bool(camera.get("fisheye", False))
     lens, gains = camera["intrinsics"], camera.get("gains")
     return StoredCamera(name, origin, lens, pose, size, distortion, fisheye, gains=gains)
 

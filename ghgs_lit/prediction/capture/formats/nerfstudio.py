@@ -8,16 +8,9 @@ from typing import Any
 import numpy as np
 
 from ghgs_lit.data.decoding import check_array
-from ghgs_lit.errors import InputError, choice, require
+from ghgs_lit.errors import choice, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import (
-    CameraFile,
-    check_unread,
-    coefficients,
-    finite,
-    pinhole,
-    plain,
-)
+from ghgs_lit.prediction.capture.formats import camera_file
 from ghgs_lit.prediction.capture.formats.json_and_toml import read_json_file
 
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -25,14 +18,14 @@ _KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 # Read, or of no matter for a camera.
 _KNOWN = {
-    *map(plain, _KEYS),
+    *map(camera_file.plain, _KEYS),
     *("frames", "filepath", "transformmatrix", "maskpath", "cameramodel", "isfisheye", "aabbscale", "scale"),
     *("offset", "appliedtransform", "appliedscale", "orientationoverride", "plyfilepath", "depthfilepath"),
     *("colmapimid", "sharpness", "rotation", "trainfilenames", "valfilenames", "testfilenames", "time", "up"),
 }
 
 
-def read_nerfstudio(path: Path) -> CameraFile:
+def read_nerfstudio(path: Path) -> camera_file.CameraFile:
     """Cameras of ``frames``; intrinsics of a frame win over those of the whole file. InputError: a frame is
     wrong."""
     content = read_json_file(path)
@@ -40,7 +33,7 @@ def read_nerfstudio(path: Path) -> CameraFile:
     require(isinstance(frames, list) and len(frames) > 0, f"{path}: frames", "a list of frames", frames)
     cameras = [_camera(path, f"{path}: frames[{i}]", content, frame) for i, frame in enumerate(frames)]
     convention = Convention(extrinsics="camera_to_world", axes="opengl")
-    return CameraFile.of(cameras, convention, "nerfstudio")
+    return camera_file.CameraFile.of(cameras, convention, "nerfstudio")
 
 
 def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> StoredCamera:
@@ -53,16 +46,16 @@ def _camera(path: Path, origin: str, shared: Mapping[str, Any], frame: Any) -> S
     fisheye = model == "OPENCV_FISHEYE" if flag is None else bool(flag)
     allowed = (None, False, True) if model is None else (None, model == "OPENCV_FISHEYE")
     require(flag in allowed, f"{origin}: is_fisheye", f"{allowed[-1]} beside {model}", flag)
-    numbers = {key: finite(origin, key, fields[key]) for key in _KEYS if key in fields}
+    numbers = {key: camera_file.finite(origin, key, fields[key]) for key in _KEYS if key in fields}
     size = (int(numbers["h"]), int(numbers["w"])) if {"h", "w"} <= set(numbers) else None
     intrinsics = _intrinsics(origin, numbers, size)
     names = "k1 k2 k3 k4" if fisheye else "k1 k2 p1 p2 k3"
     beyond = [key for key in _LENS if numbers.get(key) and key not in names.split()]
     require(not beyond, origin, f"distortion {names}", beyond)
-    distortion = coefficients(numbers, names)
+    distortion = camera_file.coefficients(numbers, names)
     pose = check_array(f"{origin}: transform_matrix", frame["transform_matrix"], [(4, 4), (3, 4)])
     mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
-    check_unread(origin, fields, _KNOWN)
+    camera_file.check_unread(origin, fields, _KNOWN)
     return StoredCamera(str(frame["file_path"]), origin, intrinsics, pose, size, distortion, fisheye, mask)
 
 
@@ -76,12 +69,10 @@ def _intrinsics(origin: str, numbers: Mapping[str, float], size: tuple[int, int]
             focal[axis] = numbers[f"fl_{axis}"]
         elif angle is not None and side is not None and 0 < angle < math.pi:
             focal[axis] = side / 2 / math.tan(angle / 2)
-    if not focal or (size is None and not {"cx", "cy"} <= set(numbers)):
-        raise InputError(
-            f"{origin}: expected fl_x, cx and cy, or w, h and camera_angle_x; found {sorted(numbers)}"
-        )
+    is_enough = bool(focal) and (size is not None or {"cx", "cy"} <= set(numbers))
+    require(is_enough, origin, "fl_x, cx and cy, or w, h and camera_angle_x", sorted(numbers))
     # Square pixels where one focal length is given.
     fx, fy = focal.get("x", focal.get("y")), focal.get("y", focal.get("x"))
     cx = numbers["cx"] if "cx" in numbers else width / 2
     cy = numbers["cy"] if "cy" in numbers else height / 2
-    return pinhole(fx, fy, cx, cy)
+    return camera_file.pinhole(fx, fy, cx, cy)

@@ -16,18 +16,10 @@ import yaml
 from ghgs_lit.data.decoding import check_array
 from ghgs_lit.errors import InputError, require
 from ghgs_lit.prediction.capture.calibration import Convention, StoredCamera
-from ghgs_lit.prediction.capture.formats.camera_file import (
-    CameraFile,
-    check_unread,
-    coefficients,
-    finite,
-    plain,
-    read_mapping,
-)
+from ghgs_lit.prediction.capture.formats import camera_file
 from ghgs_lit.readers import check_yaml
 
-#: The files of EasyMocap: intrinsics and poses.
-EASYMOCAP = ("intri.yml", "extri.yml")
+EASYMOCAP = ("intri.yml", "extri.yml")  #: The files of EasyMocap: intrinsics and poses
 # Spelled as `plain` does; a rotation matrix is preferred to a vector where there are both.
 _NAMES = {
     "intrinsics": ("k", "cameramatrix", "matrix", "intrinsicmatrix", "intrinsic", "intrinsics", "m"),
@@ -39,8 +31,7 @@ _NAMES = {
     "height": ("height", "imageheight", "h"),
     "fisheye": ("fisheye", "isfisheye", "usefisheye", "fisheyemodel"),
 }
-# Coefficients with an entry each.
-_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # Coefficients with an entry each
 #: Entries that are read, or of no matter for a camera.
 KNOWN = {
     *(name for names in _NAMES.values() for name in names),
@@ -72,7 +63,7 @@ for _name in ("opencv-matrix", "opencv-nd-matrix"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_name}", _matrix)
 
 
-def read_opencv(path: Path) -> CameraFile:
+def read_opencv(path: Path) -> camera_file.CameraFile:
     """Cameras of a YAML file, or of all YAML files of a folder. InputError: a camera is missing or wrong."""
     files = sorted([*path.glob("*.yml"), *path.glob("*.yaml")]) if path.is_dir() else [path]
     cameras: list[StoredCamera] = []
@@ -85,10 +76,10 @@ def read_opencv(path: Path) -> CameraFile:
             named = named or _by_name(str(file), fields)
             expected = "a camera matrix (camera_matrix, K or K_<name>)"
             cameras += cameras_from_fields(file, named, expected, sorted(fields))
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
+    return camera_file.CameraFile.of(cameras, Convention(pixel_centers="integer"), "opencv")
 
 
-def read_easymocap(path: Path) -> CameraFile:
+def read_easymocap(path: Path) -> camera_file.CameraFile:
     """EasyMocap's ``intri.yml`` and ``extri.yml``, by the path of one of them or of their folder. InputError:
     one of the files is missing, or a camera is wrong."""
     folder = path if path.is_dir() else path.parent
@@ -99,7 +90,7 @@ def read_easymocap(path: Path) -> CameraFile:
     named = _by_name(str(folder), fields)
     require(bool(named), str(folder / EASYMOCAP[0]), "camera matrices K_<name>", sorted(fields))
     cameras = [camera_from_fields(name, f"{folder}: {name}", camera) for name, camera in named.items()]
-    return CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
+    return camera_file.CameraFile.of(cameras, Convention(pixel_centers="integer"), "easymocap")
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -110,7 +101,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         check_yaml(text)
         return yaml.load(text, _Loader)
 
-    return read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
+    return camera_file.read_mapping(path, parse, "YAML of OpenCV", "YAML of OpenCV with named matrices")
 
 
 def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -121,9 +112,8 @@ def _by_name(origin: str, fields: Mapping[str, Any]) -> dict[str, dict[str, Any]
         # The longest name: K_1 beside K_cam_1.
         name = max((name for name in cameras if key.endswith(f"_{name}")), key=len, default="")
         field = key.removesuffix(f"_{name}")
-        # EasyVolcap's t is a time.
-        cameras.get(name, others)["time" if field == "t" else field] = value
-    check_unread(origin, others, KNOWN)
+        cameras.get(name, others)["time" if field == "t" else field] = value  # EasyVolcap's t is a time
+    camera_file.check_unread(origin, others, KNOWN)
     return cameras
 
 
@@ -138,7 +128,7 @@ def cameras_from_fields(
 
 def find(fields: Mapping[str, Any], what: str) -> Any:
     """The value of an entry of ``_NAMES``; None where no spelling of it is there."""
-    spelled = {plain(key): value for key, value in fields.items()}
+    spelled = {camera_file.plain(key): value for key, value in fields.items()}
     return next((spelled[name] for name in _NAMES[what] if name in spelled), None)
 
 
@@ -167,13 +157,15 @@ def camera_from_fields(name: str, origin: str, fields: Mapping[str, Any]) -> Sto
     intrinsics, size = array("intrinsics", (3, 3)), size_from_fields(origin, fields)
     fisheye = find(fields, "fisheye")
     require(fisheye in (None, 0, 1), f"{origin}: fisheye", "true or false", fisheye)
-    single = {plain(key): value for key, value in fields.items() if plain(key) in _SINGLE}
+    single = {
+        camera_file.plain(key): value for key, value in fields.items() if camera_file.plain(key) in _SINGLE
+    }
     if find(fields, "distortion") is not None:
         distortion = array("distortion", (None,), (None, 1), (1, None)).ravel()
     else:
-        numbers = {key: finite(origin, key, value) for key, value in single.items()}
-        distortion = coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
-    check_unread(origin, fields, KNOWN)
+        numbers = {key: camera_file.finite(origin, key, value) for key, value in single.items()}
+        distortion = camera_file.coefficients(numbers, "k1 k2 k3 k4" if fisheye else " ".join(_SINGLE))
+    camera_file.check_unread(origin, fields, KNOWN)
     return StoredCamera(name, origin, intrinsics, pose, size, distortion, bool(fisheye))
 
 
@@ -185,9 +177,7 @@ def size_from_fields(origin: str, fields: Mapping[str, Any]) -> tuple[int, int] 
     if width is None or height is None:
         return None
     try:
-        size = int(height), int(width)
+        return int(height), int(width)
     except (TypeError, ValueError):
-        raise InputError(
-            f"{origin}: expected width and height in pixels; found {width!r}, {height!r}"
-        ) from None
-    return size
+        found = f"{width!r}, {height!r}"
+        raise InputError(f"{origin}: expected width and height in pixels; found {found}") from None

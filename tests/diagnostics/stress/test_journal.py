@@ -1,7 +1,7 @@
 """Finished pieces of work are kept, whatever happens to the process that writes them."""
 
-from ghgs_lit.runs import journal
-from ghgs_lit.runs.journal import Journal
+from ghgs_lit.diagnostics.stress import run
+from ghgs_lit.diagnostics.stress.run import Journal
 
 
 def test_what_is_done_is_there_after_a_kill(tmp_path):
@@ -22,8 +22,10 @@ def test_what_is_done_is_there_after_a_kill(tmp_path):
 def test_rows_of_other_code_are_not_taken_over(tmp_path, monkeypatch, capsys):
     """A table must not mix numbers of two versions."""
     path = tmp_path / "pieces.jsonl"
-    Journal(path).add("a", [])
-    Journal(path).say_done(["a", "b"], "pieces")
-    assert capsys.readouterr().out == f"{path}: 1 of 2 pieces are done already\n"
-    monkeypatch.setattr(journal, "code_digest", lambda: "other")
-    assert "a" not in Journal(path)
+    done, left = (run.Task("cosine", family, 1) for family in ("ordinary", "zero_features"))
+    Journal(path).add(done.key, [])
+    rows = run.run_tasks([done, left], path, workers=0)
+    assert capsys.readouterr().out == f"{path}: 1 of 2 families are done already\n"
+    assert {row["family"] for row in rows} == {"zero_features"}
+    monkeypatch.setattr(run, "code_digest", lambda: "other")
+    assert done.key not in Journal(path)
