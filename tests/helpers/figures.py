@@ -1,5 +1,6 @@
 """A figure of ellipsoids before cameras, as photographs, masks and a calibration on disk."""
 
+import functools
 import json
 import math
 from collections.abc import Mapping
@@ -25,40 +26,38 @@ PARTS = (
 )
 
 
+@functools.cache
+def _photographed(views, height, width, seed, jitter, focal):
+    """Intrinsics, extrinsics, masks, photographs and backgrounds [views, ...] of the figure."""
+    rng = np.random.default_rng(seed)
+    place = {"center": (0, 0.9, 0), "raised": 0.4, "radius": 2.4, "start": 15.0}
+    ring = camera_ring(views, height, width, 1, (focal * height,) * 2, **place)
+    extrinsics = ring.extrinsics.double().numpy()[0]
+    for pose in extrinsics:
+        pose[:3] = _turned(rng.normal(0, jitter, 3)) @ pose[:3]
+    cameras = Cameras(ring.intrinsics.double(), torch.from_numpy(extrinsics)[None], height, width)
+    found = [ellipsoid(cameras, torch.tensor(c).double(), torch.tensor(r).double()) for c, r in PARTS]
+    masks = np.stack([mask[0].numpy() for mask, _ in found]).any(0)
+    background = rng.integers(90, 110, (views, height, width, 3)).astype(np.uint8)
+    images = background.copy()
+    for n, (mask, _) in enumerate(found):
+        images[mask[0].numpy()] = [40 * n, 255 - 40 * n, 60 if n % 2 else 200]
+    return ring.intrinsics[0].double().numpy(), extrinsics, masks, images, background
+
+
 class Figure:
     """Photographs [v][h, w, 3] uint8, masks [v][h, w] bool and calibration of cameras around the figure."""
 
     def __init__(
         self, views=4, height=128, width=96, seed=0, jitter=0.0, focal=1.1, scale=1.0, origin=(0, 0, 0)
     ):
-        rng = np.random.default_rng(seed)
-        ring = camera_ring(
-            views,
-            height,
-            width,
-            1,
-            (focal * height,) * 2,
-            center=(0, 0.9, 0),
-            raised=0.4,
-            radius=2.4,
-            start=15.0,
+        intrinsics_of, extrinsics, masks, images, background = _photographed(
+            views, height, width, seed, jitter, focal
         )
-        extrinsics = ring.extrinsics.double().numpy()[0]
-        for pose in extrinsics:
-            pose[:3] = _turned(rng.normal(0, jitter, 3)) @ pose[:3]
-        cameras = Cameras(ring.intrinsics.double(), torch.from_numpy(extrinsics)[None], height, width)
-        found = [ellipsoid(cameras, torch.tensor(c).double(), torch.tensor(r).double()) for c, r in PARTS]
-        self.masks = np.stack([mask[0].numpy() for mask, _ in found]).any(0)
-        background = rng.integers(90, 110, (views, height, width, 3))
-        self.images = background.astype(np.uint8)
-        for n, (mask, _) in enumerate(found):
-            self.images[mask[0].numpy()] = [40 * n, 255 - 40 * n, 60 if n % 2 else 200]
-        self.backgrounds = background.astype(np.uint8)
+        self.masks, self.images, self.backgrounds = masks.copy(), images.copy(), background.copy()
         self.names = [f"cam{v}" for v in range(views)]
         self.cameras = {}
-        for name, intrinsics, pose in zip(
-            self.names, ring.intrinsics[0].double().numpy(), extrinsics, strict=True
-        ):
+        for name, intrinsics, pose in zip(self.names, intrinsics_of, extrinsics, strict=True):
             world = pose.copy()
             world[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ np.array(origin)
             self.cameras[name] = {

@@ -1,6 +1,7 @@
 """Cameras from silhouettes alone: no model, no colours."""
 
 import dataclasses
+import functools
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ def _parts():
     return [(CENTER + torch.tensor(middle), torch.tensor(radii)) for middle, radii in PARTS]
 
 
+@functools.cache
 def figure(batch=1, views=4, size=126):
     """Mattes and depths of the figure, in the subject's frame."""
     cameras = ring(batch, views, size, size)
