@@ -1,5 +1,7 @@
 """Checkpoints for prediction alone."""
 
+import re
+
 import pytest
 import torch
 
@@ -75,3 +77,11 @@ def test_half_precision_is_computed_where_the_processor_has_it(
     assert {p.dtype for p in elsewhere.encoder.parameters()} == {stored}
     for name, tensor in model_state(read_checkpoint(tmp_path / "b.ckpt")).items():
         assert torch.equal(model.state_dict()[name].float(), tensor.float())
+
+
+def test_the_weights_of_the_package_are_exported_by_name(tmp_path, monkeypatch, capsys):
+    """``checkpoint=shipped`` is no file's path."""
+    monkeypatch.chdir(tmp_path)
+    assert ghgs("export", "checkpoint=shipped", "inference=half.ckpt", "dtype=float16") == 0
+    assert re.search(r"^[\d.]+ MB to [\d.]+ MB$", capsys.readouterr().out, re.MULTILINE)
+    assert (tmp_path / "half.ckpt").stat().st_size < 2.5e6
