@@ -160,7 +160,8 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
     """Counts and checks of a subject; PSNR in dB in the box of the subject says how the inputs are met."""
     gaussians, valid = subject.gaussians, subject.depth_valid
     lost = subject.masks & ~valid
-    image = subject.renderer(gaussians, subject.cameras[None]).image[0].clamp(0, 1)
+    drawn = subject.renderer(gaussians, subject.cameras[None])
+    image = drawn.image[0].clamp(0, 1)
     quality = psnr(image, subject.images, box_of(subject.masks)).tolist()
     means = gaussians.means if len(gaussians) else gaussians.means.new_full((1, 3), torch.nan)
     return {
@@ -177,6 +178,6 @@ def _report(subject: ExportedSubject) -> dict[str, Any]:
         "depth_pixels": dict(zip(subject.views, valid.flatten(1).sum(1).tolist(), strict=True)),
         "depth_png_unit": depth_unit(float(torch.where(valid, subject.depth, 0).max())),
         "psnr_box_of_inputs": dict(zip(subject.views, quality, strict=True)),
-        **unseen(subject),
+        **unseen(subject, drawn.depth),
         "versions": versions(),
     }

@@ -4,6 +4,8 @@ import dataclasses
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ghgs_lit.prediction.export.subject import ExportedSubject
 from ghgs_lit.rounds.observation import looked_up
@@ -17,8 +19,8 @@ _PARTS, _OUTSIDE = 4, 1e-3
 GUESSED = 0.75
 
 
-def unseen(subject: ExportedSubject) -> dict[str, Any]:
-    """Plain data for the report.
+def unseen(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[str, Any]:
+    """Plain data for the report. ``depth``: of the inputs, as rendered.
 
     Returns:
         ``cut``: by edge of the frame, the photographs whose mask reaches it. ``seen_once``: by part of the
@@ -33,15 +35,14 @@ def unseen(subject: ExportedSubject) -> dict[str, Any]:
         for edge, which in touched.items()
         if any(which)
     }
-    return {"cut": cut, "seen_once": _seen_once(subject)}
+    return {"cut": cut, "seen_once": _seen_once(subject, depth)}
 
 
-def _seen_once(subject: ExportedSubject) -> dict[str, float]:
+def _seen_once(subject: ExportedSubject, depth: Float[Tensor, "1 V 1 H W"]) -> dict[str, float]:
     gaussians, cameras = subject.gaussians, subject.cameras[None]
     if not len(gaussians):
         return {}
     metre = 1.0 if gaussians.metre is None else float(gaussians.metre[0])
-    depth = subject.renderer(gaussians, cameras).depth
     maps = torch.cat((subject.mattes[None, :, None], depth), 2).double()
     exact = dataclasses.replace(gaussians, means=gaussians.means.double())
     values, z, is_inside = looked_up(exact, cameras, maps)

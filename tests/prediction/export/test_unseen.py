@@ -33,7 +33,8 @@ def photographed(views: int, shown: tuple[int, ...] = ()) -> tuple[Batch, Predic
 
 
 def said(batch: Batch, prediction: Prediction) -> dict:
-    return unseen(exported_subject(batch, prediction, Renderer(), OutputOptions()))
+    depth = Renderer()(prediction.gaussians, batch.cameras).depth
+    return unseen(exported_subject(batch, prediction, Renderer(), OutputOptions()), depth)
 
 
 def test_what_one_photograph_alone_shows_is_a_guess():
